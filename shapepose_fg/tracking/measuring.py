@@ -53,84 +53,27 @@ def measured(
 @kernel
 def _measure(mean, covariance, at, candidate, xy, confident, scatter, P, focal, numbers, inlier):
     """Update `mean` (A, J, S) and `covariance` (A, J, S, S) by views `P` (V, 3, 4), pixels from the world."""
-    sigma_m, floor_rad, rho_m, fixed_m = numbers[0], numbers[1], numbers[2], numbers[3]
-    shape, wide, nearest_m = int(numbers[4]), numbers[5], numbers[6]
+    sigma_m, floor_rad, nearest_m = numbers[0], numbers[1], numbers[6]
     people, joints, views = candidate.shape
-    size = mean.shape[2]
-    mean_depth, sigma = np.empty(views), np.empty(views)
-    L, g, place, pull, A = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty((2, 3))
-    M, gain, information = np.empty((3, 3)), np.empty((size, 3)), np.empty((size, 3))
+    sigma, depths = np.empty(views), np.empty(views)
+    L, g, M, gain = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, mean.shape[2], 3))
     for a in range(people):
         for v in range(views):
-            total, count = 0.0, 0
-            for j in range(joints):
-                depth = _along(P[v, 2], mean[a, j])
-                if depth >= nearest_m:
-                    total, count = total + depth, count + 1
-            mean_depth[v] = max(total / max(count, 1), nearest_m)
+            depths[v] = _mean_depth(mean[a], P[v, 2], nearest_m)
         for j in range(joints):
             seen = False
             for v in range(views):
-                d = candidate[a, j, v]
-                sigma[v] = 0.0
+                d, sigma[v] = candidate[a, j, v], 0.0
                 if d >= 0 and confident[d] > 0:
                     depth = _along(P[v, 2], mean[a, j])
-                    depth = fixed_m if fixed_m > 0 else depth if depth >= nearest_m else mean_depth[v]
-                    px = np.hypot(floor_rad * focal[v], sigma_m * focal[v] / depth)
-                    sigma[v] = px * scatter[j] / np.sqrt(confident[d])
-                    seen = True
-            if not seen:
-                continue
-            place[:] = at[a, j]
-            for _ in range(_ITERATIONS):
-                L[:], g[:] = 0.0, 0.0
-                for v in range(views):
-                    inlier[a, j, v] = False
-                    depth = _along(P[v, 2], place)
-                    if sigma[v] == 0 or not depth >= nearest_m:
-                        continue
-                    d = candidate[a, j, v]
-                    x, y = _along(P[v, 0], place) / depth, _along(P[v, 1], place) / depth
-                    rx, ry = x - xy[d, 0], y - xy[d, 1]
-                    off = np.hypot(rx, ry)
-                    if not off < rho_m * focal[v] / (fixed_m if fixed_m > 0 else depth):
-                        continue
-                    inlier[a, j, v] = True
-                    weight = _weight(shape, off / sigma[v] / wide) / sigma[v] ** 2
-                    for i in range(3):
-                        A[0, i] = (P[v, 0, i] - x * P[v, 2, i]) / depth
-                        A[1, i] = (P[v, 1, i] - y * P[v, 2, i]) / depth
-                    for i in range(3):
-                        g[i] += weight * (A[0, i] * rx + A[1, i] * ry)
-                        for k in range(3):
-                            L[i, k] += weight * (A[0, i] * A[0, k] + A[1, i] * A[1, k])
-                for i in range(3):
-                    pull[i] = -g[i]
-                    for k in range(3):
-                        pull[i] += L[i, k] * (place[k] - mean[a, j, k])
-                # The gain P (1 + L P)^-1 needs no inverse of L, which is singular where one view sees the joint.
-                for i in range(3):
-                    for k in range(3):
-                        M[i, k] = 1.0 if i == k else 0.0
-                        for m in range(3):
-                            M[i, k] += L[i, m] * covariance[a, j, m, k]
-                _invert(M)
-                for i in range(size):
-                    for k in range(3):
-                        gain[i, k] = 0.0
-                        for m in range(3):
-                            gain[i, k] += covariance[a, j, i, m] * M[m, k]
-                for i in range(3):
-                    place[i] = mean[a, j, i]
-                    for k in range(3):
-                        place[i] += gain[i, k] * pull[k]
-            for i in range(size):
-                for k in range(3):
-                    mean[a, j, i] += gain[i, k] * pull[k]
-                    information[i, k] = 0.0
-                    for m in range(3):
-                        information[i, k] += gain[i, m] * L[m, k]
-            _lessen(covariance[a, j], information)
+                    depth = numbers[3] if numbers[3] > 0 else depth if depth >= nearest_m else depths[v]
+                    px = np.sqrt((floor_rad * focal[v]) ** 2 + (sigma_m * focal[v] / depth) ** 2)
+                    sigma[v], seen = px * scatter[j] / np.sqrt(confident[d]), True
+            if seen:
+                for _ in range(_ITERATIONS):
+                    _linearise(at[a, j], candidate[a, j], xy, sigma, P, focal, numbers, L, g, inlier[a, j])
+                    _move(mean[a, j], covariance[a, j], at[a, j], L, g, M, gain)
+                _update(mean[a, j], covariance[a, j], L, M, gain)
 
 
 @kernel
@@ -140,17 +83,91 @@ def _along(row, place):
 
 
 @kernel
+def _mean_depth(mean, row, nearest_m):
+    """Of the joints in front of a view."""
+    total, count = 0.0, 0
+    for j in range(len(mean)):
+        depth = _along(row, mean[j])
+        if depth >= nearest_m:
+            total += depth
+            count += 1
+    return total / count if count > 0 else nearest_m
+
+
+@kernel
+def _linearise(place, candidate, xy, sigma, P, focal, numbers, L, g, inlier):
+    """Sum up what views say of a joint at `place`: information L (3, 3) and gradient g (3,)."""
+    for i in range(3):
+        g[i] = L[i, 0] = L[i, 1] = L[i, 2] = 0.0
+    for v in range(len(P)):
+        depth, d = _along(P[v, 2], place), candidate[v]
+        inlier[v] = False
+        if sigma[v] == 0 or not depth >= numbers[6]:
+            continue
+        x, y = _along(P[v, 0], place) / depth, _along(P[v, 1], place) / depth
+        to_x, to_y = x - xy[d, 0], y - xy[d, 1]
+        off = np.sqrt(to_x * to_x + to_y * to_y)
+        if not off < numbers[2] * focal[v] / (numbers[3] if numbers[3] > 0 else depth):
+            continue
+        inlier[v] = True
+        weight = _weight(numbers[4], off / sigma[v] / numbers[5]) / (sigma[v] * depth) ** 2
+        for i in range(3):
+            dx, dy = P[v, 0, i] - x * P[v, 2, i], P[v, 1, i] - y * P[v, 2, i]
+            g[i] += weight * depth * (dx * to_x + dy * to_y)
+            for k in range(3):
+                L[i, k] += weight * (dx * (P[v, 0, k] - x * P[v, 2, k]) + dy * (P[v, 1, k] - y * P[v, 2, k]))
+
+
+@kernel
 def _weight(shape, ratio):
     """What a robust kernel leaves of a residual of `ratio` times its width (`factors.kernel_weight`)."""
-    if shape == 0:
+    squared = ratio * ratio
+    if shape == 0 or (shape == 1 and squared <= 1):
         return 1.0
     if shape == 1:
-        return 1.0 / max(ratio, 1.0)
+        return 1.0 / ratio
     if shape == 2:
-        return 1.0 / (1.0 + ratio * ratio)
+        return 1.0 / (1.0 + squared)
     if shape == 3:
-        return 1.0 / (1.0 + ratio * ratio) ** 2
-    return max(1.0 - ratio * ratio, 0.0) ** 2
+        return 1.0 / (1.0 + squared) ** 2
+    return (1.0 - squared) ** 2 if squared < 1 else 0.0
+
+
+@kernel
+def _move(mean, P, place, L, g, M, gain):
+    """Put `place` where a joint is after the measurement, by the gain P (1 + L P)^-1.
+
+    It needs no inverse of L, which is singular where one view sees the joint. What pulls is left in `M[0]`.
+    """
+    for i in range(3):
+        for k in range(3):
+            M[i, k] = L[i, 0] * P[0, k] + L[i, 1] * P[1, k] + L[i, 2] * P[2, k] + (1.0 if i == k else 0.0)
+    _invert(M)
+    for i in range(len(mean)):
+        for k in range(3):
+            gain[0, i, k] = P[i, 0] * M[0, k] + P[i, 1] * M[1, k] + P[i, 2] * M[2, k]
+    x, y, z = place[0] - mean[0], place[1] - mean[1], place[2] - mean[2]
+    for i in range(3):
+        M[0, i] = L[i, 0] * x + L[i, 1] * y + L[i, 2] * z - g[i]
+    for i in range(3):
+        place[i] = mean[i] + gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
+
+
+@kernel
+def _update(mean, P, L, M, gain):
+    """A joint's state after `_move`: P less (gain L) P, symmetric."""
+    for i in range(len(mean)):
+        mean[i] += gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
+        for k in range(3):
+            gain[1, i, k] = gain[0, i, 0] * L[0, k] + gain[0, i, 1] * L[1, k] + gain[0, i, 2] * L[2, k]
+            gain[2, i, k] = P[i, k]
+    for i in range(len(mean)):
+        for k in range(i + 1):
+            less = 0.0
+            for m in range(3):
+                less += gain[1, i, m] * gain[2, k, m] + gain[1, k, m] * gain[2, i, m]
+            P[i, k] -= less / 2
+            P[k, i] = P[i, k]
 
 
 @kernel
@@ -162,17 +179,3 @@ def _invert(M):
     M[0, 0], M[0, 1], M[0, 2] = first * over, (c * h - b * i) * over, (b * f - c * e) * over
     M[1, 0], M[1, 1], M[1, 2] = second * over, (a * i - c * g) * over, (c * d - a * f) * over
     M[2, 0], M[2, 1], M[2, 2] = third * over, (b * g - a * h) * over, (a * e - b * d) * over
-
-
-@kernel
-def _lessen(P, told):
-    """Take `told` (S, 3) times the first three rows of a covariance (S, S) from it; it stays symmetric."""
-    size = len(P)
-    top = P[:3].copy()
-    for i in range(size):
-        for k in range(size):
-            for m in range(3):
-                P[i, k] -= told[i, m] * top[m, k]
-    for i in range(size):
-        for k in range(i):
-            P[i, k] = P[k, i] = (P[i, k] + P[k, i]) / 2

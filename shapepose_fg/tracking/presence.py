@@ -93,84 +93,91 @@ def _weigh(places, world, P, focal, sizes, limbs, weight, price):
     """Make what detections count, `weight` (A, J, V), a share of the places; fill in `price` (A,)."""
     people, joints, views = weight.shape
     x, y, depth = np.empty((people, joints)), np.empty((people, joints)), np.empty((people, joints))
-    known, hidden = np.empty((people, joints), dtype=np.bool_), np.empty((people, joints), dtype=np.bool_)
-    expected, box = np.zeros(people), np.empty((people, 6))
+    expected, box, hidden = np.zeros(people), np.empty((people, 6)), np.zeros((people, joints))
     for v in range(views):
         for a in range(people):
-            _pictured(places[a], P[v], x[a], y[a], depth[a], known[a])
-            hidden[a] = ~known[a]
-            _enclose(x[a], y[a], depth[a], known[a], focal[v], box[a])
+            _pictured(places[a], P[v], focal[v], x[a], y[a], depth[a], hidden[a], box[a])
         for a in range(people):
             for b in range(people):
                 if a != b and world[a] == world[b]:
-                    _hide(x, y, depth, known, box, a, b, focal[v], limbs, hidden[a])
+                    _hide(x, y, depth, box, a, b, focal[v], limbs, places[b], hidden[a])
             for j in range(joints):
                 if depth[a, j] > 0 and 0 <= x[a, j] < sizes[v, 0] and 0 <= y[a, j] < sizes[v, 1]:
-                    cost = _PRICE_HIDDEN if hidden[a, j] else _PRICE
+                    cost = _PRICE_HIDDEN if hidden[a, j] > 0 else _PRICE
                     weight[a, j, v] *= 1 + cost
                     price[a] += cost
                     expected[a] += 1.0
     for a in range(people):
-        price[a] /= max(expected[a], 1.0)
-        weight[a] /= max(expected[a], 1.0)
+        over = 1.0 / expected[a] if expected[a] > 0 else 1.0
+        price[a] *= over
+        for j in range(joints):
+            for v in range(views):
+                weight[a, j, v] *= over
 
 
 @kernel
-def _pictured(places, P, x, y, depth, known):
-    """Pixels and depths of joints in a view, NaN pixels behind it; unknown joints are amidst the others."""
-    centre, count = np.zeros(3), 0
-    for j in range(len(places)):
-        known[j] = np.isfinite(places[j, 0] + places[j, 1] + places[j, 2])
-        if known[j]:
-            centre += places[j]
-            count += 1
-    centre /= max(count, 1)
-    for j in range(len(places)):
-        at = places[j] if known[j] else centre
-        depth[j] = P[2, 0] * at[0] + P[2, 1] * at[1] + P[2, 2] * at[2] + P[2, 3]
-        over = 1.0 / depth[j] if depth[j] > 0 else np.nan
-        x[j] = (P[0, 0] * at[0] + P[0, 1] * at[1] + P[0, 2] * at[2] + P[0, 3]) * over
-        y[j] = (P[1, 0] * at[0] + P[1, 1] * at[1] + P[1, 2] * at[2] + P[1, 3]) * over
+def _pictured(places, P, focal, x, y, depth, hidden, box):
+    """Pixels and depths of joints in a view, NaN pixels behind it; unknown joints are amidst others, and hidden.
 
-
-@kernel
-def _enclose(x, y, depth, known, focal, box):
-    """What known joints are between: left and right, top and bottom, with a limb's width, then near and far."""
-    box[0] = box[2] = box[4] = np.inf
-    box[1] = box[3] = box[5] = -np.inf
-    for j in range(len(x)):
-        if known[j]:
-            box[4], box[5] = min(box[4], depth[j]), max(box[5], depth[j])
-            if depth[j] > 0:
-                box[0], box[1] = min(box[0], x[j]), max(box[1], x[j])
-                box[2], box[3] = min(box[2], y[j]), max(box[3], y[j])
-    margin = _LIMB_M * focal / max(box[4], _LIMB_M)
+    `box` (6,): what known joints are between, left and right, top and bottom, with a limb's width, near and far.
+    """
+    cx, cy, cz, count = 0.0, 0.0, 0.0, 0.0
+    for side in range(0, 6, 2):
+        box[side], box[side + 1] = np.inf, -np.inf
+    for j in range(len(places)):
+        hidden[j] = 0.0 if np.isfinite(places[j, 0] + places[j, 1] + places[j, 2]) else 1.0
+        if hidden[j] == 0:
+            cx, cy, cz, count = cx + places[j, 0], cy + places[j, 1], cz + places[j, 2], count + 1
+    over = 1.0 / count if count > 0 else 0.0
+    for j in range(len(places)):
+        X, Y, Z = cx * over, cy * over, cz * over
+        if hidden[j] == 0:
+            X, Y, Z = places[j, 0], places[j, 1], places[j, 2]
+        depth[j] = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        nearer = 1.0 / depth[j] if depth[j] > 0 else np.nan
+        x[j] = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) * nearer
+        y[j] = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) * nearer
+        if hidden[j] == 0:
+            _widen(box, 0, x[j])
+            _widen(box, 2, y[j])
+            _widen(box, 4, depth[j])
+    margin = _LIMB_M * focal / (box[4] if box[4] > _LIMB_M else _LIMB_M)
     for low in (0, 2):
         box[low] -= margin
         box[low + 1] += margin
 
 
 @kernel
-def _hide(x, y, depth, known, box, a, b, focal, limbs, hidden):
-    """Mark the joints of `a` that are behind a limb of `b` in a view; limbs hide whose both ends are known."""
+def _widen(box, side, value):
+    """Make a box reach a value, which may be NaN."""
+    if value < box[side]:
+        box[side] = value
+    if value > box[side + 1]:
+        box[side + 1] = value
+
+
+@kernel
+def _hide(x, y, depth, box, a, b, focal, limbs, places, hidden):
+    """Mark the joints of `a` that are behind a limb of `b`, both of whose ends are in `places`, in a view."""
     near, far = box[b], box[a]
     if not (near[0] < far[1] and far[0] < near[1] and near[2] < far[3] and far[2] < near[3]):
         return
     for j in range(len(hidden)):
         behind = depth[a, j] - _IN_FRONT_M
-        if hidden[j] or not (near[4] < behind and near[0] < x[a, j] < near[1] and near[2] < y[a, j] < near[3]):
+        if hidden[j] > 0 or not (near[4] < behind and near[0] < x[a, j] < near[1] and near[2] < y[a, j] < near[3]):
             continue
-        for limb in limbs:
-            one, two = limb[0], limb[1]
-            if not (known[b, one] and known[b, two]):
+        for n in range(len(limbs)):
+            one, two = limbs[n, 0], limbs[n, 1]
+            if not np.isfinite(places[one, 0] + places[two, 0]):
                 continue
             to_x, to_y = x[a, j] - x[b, one], y[a, j] - y[b, one]
             dx, dy = x[b, two] - x[b, one], y[b, two] - y[b, one]
-            along = min(max((to_x * dx + to_y * dy) / max(dx * dx + dy * dy, 1e-6), 0.0), 1.0)
+            length, along = dx * dx + dy * dy, to_x * dx + to_y * dy
+            along = 0.0 if along <= 0 else 1.0 if along >= length else along / length
             to_x, to_y = to_x - along * dx, to_y - along * dy
             at = depth[b, one] + along * (depth[b, two] - depth[b, one])
             if (to_x * to_x + to_y * to_y) * at * at < (_LIMB_M * focal) ** 2 and at < behind:
-                hidden[j] = True
+                hidden[j] = 1.0
                 break
 
 
@@ -247,7 +254,8 @@ class Account:
         first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(world) == 0:
             return [self.in_turn(first)]
-        best_s = np.array([_best_segment(gains, *self._borders(asked))[0] for gains in self.alone])
+        segment, costs = np.zeros(3, dtype=np.intp), (asked * _APPEARS_S, self.begins, self.ends)
+        best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.alone])
         bound = np.bincount(world, np.maximum(best_s, 0.0))
         tried = np.argsort(-bound, kind="stable")[:_WORLDS]
         found = [self.in_turn(each, asked) for each in (first, *(world == each for each in tried))]
@@ -269,10 +277,6 @@ class Account:
         """Who would be there besides those whom `choose` has `chosen`, if appearing cost nothing."""
         return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
-    def _borders(self, asked: float) -> tuple[float, int, int]:
-        """What it costs to appear or vanish, if a share of that is `asked` for, and between which frames."""
-        return asked * _APPEARS_S, self.begins, self.ends
-
     @cached_property
     def alone(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
@@ -284,7 +288,11 @@ class Account:
         """Where those who have each detection begin, (D + 1,), who they are, and what it counts for them, one
         detection after the other.
         """
-        return _holders(self.place, self.weight, self.detections)
+        counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
+        begin = np.cumsum(np.concatenate([[0, 0], counts]))
+        who, what = np.empty(begin[-1], dtype=np.intp), np.empty(begin[-1])
+        _holders(self.place, self.weight, begin, who, what)
+        return begin[:-1], who, what
 
     def in_turn(self, first: Mask, asked: float = 1.0, besides: Chosen | None = None) -> Chosen:
         """People one after the other, the best of those `first` (H,) before all others: so many as have the least
@@ -292,48 +300,49 @@ class Account:
 
         Those `besides` come before all, and are not returned; for who comes besides them appearing costs nothing.
         """
-        none = np.zeros(0, dtype=np.intp)
-        before = (none, none, none) if besides is None else (besides.hypothesis, besides.start, besides.stop)
-        borders, least_s = self._borders(asked if besides is None else 0.0), asked * self.least_s
-        given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first
-        return Chosen(*_in_turn(*given, *before, *borders, least_s))
+        before = np.zeros((0, 3), dtype=np.intp)
+        if besides is not None:
+            before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
+        appears_s = asked * _APPEARS_S if besides is None else 0.0
+        given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first, before
+        costs, (H, T) = (appears_s, self.begins, self.ends, asked * self.least_s), self.there.shape
+        free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)
+        room = np.empty((H, 3), dtype=np.intp), np.empty(H)
+        chosen, evidence = np.empty((H * T, 3), dtype=np.intp), np.empty(H * T)
+        count = _in_turn(*given, *costs, free, changed, *room, chosen, evidence)
+        return Chosen(*chosen[:count].T.copy(), evidence[:count])
 
 
 @kernel
-def _holders(place, weight, detections):
-    """`Account.holders` of places and weights (H, T, K)."""
-    begin, each = np.zeros(detections + 2, dtype=np.intp), place.shape[1] * place.shape[2]
-    flat, counts = place.reshape(-1), weight.reshape(-1)
-    for d in flat:
-        if d < detections:
-            begin[d + 2] += 1
-    for d in range(detections):
-        begin[d + 2] += begin[d + 1]
-    who, what = np.empty(begin[-1], dtype=np.intp), np.empty(begin[-1])
-    for n in range(len(flat)):
-        if flat[n] < detections:
-            at = begin[flat[n] + 1]
-            who[at], what[at] = n // each, counts[n]
-            begin[flat[n] + 1] += 1
-    return begin[:-1], who, what
+def _holders(place, weight, begin, who, what):
+    """Fill in `Account.holders` of places and weights (H, T, K); `begin` (D + 2,) has its first entry twice."""
+    people, frames, places = place.shape
+    for h in range(people):
+        for t in range(frames):
+            for k in range(places):
+                d = place[h, t, k]
+                if d + 2 < len(begin):
+                    at = begin[d + 1]
+                    who[at], what[at] = h, weight[h, t, k]
+                    begin[d + 1] += 1
 
 
 @kernel
 def _in_turn(
-    gains, place, begin, who, what, lasts, first, besides, besides_from, besides_to, appears, begins, ends, least
+    gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free, changed, segment,
+    value, chosen, evidence,
 ):  # fmt: skip
-    """Hypothesis, start, stop and evidence of those whom `Account.in_turn` chooses."""
-    people, frames = gains.shape
-    free, changed = np.ones(len(begin) - 1, dtype=np.bool_), np.ones(people, dtype=np.bool_)
-    start, stop, value = np.zeros(people, dtype=np.intp), np.zeros(people, dtype=np.intp), np.zeros(people)
-    chosen, count, evidence = np.empty((3, people * frames), dtype=np.intp), 0, np.empty(people * frames)
+    """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of those whom `Account.in_turn`
+    chooses; returns how many there are.
+    """
+    people, count = len(gains), 0
     for n in range(len(besides)):
-        _take(besides[n], besides_from[n], besides_to[n], gains, place, begin, who, what, lasts, free, changed)
+        _take(besides[n], gains, place, begin, who, what, lasts, free, changed)
     while people > 0:
         before_all, best = False, -1
         for h in range(people):
             if changed[h]:
-                value[h], start[h], stop[h] = _best_segment(gains[h], appears, begins, ends)
+                value[h] = _best_segment(gains[h], appears, begins, ends, h, segment[h])
                 changed[h] = False
             before_all = before_all or (first[h] and value[h] >= least)
         for h in range(people):
@@ -341,20 +350,23 @@ def _in_turn(
                 best = h
         if value[best] < least:
             break
-        chosen[0, count], chosen[1, count], chosen[2, count] = best, start[best], stop[best]
         evidence[count] = value[best]
+        for n in range(3):
+            chosen[count, n] = segment[best, n]
+        _take(chosen[count], gains, place, begin, who, what, lasts, free, changed)
         count += 1
-        _take(best, start[best], stop[best], gains, place, begin, who, what, lasts, free, changed)
-    return chosen[0, :count].copy(), chosen[1, :count].copy(), chosen[2, :count].copy(), evidence[:count].copy()
+    return count
 
 
 @kernel
-def _take(person, start, stop, gains, place, begin, who, what, lasts, free, changed):
+def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
     """Somebody is there for some frames: their detections are evidence of nobody else."""
+    person = chosen[0]
     changed[person] = True
-    for t in range(start, stop):
+    for t in range(chosen[1], chosen[2]):
         gains[person, t] = -np.inf
-        for d in place[person, t]:
+        for k in range(place.shape[2]):
+            d = place[person, t, k]
             if d < len(free) and free[d]:
                 free[d] = False
                 for n in range(begin[d], begin[d + 1]):
@@ -363,20 +375,21 @@ def _take(person, start, stop, gains, place, begin, who, what, lasts, free, chan
 
 
 @kernel
-def _best_segment(gains, appears, begins, ends):
-    """The segment with the greatest sum of `gains` (T,): value, start, stop.
+def _best_segment(gains, appears, begins, ends, person, segment):
+    """The segment of `gains` (T,) with the greatest sum, which is returned; `segment` (3,) is who, start and stop.
 
     Where it begins after the frame `begins`, or stops before the frame `ends`, it costs `appears` each. No part of
     it costs more than to vanish and to appear again.
     """
-    running, peak, since, value, start, stop = -np.inf, -np.inf, 0, -np.inf, 0, 0
+    running, peak, since, best = -np.inf, -np.inf, 0, -np.inf
+    segment[0], segment[1], segment[2] = person, 0, 0
     for t in range(len(gains)):
         afresh = -appears if t > begins else 0.0
-        if running < max(afresh, peak - 2 * appears):
+        if running < afresh or running < peak - 2 * appears:
             since, running, peak = t, afresh, -np.inf
         running += gains[t]
-        peak = max(peak, running)
+        peak = running if running > peak else peak
         closed = running - (appears if t < ends else 0.0)
-        if closed > value:
-            value, start, stop = closed, since, t + 1
-    return value, start, stop
+        if closed > best:
+            best, segment[1], segment[2] = closed, since, t + 1
+    return best

@@ -121,23 +121,39 @@ def own_affinity(candidate: Index, detections: Detections, skeleton: Skeleton) -
 
 def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> tuple[Index, Near]:
     """The detections (A, J, V), and all that are near."""
-    slot = detections.joint * len(rig) + detections.view
-    order = np.lexsort((detections.xy[:, 0], slot))
-    first = np.searchsorted(slot[order], np.arange(len(skeleton) * len(rig) + 1))
     gate_m = np.where(predicted.lost, _REACH_M, np.minimum(_FAR_M + 2 * predicted.sigma_m, FARTHEST_M))
     variance = _NEAR_M**2 + predicted.sigma_m**2
     world = np.zeros(len(gate_m), dtype=np.intp) if predicted.world is None else predicted.world
     people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
-    reach_m = np.maximum(gate_m, OVERLAP_M)
-    found = _near(places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.xy)
-    first, person, detection, distance_m = found
+    first, *found = _found(places, np.maximum(gate_m, OVERLAP_M), people, rig, skeleton, detections)
+    person, detection, distance_m = found
     at = person, detections.joint[detection]
     within, lost = distance_m < gate_m[at], predicted.lost[at]
-    chosen = np.empty((len(places), len(skeleton), len(rig)), dtype=np.intp)
-    claims = *found, distance_m**2 / variance[at], within, lost, world
+    score, tied, likely = np.empty(len(person)), np.empty(len(person)), np.empty(len(person), dtype=bool)
+    chosen = np.full((len(places), len(skeleton), len(rig)), -1, dtype=np.intp)
+    room = chosen.copy(), np.full(len(detections), -1, dtype=np.intp), np.empty(len(person), dtype=np.intp)
+    claims = first, *found, distance_m**2 / variance[at], within, lost, world
     constants = LEAST_AFFINITY, OVERLAP_M, _PASSES
-    score, likely = _give_out(*claims, *_facts(detections), *_limb_ends(skeleton), *constants, chosen)
+    _give_out(*claims, *_facts(detections), *_limb_ends(skeleton), *constants, *room, score, tied, likely, chosen)
     return chosen, Near(first, person, detection, distance_m, within & ~lost, score, likely)
+
+
+def _found(
+    places: Array, reach_m: Array, people: Index, rig: Rig, skeleton: Skeleton, detections: Detections
+) -> tuple[Index, Index, Index, Array]:
+    """The first four fields of `Near`: detections within `reach_m` (A, J) of `places` (A, J, 3), metres."""
+    slot = detections.joint * len(rig) + detections.view
+    order = np.lexsort((detections.xy[:, 0], slot))
+    first = np.searchsorted(slot[order], np.arange(len(skeleton) * len(rig) + 1))
+    begins, count, room = np.zeros_like(first), 4 * reach_m.size * len(rig), 0
+    person = detection = np.zeros(0, dtype=np.intp)
+    distance_m = np.zeros(0)
+    while count > room:
+        room = count
+        person, detection, distance_m = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room)
+        found = begins, person, detection, distance_m
+        count = _near(places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.xy, *found)
+    return begins, person[:count], detection[:count], distance_m[:count]
 
 
 def _facts(detections: Detections) -> tuple[Index, Index, Array, Array, Index, Array]:
@@ -154,43 +170,38 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
 
 
 @kernel
-def _near(places, reach_m, people, P, focal, first, order, xy):
-    """Detections within `reach_m` (A, J) of `places` (A, J, 3): `Near.first`, person, detection and distance.
+def _near(places, reach_m, people, P, focal, first, order, xy, begins, person, detection, distance_m):
+    """Fill in what `_found` returns, as far as there is room; returns how much there is.
 
     `order` (D,) sorts detections by joint and view, of which each begins at `first` (J V + 1,), and by x.
     """
     views, count = len(P), 0
-    starts = np.zeros(len(first), dtype=np.intp)
-    person, detection, distance_m = np.empty(64, dtype=np.intp), np.empty(64, dtype=np.intp), np.empty(64)
     for slot in range(len(first) - 1):
-        j, v = slot // views, slot % views
-        for a in people:
-            depth = _along(P[v, 2], places[a, j])
-            if first[slot] == first[slot + 1] or not depth > 0:
+        j, v, stop = slot // views, slot % views, first[slot + 1]
+        for n in range(len(people) if first[slot] < stop else 0):
+            place, reach = places[people[n], j], reach_m[people[n], j]
+            depth = _along(P[v, 2], place)
+            if not depth > 0:
                 continue
-            x, y = _along(P[v, 0], places[a, j]) / depth, _along(P[v, 1], places[a, j]) / depth
-            m_per_px = depth / focal[v]
-            reach_px = 1.000001 * reach_m[a, j] / m_per_px
-            low, high = first[slot], first[slot + 1]
+            x, y, m_per_px = _along(P[v, 0], place) / depth, _along(P[v, 1], place) / depth, depth / focal[v]
+            reach_px = 1.000001 * reach / m_per_px
+            low, high = first[slot], stop
             while low < high:  # the first that is not too far to the left
                 middle = (low + high) // 2
                 if xy[order[middle], 0] < x - reach_px:
                     low = middle + 1
                 else:
                     high = middle
-            while low < first[slot + 1] and xy[order[low], 0] <= x + reach_px:
+            while low < stop and xy[order[low], 0] <= x + reach_px:
                 d = order[low]
                 low += 1
-                apart_m = np.hypot(x - xy[d, 0], y - xy[d, 1]) * m_per_px
-                if not apart_m < reach_m[a, j]:
-                    continue
-                if count == len(person):
-                    person, detection = np.append(person, person), np.append(detection, detection)
-                    distance_m = np.append(distance_m, distance_m)
-                person[count], detection[count], distance_m[count] = a, d, apart_m
-                count += 1
-        starts[slot + 1] = count
-    return starts, person[:count].copy(), detection[:count].copy(), distance_m[:count].copy()
+                apart_m = np.sqrt((x - xy[d, 0]) ** 2 + (y - xy[d, 1]) ** 2) * m_per_px
+                if apart_m < reach:
+                    if count < len(person):
+                        person[count], detection[count], distance_m[count] = people[n], d, apart_m
+                    count += 1
+        begins[slot + 1] = count
+    return count
 
 
 @kernel
@@ -202,27 +213,22 @@ def _along(row, place):
 @kernel
 def _give_out(
     first, person, detection, distance_m, squared, within, lost, world, joint, view, xy, confidence, pairs,
-    affinity, limb, ends, least, overlap_m, passes, chosen,
+    affinity, limb, ends, least, overlap_m, passes, before, taken, queue, score, tied, likely, chosen,
 ):  # fmt: skip
     """Fill in `chosen` (A, J, V); score and likely of `Near`. `squared` (N,) are distances in sigmas, squared."""
     begin, other, value = _by_detection(pairs, affinity, len(joint))
-    count, views = len(person), chosen.shape[2]
-    score, likely, tied = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(count)
-    before, taken = np.empty_like(chosen), np.full(len(joint), -1, dtype=np.intp)
-    chosen[:] = -1
     for _ in range(passes + 1):
-        before[:] = chosen
-        for e in range(count):
+        for e in range(len(person)):
             d, own = detection[e], before[person[e]]
             tied[e], neighbours = _affinity(d, own, joint, view, begin, other, value, limb, ends)
             # Where no neighbour is seen, the affinities say nothing: neither for nor against.
             score[e] = np.exp(-0.5 * squared[e]) + (tied[e] if neighbours > 0 else least)
             enough = (neighbours > 0 and tied[e] >= least) if lost[e] else score[e] >= 2 * least
             likely[e] = within[e] and enough
-        chosen[:] = -1
-        _match(first, person, detection, score, likely, world, xy, confidence, taken, chosen)
-        if (chosen == before).all():
+        _match(first, person, detection, score, likely, world, xy, confidence, taken, queue, chosen)
+        if not _copied(chosen, before):
             break
+    views = chosen.shape[2]
     for slot in range(len(first) - 1):
         e = first[slot]
         while e < first[slot + 1]:  # a person at a time: the nearest of an empty place serves it, too
@@ -234,39 +240,49 @@ def _give_out(
                 e += 1
             if best >= 0 and chosen[a, slot // views, slot % views] < 0:
                 chosen[a, slot // views, slot % views] = detection[best]
-    return score, likely
 
 
 @kernel
-def _match(first, person, detection, score, likely, world, xy, confidence, taken, chosen):
+def _copied(chosen, before):
+    """Copy what is chosen to `before`; whether that was other."""
+    other = False
+    for a in range(len(chosen)):
+        for j in range(chosen.shape[1]):
+            for v in range(chosen.shape[2]):
+                other = other or before[a, j, v] != chosen[a, j, v]
+                before[a, j, v] = chosen[a, j, v]
+    return other
+
+
+@kernel
+def _match(first, person, detection, score, likely, world, xy, confidence, taken, queue, chosen):
     """Give each detection of a joint and view to one person, and each person one, the best score first."""
-    views, queue, key = chosen.shape[2], np.empty(len(person), dtype=np.intp), np.empty(len(person))
+    views = chosen.shape[2]
     for slot in range(len(first) - 1):
         j, v, end = slot // views, slot % views, first[slot]
         while end < first[slot + 1]:  # worlds stand one after the other, and do not compete
-            of, start, length = world[person[end]], end, 0
+            of, length = world[person[end]], 0
             while end < first[slot + 1] and world[person[end]] == of:
+                chosen[person[end], j, v], taken[detection[end]] = -1, -1
                 if likely[end]:
                     queue[length] = end
                     length += 1
-                key[end] = np.rint(1e9 * score[end])
                 end += 1
-            _sort(queue, length, key, detection, xy, confidence)
+            _sort(queue, length, score, detection, xy, confidence)
             for n in range(length):
                 a, d = person[queue[n]], detection[queue[n]]
-                if chosen[a, j, v] < 0 and taken[d] != start:
-                    chosen[a, j, v], taken[d] = d, start
-    taken[:] = -1
+                if chosen[a, j, v] < 0 and taken[d] < 0:
+                    chosen[a, j, v], taken[d] = d, a
 
 
 @kernel
-def _sort(queue, length, key, detection, xy, confidence):
+def _sort(queue, length, score, detection, xy, confidence):
     """Sort the first entries of a queue, best first (Shell's way)."""
     gap = length // 2
     while gap > 0:
         for n in range(gap, length):
             moved, place = queue[n], n
-            while place >= gap and _better(moved, queue[place - gap], key, detection, xy, confidence):
+            while place >= gap and _better(moved, queue[place - gap], score, detection, xy, confidence):
                 queue[place] = queue[place - gap]
                 place -= gap
             queue[place] = moved
@@ -274,13 +290,14 @@ def _sort(queue, length, key, detection, xy, confidence):
 
 
 @kernel
-def _better(one, other, key, detection, xy, confidence):
-    """Whether one comes before another. Detections of equal scores are told apart by what they are, not by their
-    order: people whom the detector has grouped have affinities of exactly 1.
+def _better(one, other, score, detection, xy, confidence):
+    """Whether one comes before another. Detections of equal scores, to nine digits, are told apart by what they
+    are, not by their order: people whom the detector has grouped have affinities of exactly 1.
     """
     c, d = detection[one], detection[other]
-    if key[one] != key[other]:
-        return key[one] > key[other]
+    key, others = np.rint(1e9 * score[one]), np.rint(1e9 * score[other])
+    if key != others:
+        return key > others
     if c == d:
         return one < other
     if confidence[c] != confidence[d]:
@@ -302,7 +319,7 @@ def _affinity(d, own, joint, view, begin, other, value, limb, ends):
         for n in range(begin[d], begin[d + 1]):
             if own[joint[other[n]], view[other[n]]] == other[n]:
                 total += value[n]
-    return total / max(neighbours, 1), neighbours
+    return total / neighbours if neighbours > 0 else 0.0, neighbours
 
 
 @kernel
