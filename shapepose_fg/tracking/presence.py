@@ -79,9 +79,10 @@ def weighed(
     person's others, and pays for its place. A place is a joint in the picture of a view; joints whose place is
     unknown are thought to be where the others are in the mean.
     """
-    affinity, neighbours = own_affinity(candidate, detections, skeleton)
-    counts = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
-    weight, price = np.where(candidate >= 0, counts, 0.0), np.zeros(len(candidate))
+    weight, price, seen = np.zeros(candidate.shape), np.zeros(len(candidate)), np.nonzero(candidate >= 0)
+    whose = np.ascontiguousarray(seen[0])
+    affinity, neighbours = own_affinity(whose, candidate[seen], candidate, detections, skeleton)
+    weight[seen] = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
     core = set(skeleton.core)
     limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
     _weigh(places, world, rig.K @ rig.cTw, rig.focal_px, rig.image_sizes, limbs, weight, price)

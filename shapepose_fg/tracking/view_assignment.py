@@ -110,38 +110,65 @@ def probabilities(near: Near, detections: int) -> Array:
     return probable
 
 
-def own_affinity(candidate: Index, detections: Detections, skeleton: Skeleton) -> tuple[Array, Index]:
-    """Mean affinity (A, J, V) of people's detections `candidate` (A, J, V) to what they have at the other ends of
-    the joint's limbs, and how many (A, J, V) of these there are.
+def own_affinity(
+    person: Index, detection: Index, candidate: Index, detections: Detections, skeleton: Skeleton
+) -> tuple[Array, Index]:
+    """Mean affinity (N,) of each `detection` (N,) to what a `person` (N,) has of `candidate` (A, J, V) at the
+    other ends of the joint's limbs, and how many (N,) of these there are.
     """
-    affinity, neighbours = np.zeros(candidate.shape), np.zeros(candidate.shape, dtype=np.intp)
-    _affinities(candidate, *_facts(detections), *_limb_ends(skeleton), affinity, neighbours)
-    return affinity, neighbours
+    count, pairs = len(detections), detections.pairs
+    begin, (limb, ends) = np.zeros(count + 2, dtype=np.intp), _limb_ends(skeleton)
+    other, value = np.empty(pairs.size, dtype=np.intp), np.empty(pairs.size)
+    mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
+    _tie(
+        person, detection, candidate, detections.joint, detections.view, pairs, detections.affinity, limb, ends,
+        begin, other, value, mean, neighbours,
+    )  # fmt: skip
+    return mean, neighbours
 
 
 def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> tuple[Index, Near]:
     """The detections (A, J, V), and all that are near."""
     gate_m = np.where(predicted.lost, _REACH_M, np.minimum(_FAR_M + 2 * predicted.sigma_m, FARTHEST_M))
-    variance = _NEAR_M**2 + predicted.sigma_m**2
     world = np.zeros(len(gate_m), dtype=np.intp) if predicted.world is None else predicted.world
-    people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
-    first, *found = _found(places, np.maximum(gate_m, OVERLAP_M), people, rig, skeleton, detections)
+    first, *found = _found(predicted.places, np.maximum(gate_m, OVERLAP_M), world, rig, skeleton, detections)
     person, detection, distance_m = found
     at = person, detections.joint[detection]
-    within, lost = distance_m < gate_m[at], predicted.lost[at]
-    score, tied, likely = np.empty(len(person)), np.empty(len(person)), np.empty(len(person), dtype=bool)
-    chosen = np.full((len(places), len(skeleton), len(rig)), -1, dtype=np.intp)
-    room = chosen.copy(), np.full(len(detections), -1, dtype=np.intp), np.empty(len(person), dtype=np.intp)
-    claims = first, *found, distance_m**2 / variance[at], within, lost, world
-    constants = LEAST_AFFINITY, OVERLAP_M, _PASSES
-    _give_out(*claims, *_facts(detections), *_limb_ends(skeleton), *constants, *room, score, tied, likely, chosen)
+    within, lost, sigma_m = distance_m < gate_m[at], predicted.lost[at], predicted.sigma_m[at]
+    nearness = np.exp(-0.5 * distance_m**2 / (_NEAR_M**2 + sigma_m**2))
+    # Detections of equal scores are told apart by what they are, not by their order: people whom the detector has
+    # grouped have affinities of exactly 1.
+    rank = np.empty(len(detections))
+    rank[np.lexsort((*detections.xy.T, detections.confidence))] = np.arange(len(detections))
+    apart = 1e-10 * rank[detection] / max(len(detections), 1)
+    chosen = np.full((len(gate_m), len(skeleton), len(rig)), -1, dtype=np.intp)
+    for _ in range(_PASSES + 1):
+        before, chosen = chosen, np.full_like(chosen, -1)
+        tied, neighbours = own_affinity(person, detection, before, detections, skeleton)
+        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+        score = nearness + np.where(neighbours > 0, tied, LEAST_AFFINITY)
+        sure = (neighbours > 0) & (tied >= LEAST_AFFINITY)
+        likely = within & np.where(lost, sure, score >= 2 * LEAST_AFFINITY)
+        key, queue = np.round(score, 9) + apart, np.empty(len(person), dtype=np.intp)
+        taken = np.empty(len(detections), dtype=np.intp)
+        _match(first, person, detection, key, likely, world, queue, taken, chosen)
+        if (chosen == before).all():
+            break
+    on_it = np.flatnonzero((distance_m < OVERLAP_M) & (tied >= LEAST_AFFINITY))
+    on_it = on_it[np.argsort(-distance_m[on_it], kind="stable")]  # the nearest is written last
+    place = person[on_it], detections.joint[detection[on_it]], detections.view[detection[on_it]]
+    empty = chosen[place] < 0
+    chosen[tuple(each[empty] for each in place)] = detection[on_it[empty]]
     return chosen, Near(first, person, detection, distance_m, within & ~lost, score, likely)
 
 
 def _found(
-    places: Array, reach_m: Array, people: Index, rig: Rig, skeleton: Skeleton, detections: Detections
+    places: Array, reach_m: Array, world: Index, rig: Rig, skeleton: Skeleton, detections: Detections
 ) -> tuple[Index, Index, Index, Array]:
-    """The first four fields of `Near`: detections within `reach_m` (A, J) of `places` (A, J, 3), metres."""
+    """The first four fields of `Near`: detections within `reach_m` (A, J) of `places` (A, J, 3), metres, of people
+    of the same `world` (A,) one after the other.
+    """
+    people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(places)
     slot = detections.joint * len(rig) + detections.view
     order = np.lexsort((detections.xy[:, 0], slot))
     first = np.searchsorted(slot[order], np.arange(len(skeleton) * len(rig) + 1))
@@ -154,12 +181,6 @@ def _found(
         found = begins, person, detection, distance_m
         count = _near(places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.xy, *found)
     return begins, person[:count], detection[:count], distance_m[:count]
-
-
-def _facts(detections: Detections) -> tuple[Index, Index, Array, Array, Index, Array]:
-    """What kernels look at of a frame."""
-    seen = detections
-    return seen.joint, seen.view, seen.xy, seen.confidence, seen.pairs, seen.affinity
 
 
 @cache
@@ -211,148 +232,67 @@ def _along(row, place):
 
 
 @kernel
-def _give_out(
-    first, person, detection, distance_m, squared, within, lost, world, joint, view, xy, confidence, pairs,
-    affinity, limb, ends, least, overlap_m, passes, before, taken, queue, score, tied, likely, chosen,
+def _tie(
+    person, detection, own, joint, view, pairs, affinity, limb, ends, begin, other, value, mean, neighbours
 ):  # fmt: skip
-    """Fill in `chosen` (A, J, V); score and likely of `Near`. `squared` (N,) are distances in sigmas, squared."""
-    begin, other, value = _by_detection(pairs, affinity, len(joint))
-    for _ in range(passes + 1):
-        for e in range(len(person)):
-            d, own = detection[e], before[person[e]]
-            tied[e], neighbours = _affinity(d, own, joint, view, begin, other, value, limb, ends)
-            # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-            score[e] = np.exp(-0.5 * squared[e]) + (tied[e] if neighbours > 0 else least)
-            enough = (neighbours > 0 and tied[e] >= least) if lost[e] else score[e] >= 2 * least
-            likely[e] = within[e] and enough
-        _match(first, person, detection, score, likely, world, xy, confidence, taken, queue, chosen)
-        if not _copied(chosen, before):
-            break
-    views = chosen.shape[2]
-    for slot in range(len(first) - 1):
-        e = first[slot]
-        while e < first[slot + 1]:  # a person at a time: the nearest of an empty place serves it, too
-            a, best = person[e], -1
-            while e < first[slot + 1] and person[e] == a:
-                on_it = distance_m[e] < overlap_m and tied[e] >= least
-                if on_it and (best < 0 or distance_m[e] <= distance_m[best]):
-                    best = e
-                e += 1
-            if best >= 0 and chosen[a, slot // views, slot % views] < 0:
-                chosen[a, slot // views, slot % views] = detection[best]
+    """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`.
+
+    On the way `begin` (D + 2,), zeros before, `other` and `value` (2 E,): the pairs of each detection.
+    """
+    for e in range(len(pairs)):
+        for end in range(2):
+            if pairs[e, end] + 2 < len(begin):
+                begin[pairs[e, end] + 2] += 1
+    for d in range(2, len(begin)):
+        begin[d] += begin[d - 1]
+    for e in range(len(pairs)):
+        for end in range(2):
+            place = begin[pairs[e, end] + 1]
+            other[place], value[place] = pairs[e, 1 - end], affinity[e]
+            begin[pairs[e, end] + 1] += 1
+    for e in range(len(person)):
+        a, d, count, total = person[e], detection[e], 0, 0.0
+        for n in range(limb[joint[d]], limb[joint[d] + 1]):
+            if own[a, ends[n], view[d]] >= 0:
+                count += 1
+        if count > 0:
+            for n in range(begin[d], begin[d + 1]):
+                if own[a, joint[other[n]], view[other[n]]] == other[n]:
+                    total += value[n]
+            total /= count
+        mean[e], neighbours[e] = total, count
 
 
 @kernel
-def _copied(chosen, before):
-    """Copy what is chosen to `before`; whether that was other."""
-    other = False
-    for a in range(len(chosen)):
-        for j in range(chosen.shape[1]):
-            for v in range(chosen.shape[2]):
-                other = other or before[a, j, v] != chosen[a, j, v]
-                before[a, j, v] = chosen[a, j, v]
-    return other
-
-
-@kernel
-def _match(first, person, detection, score, likely, world, xy, confidence, taken, queue, chosen):
-    """Give each detection of a joint and view to one person, and each person one, the best score first."""
+def _match(first, person, detection, key, likely, world, queue, taken, chosen):
+    """Give each detection of a joint and view to one person, and each person one, the best `key` first."""
     views = chosen.shape[2]
     for slot in range(len(first) - 1):
         j, v, end = slot // views, slot % views, first[slot]
         while end < first[slot + 1]:  # worlds stand one after the other, and do not compete
             of, length = world[person[end]], 0
             while end < first[slot + 1] and world[person[end]] == of:
-                chosen[person[end], j, v], taken[detection[end]] = -1, -1
+                taken[detection[end]] = -1
                 if likely[end]:
                     queue[length] = end
                     length += 1
                 end += 1
-            _sort(queue, length, score, detection, xy, confidence)
+            gap = length // 2
+            while gap > 0:  # sorted in Shell's way
+                for n in range(gap, length):
+                    moved, place = queue[n], n
+                    while place >= gap:
+                        e = queue[place - gap]
+                        if key[e] > key[moved] or (key[e] == key[moved] and e < moved):
+                            break
+                        queue[place] = e
+                        place -= gap
+                    queue[place] = moved
+                gap //= 2
             for n in range(length):
                 a, d = person[queue[n]], detection[queue[n]]
                 if chosen[a, j, v] < 0 and taken[d] < 0:
                     chosen[a, j, v], taken[d] = d, a
-
-
-@kernel
-def _sort(queue, length, score, detection, xy, confidence):
-    """Sort the first entries of a queue, best first (Shell's way)."""
-    gap = length // 2
-    while gap > 0:
-        for n in range(gap, length):
-            moved, place = queue[n], n
-            while place >= gap and _better(moved, queue[place - gap], score, detection, xy, confidence):
-                queue[place] = queue[place - gap]
-                place -= gap
-            queue[place] = moved
-        gap //= 2
-
-
-@kernel
-def _better(one, other, score, detection, xy, confidence):
-    """Whether one comes before another. Detections of equal scores, to nine digits, are told apart by what they
-    are, not by their order: people whom the detector has grouped have affinities of exactly 1.
-    """
-    c, d = detection[one], detection[other]
-    key, others = np.rint(1e9 * score[one]), np.rint(1e9 * score[other])
-    if key != others:
-        return key > others
-    if c == d:
-        return one < other
-    if confidence[c] != confidence[d]:
-        return confidence[c] > confidence[d]
-    if xy[c, 1] != xy[d, 1]:
-        return xy[c, 1] > xy[d, 1]
-    return xy[c, 0] > xy[d, 0] if xy[c, 0] != xy[d, 0] else c > d
-
-
-@kernel
-def _affinity(d, own, joint, view, begin, other, value, limb, ends):
-    """Mean affinity of a detection to a person's `own` (J, V) at the other ends of its joint's limbs, and how many
-    these are.
-    """
-    neighbours, total = 0, 0.0
-    for n in range(limb[joint[d]], limb[joint[d] + 1]):
-        neighbours += own[ends[n], view[d]] >= 0
-    if neighbours > 0:
-        for n in range(begin[d], begin[d + 1]):
-            if own[joint[other[n]], view[other[n]]] == other[n]:
-                total += value[n]
-    return total / neighbours if neighbours > 0 else 0.0, neighbours
-
-
-@kernel
-def _by_detection(pairs, affinity, count):
-    """The pairs of each detection one after the other: where each one's begin, the others, their affinities."""
-    begin = np.zeros(count + 2, dtype=np.intp)
-    for pair in pairs:
-        begin[pair[0] + 2] += 1
-        begin[pair[1] + 2] += 1
-    for d in range(count):
-        begin[d + 2] += begin[d + 1]
-    other, value = np.empty(2 * len(pairs), dtype=np.intp), np.empty(2 * len(pairs))
-    for e in range(len(pairs)):
-        for end in range(2):
-            place = begin[pairs[e, end] + 1]
-            other[place], value[place] = pairs[e, 1 - end], affinity[e]
-            begin[pairs[e, end] + 1] += 1
-    return begin, other, value
-
-
-@kernel
-def _affinities(candidate, joint, view, xy, confidence, pairs, affinity, limb, ends, mean, neighbours):
-    """Fill in what `own_affinity` returns."""
-    begin, other, value = _by_detection(pairs, affinity, len(joint))
-    people, joints, views = candidate.shape
-    for a in range(people):
-        for j in range(joints):
-            for v in range(views):
-                d = candidate[a, j, v]
-                if d >= 0:
-                    mean[a, j, v], neighbours[a, j, v] = _affinity(
-                        d, candidate[a], joint, view, begin, other, value, limb, ends
-                    )
 
 
 @kernel
