@@ -59,6 +59,10 @@ class StageOne:
     def _by_hips(self, detections: Detections, rig: Rig) -> Observations:
         """As the paper has it: votes, hips that anchor people, and joints linked to them."""
         points, skeleton, book = self._points(detections, rig), self.skeleton, self.book
+        if not np.isin(points.joint, skeleton.root).any() and not np.isin(skeleton.hips, points.joint).all():
+            return Observations.of(
+                np.full((0, len(skeleton), len(rig)), -1), detections, np.zeros((0, len(skeleton), 3))
+            )
         with book.stage("vote"):
             every = vote(points, detections, len(rig), self.candidates)
             candidates = thinned_candidates(every, detections, self.candidates)
