@@ -87,12 +87,7 @@ def weighed(
     centre = np.where(known[..., None], places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
     at, P, core = np.where(known[..., None], places, centre[:, None]), rig.K @ rig.cTw, set(skeleton.core)
     limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
-    room = (
-        np.empty((3, *known.shape)),
-        np.empty((len(at), 3)),
-        np.empty(known.shape, dtype=bool),
-        np.zeros(len(at)),
-    )
+    room = np.empty((3, *known.shape)), np.empty((len(at), 3)), np.zeros(len(at))
     _weigh(at, known, world, P, rig.focal_px, rig.image_sizes, limbs, *room, weight, price)
     return weight, price
 
