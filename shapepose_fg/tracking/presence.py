@@ -108,11 +108,9 @@ def _weigh(places, known, world, P, focal, sizes, limbs, seen, box, expected, we
                 x, y, depth = seen[0, a, j], seen[1, a, j], seen[2, a, j]
                 if not (depth > 0 and 0 <= x < sizes[v, 0] and 0 <= y < sizes[v, 1]):
                     continue
-                cost = _PRICE_HIDDEN
-                if known[a, j] and not _behind(
-                    a, x, y, depth - _IN_FRONT_M, known, world, limbs, seen, box, focal[v]
-                ):
-                    cost = _PRICE
+                place = a, x, y, depth - _IN_FRONT_M
+                hidden = not known[a, j] or _behind(place, known, world, limbs, seen, box, focal[v])
+                cost = _PRICE_HIDDEN if hidden else _PRICE
                 weight[a, j, v] *= 1 + cost
                 price[a] += cost
                 expected[a] += 1
