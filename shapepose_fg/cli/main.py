@@ -20,8 +20,8 @@ from shapepose_fg.cli.report import report
 from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
+from shapepose_fg.cli.terminal import note_log, say, show, use_any_streams
 from shapepose_fg.cli.terminal import progress as progress_bar
-from shapepose_fg.cli.terminal import say, show, use_any_streams
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.train_fitter import train_fitter
 from shapepose_fg.cli.view import view
@@ -57,6 +57,7 @@ _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line. An error is one sentence on stderr and exit code 2."""
     use_any_streams()
+    note_log()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with stoppable():
