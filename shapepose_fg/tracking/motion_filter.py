@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import Motion
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.compiled import kernel
 
 
 @dataclass(frozen=True)
@@ -68,27 +69,37 @@ class JointStates:
 
         A negative step predicts into the past.
         """
-        F, noise = (np.kron(each, np.eye(3)) for each in motion.step(step_s, density))
-        return JointStates(self.mean @ F.T, F @ self.covariance @ F.T + noise)
-
-    def updated(self, information: Array, pull: Array) -> "JointStates":
-        """After a measurement z of the positions with `information` L (A, J, 3, 3) and L (z - position) = `pull`.
-
-        L may be singular (a joint that one view sees) or zero: the gain P (I + L P)^-1 needs no inverse of it.
-        """
-        P = self.covariance[..., :3, :3]
-        gain = self.covariance[..., :, :3] @ np.linalg.inv(np.eye(3) + information @ P)
-        mean = self.mean + np.einsum("...ij,...j->...i", gain, pull)
-        covariance = self.covariance - gain @ information @ self.covariance[..., :3, :]
-        return JointStates(mean, (covariance + np.swapaxes(covariance, -1, -2)) / 2)
-
-    def replaced(self, where: Mask, other: "JointStates") -> "JointStates":
-        """The same, with the joints `where` (A, J) from another."""
-        return JointStates(
-            np.where(where[..., None], other.mean, self.mean),
-            np.where(where[..., None, None], other.covariance, self.covariance),
-        )
+        F, noise = motion.step(step_s, density)
+        mean, covariance = np.empty_like(self.mean), np.empty_like(self.covariance)
+        _predict(self.mean, self.covariance, F, noise, mean, covariance)
+        return JointStates(mean, covariance)
 
     def with_derivatives(self, *derivatives: Array) -> "JointStates":
         """The same with other mean velocities (A, J, 3), and with what is beyond these."""
         return replace(self, mean=np.concatenate([self.position, *derivatives], axis=-1))
+
+
+@kernel
+def _predict(mean, covariance, F, noise, mean_after, covariance_after):
+    """F m and F P F^T + Q of all joints, with F (n, n) and Q (J, n, n) for each axis."""
+    people, joints, size = mean.shape
+    order, half = len(F), np.empty((size, size))
+    for a in range(people):
+        for j in range(joints):
+            for i in range(order):
+                for x in range(3):
+                    row, total = 3 * i + x, 0.0
+                    for k in range(order):
+                        total += F[i, k] * mean[a, j, 3 * k + x]
+                    mean_after[a, j, row] = total
+                    for column in range(size):
+                        half[row, column] = 0.0
+                        for k in range(order):
+                            half[row, column] += F[i, k] * covariance[a, j, 3 * k + x, column]
+            for row in range(size):
+                for i in range(order):
+                    for x in range(3):
+                        total = noise[j, row // 3, i] if row % 3 == x else 0.0
+                        for k in range(order):
+                            total += half[row, 3 * k + x] * F[i, k]
+                        covariance_after[a, j, row, 3 * i + x] = total

@@ -3,6 +3,7 @@
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.skeleton import Skeleton
 
 
@@ -20,41 +21,63 @@ def torn_joints(
     where it is `reach_m` farther than bones are long: nearer, whole bodies put it right.
     """
     torn = np.zeros(trusted.shape, dtype=bool)
-    person, joint, parent = np.arange(len(places))[:, None], np.arange(len(skeleton)), np.array(skeleton.parents)
-    doubt = 0.1 / (1.0 + views)  # less than any difference of shares of a joint's few bones
-    while True:
-        judged = trusted & ~torn
-        above, allowed_m = _judged_above(judged, longest_m, skeleton)
-        bone = above == parent
-        apart_m = np.linalg.norm(places - places[person, above], axis=-1)
-        long = judged & (above != joint) & (np.nan_to_num(apart_m) > allowed_m + np.where(bone, 0.0, reach_m))
-        compared = (judged & bone) | long
-        count, too_long = compared.astype(float), long.astype(float)
-        for of, those in ((count, compared), (too_long, long)):
-            rows, children = np.nonzero(those & bone)
-            np.add.at(of, (rows, parent[children]), 1.0)
-        share = np.where(too_long > 0, too_long / np.maximum(count, 1.0) + doubt, 0.0)
-        rows = np.flatnonzero(share.max(axis=1, initial=0.0) > 0)
-        if len(rows) == 0:
-            return torn
-        torn[rows, share[rows].argmax(axis=1)] = True
+    _tear(np.ascontiguousarray(places), trusted, views, longest_m, np.array(skeleton.parents), reach_m, torn)
+    return torn
 
 
-def _judged_above(judged: Mask, longest_m: Array, skeleton: Skeleton) -> tuple[Index, Array]:
-    """For each joint the nearest `judged` (A, J) one above it, (A, J), and the longest way there, metres.
+@kernel
+def _tear(places, trusted, views, longest_m, parents, reach_m, torn):
+    """Fill in `torn` (A, J)."""
+    people, joints = trusted.shape
+    above, way_m = np.empty(joints, dtype=np.intp), np.empty(joints)
+    count, too_long = np.empty(joints), np.empty(joints)
+    for a in range(people):
+        worst = 0
+        while worst >= 0:
+            judged = trusted[a] & ~torn[a]
+            _judged_above(judged, longest_m, parents, above, way_m)
+            count[:], too_long[:] = 0.0, 0.0
+            for j in range(joints):
+                if not judged[j] or above[j] == j:
+                    continue
+                bone, squared = above[j] == parents[j], 0.0
+                for x in range(3):
+                    squared += (places[a, j, x] - places[a, above[j], x]) ** 2
+                long = np.sqrt(squared) > way_m[j] + (0.0 if bone else reach_m)
+                if bone or long:
+                    count[j] += 1.0
+                    too_long[j] += 1.0 if long else 0.0
+                if bone:
+                    count[parents[j]] += 1.0
+                    too_long[parents[j]] += 1.0 if long else 0.0
+            worst, most = -1, 0.0
+            for j in range(joints):
+                if too_long[j] > 0:
+                    # The doubt is less than any difference of shares of a joint's few bones.
+                    share = too_long[j] / count[j] + 0.1 / (1.0 + views[a, j])
+                    if share > most:
+                        worst, most = j, share
+            if worst >= 0:
+                torn[a, worst] = True
+
+
+@kernel
+def _judged_above(judged, longest_m, parents, above, way_m):
+    """For each joint the nearest `judged` (J,) one above it, (J,), and the longest way there, metres (J,).
 
     Joints with none above them have the first of these, by way of the root; that one has itself.
     """
-    count, person = len(skeleton), np.arange(len(judged))[:, None]
-    parent = np.array([*skeleton.parents, -1])
-    parent[parent < 0] = count  # a place above the root, where every way ends
-    longest = np.append(np.where(parent[:count] < count, longest_m, 0.0), 0.0)
-    ends = np.append(judged, np.ones((len(judged), 1), dtype=bool), axis=1)
-    above, way_m = (np.tile(of[:count], (len(judged), 1)) for of in (parent, longest))
-    for _ in skeleton.tree_levels:
-        on = ~ends[person, above]
-        way_m = way_m + np.where(on, longest[above], 0.0)
-        above = np.where(on, parent[above], above)
-    top = above == count
-    first = (top & judged).argmax(axis=1)[:, None]
-    return np.where(top, first, above), way_m + np.where(top, way_m[person, first], 0.0)
+    first = -1
+    for j in range(len(judged)):
+        above[j], way_m[j] = parents[j], longest_m[j] if parents[j] >= 0 else 0.0
+        while above[j] >= 0 and not judged[above[j]]:
+            if parents[above[j]] >= 0:
+                way_m[j] += longest_m[above[j]]
+            above[j] = parents[above[j]]
+        if above[j] < 0 and judged[j] and first < 0:
+            first = j
+    top_m = way_m[first]
+    for j in range(len(judged)):
+        if above[j] < 0:
+            above[j] = first
+            way_m[j] += top_m

@@ -1,6 +1,6 @@
 """Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
-from shapepose_fg.core.camera import Rig, beside_segment
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import mean_affinity, owned
+from shapepose_fg.tracking.view_assignment import own_affinity
 
 _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
@@ -78,49 +79,107 @@ def weighed(
     person's others, and pays for its place. A place is a joint in the picture of a view; joints whose place is
     unknown are thought to be where the others are in the mean.
     """
-    known = np.asarray(np.isfinite(places).all(axis=-1))[..., None]
-    centre = np.where(known, places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    xy, depth = rig.project(np.where(known, places, centre[:, None]))
-    inside = ((xy >= 0) & (xy < rig.image_sizes[:, None, None])).all(axis=-1) & (depth > 0)
-    expected = np.maximum(inside.sum(axis=(0, 2)), 1)
-    hidden = ~known[..., 0] | _behind_others(xy, depth, known[..., 0], rig, skeleton, world)
-    price = np.where(inside, np.where(hidden, _PRICE_HIDDEN, _PRICE), 0.0)
-    weight = np.zeros(candidate.shape)
-    seen = candidate >= 0
-    if seen.any():
-        affinity, neighbours = mean_affinity(owned(candidate, len(detections)), detections, skeleton, len(rig))
-        counts = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
-        weight[seen] = counts[np.nonzero(seen)[0], candidate[seen]]
-    weight *= 1 + np.moveaxis(price, 0, 2)
-    return weight / expected[:, None, None], price.sum(axis=(0, 2)) / expected
-
-
-def _behind_others(xy: Array, depth: Array, known: Mask, rig: Rig, skeleton: Skeleton, world: Index) -> Mask:
-    """(V, A, J) joints, at pixels (V, A, J, 2) and depths, behind a limb of somebody else of the same world.
-
-    Limbs hide whose both ends are `known` (A, J).
-    """
+    weight, price, seen = np.zeros(candidate.shape), np.zeros(len(candidate)), np.nonzero(candidate >= 0)
+    whose = np.ascontiguousarray(seen[0])
+    affinity, neighbours = own_affinity(whose, candidate[seen], candidate, detections, skeleton)
+    weight[seen] = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
     core = set(skeleton.core)
-    ends = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core]).T
-    away = np.where(known, depth, np.nan)
-    least_m, most_m = np.fmin.reduce(away, axis=2), np.fmax.reduce(away, axis=2)
-    focal_px, flat = rig.focal_px.astype(np.float32), np.where(known[..., None], xy, np.nan)
-    margin = (_LIMB_M * focal_px[:, None] / np.maximum(least_m, _LIMB_M))[..., None]
-    low, high = np.fmin.reduce(flat, axis=2) - margin, np.fmax.reduce(flat, axis=2) + margin
-    other = (world[:, None] == world) & ~np.eye(len(world), dtype=bool)
-    other = other & (low[:, :, None] < high[:, None]).all(axis=-1) & (low[:, None] < high[:, :, None]).all(axis=-1)
-    view, whose, who = np.nonzero(other & (least_m[:, None] < most_m[:, :, None] - _IN_FRONT_M))
-    # Everything in arrays (pairs, joints, limbs), a coordinate each: sums over an axis of two are slow.
-    x, y, z = (of.astype(np.float32) for of in (flat[..., 0], flat[..., 1], away))
-    first, second = ([of[view, who][:, None, end] for of in (x, y, z)] for end in ends)
-    place, deep = xy[view, whose, :, None].astype(np.float32), depth[view, whose, :, None]
-    squared, at = beside_segment(place[..., 0], place[..., 1], first, second)
-    hides = squared * at * at < ((_LIMB_M * focal_px[view]) ** 2)[:, None, None]
-    hides &= at < deep.astype(np.float32) - _IN_FRONT_M
-    hidden = np.zeros(depth.shape, dtype=bool)
-    pair, joint = np.nonzero(hides.any(axis=2))
-    hidden[view[pair], whose[pair], joint] = True
-    return hidden
+    limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
+    _weigh(places, world, rig.K @ rig.cTw, rig.focal_px, rig.image_sizes, limbs, weight, price)
+    return weight, price
+
+
+@kernel
+def _weigh(places, world, P, focal, sizes, limbs, weight, price):
+    """Make what detections count, `weight` (A, J, V), a share of the places; fill in `price` (A,)."""
+    people, joints, views = weight.shape
+    x, y, depth = np.empty((people, joints)), np.empty((people, joints)), np.empty((people, joints))
+    expected, box, hidden = np.zeros(people), np.empty((people, 6)), np.zeros((people, joints))
+    for v in range(views):
+        for a in range(people):
+            _pictured(places[a], P[v], focal[v], x[a], y[a], depth[a], hidden[a], box[a])
+        for a in range(people):
+            for b in range(people):
+                if a != b and world[a] == world[b]:
+                    _hide(x, y, depth, box, a, b, focal[v], limbs, places[b], hidden[a])
+            for j in range(joints):
+                if depth[a, j] > 0 and 0 <= x[a, j] < sizes[v, 0] and 0 <= y[a, j] < sizes[v, 1]:
+                    cost = _PRICE_HIDDEN if hidden[a, j] > 0 else _PRICE
+                    weight[a, j, v] *= 1 + cost
+                    price[a] += cost
+                    expected[a] += 1.0
+    for a in range(people):
+        over = 1.0 / expected[a] if expected[a] > 0 else 1.0
+        price[a] *= over
+        for j in range(joints):
+            for v in range(views):
+                weight[a, j, v] *= over
+
+
+@kernel
+def _pictured(places, P, focal, x, y, depth, hidden, box):
+    """Pixels and depths of joints in a view, NaN pixels behind it; unknown joints are amidst others, and hidden.
+
+    `box` (6,): what known joints are between, left and right, top and bottom, with a limb's width, near and far.
+    """
+    cx, cy, cz, count = 0.0, 0.0, 0.0, 0.0
+    for side in range(0, 6, 2):
+        box[side], box[side + 1] = np.inf, -np.inf
+    for j in range(len(places)):
+        hidden[j] = 0.0 if np.isfinite(places[j, 0] + places[j, 1] + places[j, 2]) else 1.0
+        if hidden[j] == 0:
+            cx, cy, cz, count = cx + places[j, 0], cy + places[j, 1], cz + places[j, 2], count + 1
+    over = 1.0 / count if count > 0 else 0.0
+    for j in range(len(places)):
+        X, Y, Z = cx * over, cy * over, cz * over
+        if hidden[j] == 0:
+            X, Y, Z = places[j, 0], places[j, 1], places[j, 2]
+        depth[j] = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        nearer = 1.0 / depth[j] if depth[j] > 0 else np.nan
+        x[j] = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) * nearer
+        y[j] = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) * nearer
+        if hidden[j] == 0:
+            _widen(box, 0, x[j])
+            _widen(box, 2, y[j])
+            _widen(box, 4, depth[j])
+    margin = _LIMB_M * focal / (box[4] if box[4] > _LIMB_M else _LIMB_M)
+    for low in (0, 2):
+        box[low] -= margin
+        box[low + 1] += margin
+
+
+@kernel
+def _widen(box, side, value):
+    """Make a box reach a value, which may be NaN."""
+    if value < box[side]:
+        box[side] = value
+    if value > box[side + 1]:
+        box[side + 1] = value
+
+
+@kernel
+def _hide(x, y, depth, box, a, b, focal, limbs, places, hidden):
+    """Mark the joints of `a` that are behind a limb of `b`, both of whose ends are in `places`, in a view."""
+    near, far = box[b], box[a]
+    if not (near[0] < far[1] and far[0] < near[1] and near[2] < far[3] and far[2] < near[3]):
+        return
+    for j in range(len(hidden)):
+        behind = depth[a, j] - _IN_FRONT_M
+        if hidden[j] > 0 or not (near[4] < behind and near[0] < x[a, j] < near[1] and near[2] < y[a, j] < near[3]):
+            continue
+        for n in range(len(limbs)):
+            one, two = limbs[n, 0], limbs[n, 1]
+            if not np.isfinite(places[one, 0] + places[two, 0]):
+                continue
+            to_x, to_y = x[a, j] - x[b, one], y[a, j] - y[b, one]
+            dx, dy = x[b, two] - x[b, one], y[b, two] - y[b, one]
+            length, along = dx * dx + dy * dy, to_x * dx + to_y * dy
+            along = 0.0 if along <= 0 else 1.0 if along >= length else along / length
+            to_x, to_y = to_x - along * dx, to_y - along * dy
+            at = depth[b, one] + along * (depth[b, two] - depth[b, one])
+            if (to_x * to_x + to_y * to_y) * at * at < (_LIMB_M * focal) ** 2 and at < behind:
+                hidden[j] = 1.0
+                break
 
 
 def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:
@@ -150,7 +209,7 @@ class Account:
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
-    price: Real
+    price: Array
     """(H, T) what being there costs."""
     there: Mask
     """(H, T) where there is something to say."""
@@ -164,8 +223,6 @@ class Account:
     """And the last."""
     least_s: float
     """Least evidence of a person, seconds."""
-    appears_s: float = _APPEARS_S
-    """What it costs to appear or vanish while others are watched, seconds."""
 
     @classmethod
     def of(
@@ -180,7 +237,7 @@ class Account:
         weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
         seen = np.append(np.flatnonzero(counts), 0)
         span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
-        return cls(place, weights, price, there, lasts_s, count, *span, least_s)
+        return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
 
     def choose(self, world: Index) -> Chosen:
         """The first of `ways`."""
@@ -195,14 +252,14 @@ class Account:
         that goes over from one person to another, always to who is seen better, is better than either of them, and
         leaves the others with too little.
         """
-        account, first = self, np.zeros(len(world), dtype=bool)
-        if on_trial:
-            account = replace(self, appears_s=_ON_TRIAL * self.appears_s, least_s=_ON_TRIAL * self.least_s)
+        first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(world) == 0:
-            return [account.in_turn(first)]
-        bound = np.bincount(world, np.maximum(account.best_segments(account.alone)[0], 0.0))
+            return [self.in_turn(first)]
+        segment, costs = np.zeros(3, dtype=np.intp), (asked * _APPEARS_S, self.begins, self.ends)
+        best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.alone])
+        bound = np.bincount(world, np.maximum(best_s, 0.0))
         tried = np.argsort(-bound, kind="stable")[:_WORLDS]
-        found = [account.in_turn(first), *(account.in_turn(world == each) for each in tried)]
+        found = [self.in_turn(each, asked) for each in (first, *(world == each for each in tried))]
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
     def agreement(self, one: Chosen, other: Chosen) -> float:
@@ -219,68 +276,121 @@ class Account:
 
     def left_over(self, chosen: Chosen) -> Chosen:
         """Who would be there besides those whom `choose` has `chosen`, if appearing cost nothing."""
-        return replace(self, appears_s=0.0).in_turn(np.zeros(len(self.there), dtype=bool), chosen)
-
-    @property
-    def free(self) -> NDArray[np.float32]:
-        """(D + 1,) 1 for every detection, as long as nobody has any; 0 for none."""
-        return np.append(np.ones(self.detections, dtype=np.float32), np.float32(0))
+        return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
     @cached_property
     def alone(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
-        return self.gains(self.free, slice(0, len(self.lasts_s)))
+        share = self.weight.sum(axis=2, dtype=np.float64)
+        return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
 
-    def gains(self, free: NDArray[np.float32], span: slice) -> Array:
-        """(H, S) evidence of each hypothesis in the frames of `span`, seconds, of detections that are `free`."""
-        share = np.einsum("htk,htk->ht", self.weight[:, span], free[self.place[:, span]])
-        return np.where(self.there[:, span], (share - self.price[:, span]) * self.lasts_s[span], -np.inf)
-
-    def in_turn(self, first: Mask, before: Chosen | None = None) -> Chosen:
-        """People one after the other, the best of those `first` (H,) before all others, besides those `before`."""
-        free, gains, chosen = self.free, self.alone.copy(), list[tuple[int, int, int, float]]()
-        taken, least = np.zeros(self.there.shape, dtype=bool), self.least_s
-        if before is not None:
-            for h, start, stop in zip(before.hypothesis, before.start, before.stop, strict=True):
-                free[self.place[h, start:stop]] = 0.0
-                taken[h, start:stop] = True
-            gains = np.where(taken, -np.inf, self.gains(free, slice(0, len(self.lasts_s))))
-        while len(gains) > 0:
-            value, start, stop = self.best_segments(gains)
-            if first.any() and value[first].max() < least:
-                first = np.zeros_like(first)
-            best = int(np.where(first | ~first.any(), value, -np.inf).argmax())
-            if value[best] < least:
-                break
-            span = slice(int(start[best]), int(stop[best]))
-            chosen.append((best, span.start, span.stop, float(value[best])))
-            free[self.place[best, span]] = 0.0
-            taken[best, span] = True
-            gains[:, span] = np.where(taken[:, span], -np.inf, self.gains(free, span))
-        columns = np.array(chosen, dtype=np.float64).reshape(-1, 4).T
-        hypothesis, start, stop = columns[:3].astype(np.intp)
-        return Chosen(hypothesis, start, stop, columns[3])
-
-    def best_segments(self, gains: Array) -> tuple[Array, Index, Index]:
-        """The segment with the greatest sum of each row of `gains` (H, T): value (H,), start (H,), stop (H,).
-
-        Where a segment begins after the first frame in which anything is seen, or stops before the last, it costs
-        `appears_s` each. No part of it costs more than to vanish and to appear again.
+    @cached_property
+    def holders(self) -> tuple[Index, Index, Array]:
+        """Where those who have each detection begin, (D + 1,), who they are, and what it counts for them, one
+        detection after the other.
         """
-        H, T = gains.shape
-        running, peak, since = np.full(H, -np.inf), np.full(H, -np.inf), np.zeros(H, dtype=np.intp)
-        value, start, stop = np.full(H, -np.inf), np.zeros(H, dtype=np.intp), np.zeros(H, dtype=np.intp)
-        for t in range(T):
-            afresh = -self.appears_s if t > self.begins else 0.0
-            begins = running < np.maximum(afresh, peak - 2 * self.appears_s)
-            since = np.where(begins, t, since)
-            running = np.where(begins, afresh, running) + gains[:, t]
-            peak = np.where(begins, running, np.maximum(peak, running))
-            ends = running - (self.appears_s if t < self.ends else 0.0)
-            better = ends > value
-            value, start, stop = (
-                np.where(better, ends, value),
-                np.where(better, since, start),
-                np.where(better, t + 1, stop),
-            )
-        return value, start, stop
+        counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
+        begin = np.cumsum(np.concatenate([[0, 0], counts]))
+        who, what = np.empty(begin[-1], dtype=np.intp), np.empty(begin[-1])
+        _holders(self.place, self.weight, begin, who, what)
+        return begin[:-1], who, what
+
+    def in_turn(self, first: Mask, asked: float = 1.0, besides: Chosen | None = None) -> Chosen:
+        """People one after the other, the best of those `first` (H,) before all others: so many as have the least
+        evidence, or the share of it that is `asked` for.
+
+        Those `besides` come before all, and are not returned; for who comes besides them appearing costs nothing.
+        """
+        before = np.zeros((0, 3), dtype=np.intp)
+        if besides is not None:
+            before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
+        appears_s = asked * _APPEARS_S if besides is None else 0.0
+        given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first, before
+        costs, (H, T) = (appears_s, self.begins, self.ends, asked * self.least_s), self.there.shape
+        free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)
+        room = np.empty((H, 3), dtype=np.intp), np.empty(H)
+        chosen, evidence = np.empty((H * T, 3), dtype=np.intp), np.empty(H * T)
+        count = _in_turn(*given, *costs, free, changed, *room, chosen, evidence)
+        return Chosen(*chosen[:count].T.copy(), evidence[:count])
+
+
+@kernel
+def _holders(place, weight, begin, who, what):
+    """Fill in `Account.holders` of places and weights (H, T, K); `begin` (D + 2,) has its first entry twice."""
+    people, frames, places = place.shape
+    for h in range(people):
+        for t in range(frames):
+            for k in range(places):
+                d = place[h, t, k]
+                if d + 2 < len(begin):
+                    at = begin[d + 1]
+                    who[at], what[at] = h, weight[h, t, k]
+                    begin[d + 1] += 1
+
+
+@kernel
+def _in_turn(
+    gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free, changed, segment,
+    value, chosen, evidence,
+):  # fmt: skip
+    """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of those whom `Account.in_turn`
+    chooses; returns how many there are.
+    """
+    people, count = len(gains), 0
+    for n in range(len(besides)):
+        _take(besides[n], gains, place, begin, who, what, lasts, free, changed)
+    while people > 0:
+        before_all, best = False, -1
+        for h in range(people):
+            if changed[h]:
+                value[h] = _best_segment(gains[h], appears, begins, ends, h, segment[h])
+                changed[h] = False
+            before_all = before_all or (first[h] and value[h] >= least)
+        for h in range(people):
+            if (first[h] or not before_all) and (best < 0 or value[h] > value[best]):
+                best = h
+        if value[best] < least:
+            break
+        evidence[count] = value[best]
+        for n in range(3):
+            chosen[count, n] = segment[best, n]
+        _take(chosen[count], gains, place, begin, who, what, lasts, free, changed)
+        count += 1
+    return count
+
+
+@kernel
+def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
+    """Somebody is there for some frames: their detections are evidence of nobody else."""
+    person = chosen[0]
+    changed[person] = True
+    for t in range(chosen[1], chosen[2]):
+        gains[person, t] = -np.inf
+        for k in range(place.shape[2]):
+            d = place[person, t, k]
+            if d < len(free) and free[d]:
+                free[d] = False
+                for n in range(begin[d], begin[d + 1]):
+                    gains[who[n], t] -= what[n] * lasts[t]
+                    changed[who[n]] = True
+
+
+@kernel
+def _best_segment(gains, appears, begins, ends, person, segment):
+    """The segment of `gains` (T,) with the greatest sum, which is returned; `segment` (3,) is who, start and stop.
+
+    Where it begins after the frame `begins`, or stops before the frame `ends`, it costs `appears` each. No part of
+    it costs more than to vanish and to appear again.
+    """
+    running, peak, since, best = -np.inf, -np.inf, 0, -np.inf
+    segment[0], segment[1], segment[2] = person, 0, 0
+    for t in range(len(gains)):
+        afresh = -appears if t > begins else 0.0
+        if running < afresh or running < peak - 2 * appears:
+            since, running, peak = t, afresh, -np.inf
+        running += gains[t]
+        peak = running if running > peak else peak
+        closed = running - (appears if t < ends else 0.0)
+        if closed > best:
+            best, segment[1], segment[2] = closed, since, t + 1
+    return best

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
-from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
+from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.proposal.association import seen_twice
+from shapepose_fg.tracking.measuring import measured
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.view_assignment import FARTHEST_M, Predicted, assign
@@ -41,8 +42,6 @@ _FOLLOW_S = 0.25
 """Time constant with which the velocity of an unseen joint becomes that of the person."""
 _FOLLOW_SIGMA_M = 0.05
 """Sigma from which on a joint counts as unseen in this sense."""
-_ITERATIONS = 3
-"""How often gates and linearisation are made anew in one frame."""
 _MIN_SEEN_TWICE = 4
 """Core joints that two views must see for a frame to count as evidence of the person."""
 _MIN_IN_A_VIEW = 9
@@ -226,26 +225,11 @@ class Tracker:
         self, joints: JointStates, lost: Mask, candidate: Index, detections: Detections, rig: Rig
     ) -> tuple[JointStates, Index]:
         """Joints after this frame's observations, and those of them that were kept."""
-        if len(joints) == 0:
-            return joints, candidate
-        seen = Observations.of(candidate, detections, np.where(lost[..., None], np.nan, joints.position))
-        views = Views.of(rig)
-        sigmas = observation_sigmas(seen, joints.position, views, self.observation, self.skeleton.joints)
-        placed = triangulate(seen, views, self.observation)
-        at = np.where(np.isfinite(placed), placed, joints.position)
-        measured, inlier = joints, candidate >= 0
-        for _ in range(_ITERATIONS):
-            said = linearise(seen, sigmas, at, views, self.observation)
-            toward = np.einsum("...ij,...j->...i", said.information, at - joints.position) - said.gradient
-            measured, inlier = joints.updated(said.information, toward), said.inlier
-            at = measured.position
-        trusted = measured.sigma_m < _TRUSTED_M
-        torn = torn_joints(at, trusted, inlier.sum(axis=-1), self.scale.longest_m, self.skeleton, FARTHEST_M)
-        doubt = np.zeros(joints.covariance.shape[-2:])
-        doubt[:3, :3] = FARTHEST_M**2 * np.eye(3)
-        doubted = JointStates(measured.mean, measured.covariance + doubt)
-        measured = measured.replaced(torn, doubted)
-        return measured, np.where(inlier & ~torn[..., None], candidate, -1)
+        joints, inlier = measured(joints, lost, candidate, detections, rig, self.observation, self.skeleton.joints)
+        trusted, views = joints.sigma_m < _TRUSTED_M, inlier.sum(axis=-1)
+        torn = torn_joints(joints.position, trusted, views, self.scale.longest_m, self.skeleton, FARTHEST_M)
+        joints.covariance[torn, :3, :3] += FARTHEST_M**2 * np.eye(3)
+        return joints, np.where(inlier & ~torn[..., None], candidate, -1)
 
     def evident(self, candidate: Index) -> Mask:
         """(A,) whether enough core joints are seen by two views, or by one."""

@@ -12,7 +12,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
-from shapepose_fg.tracking.view_assignment import Predicted, assign, assign_with_probability
+from shapepose_fg.tracking.view_assignment import Near, Predicted, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 
@@ -179,17 +179,30 @@ def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
     possible[0, 2:4] = possible[1, 4] = False
     weight = np.where(possible, np.exp(5 * (score - 0.45)), 0.0)
     expected = by_enumeration(weight, detections.view)
-    found = view_assignment.probabilities(score, possible, detections, 2)
-    np.testing.assert_allclose(found[:, [1, 3]], expected[:, [1, 3]], atol=1e-9)
-    np.testing.assert_allclose(found, expected, atol=0.15)  # both can have wrist 0 and both wrist 4: a cycle
-    alone = view_assignment.probabilities(score[:1], possible[:1], detections, 2)
-    np.testing.assert_allclose(alone, by_enumeration(weight[:1], detections.view), atol=1e-12)
+
+    def found(score, possible, view):
+        """(A, D) of `probabilities`, which wants what is possible sorted by view."""
+        order = np.argsort(view, kind="stable")
+        person, place = np.nonzero(np.ones_like(score))
+        by_view = np.lexsort((person, view[order[place]]))
+        person, detection = person[by_view], order[place[by_view]]
+        first = np.searchsorted(view[detection], np.arange(3))
+        inside = possible[person, detection]
+        given = Near(
+            first, person, detection, np.zeros(len(person)), inside, score[person, detection], ~inside & False
+        )
+        probable = np.zeros(score.shape)
+        probable[person, detection] = view_assignment.probabilities(given, len(view))
+        return probable
+
+    view = detections.view
+    both = found(score, possible, view)
+    np.testing.assert_allclose(both[:, [1, 3]], expected[:, [1, 3]], atol=1e-9)
+    np.testing.assert_allclose(both, expected, atol=0.15)  # both can have wrist 0 and both wrist 4: a cycle
+    np.testing.assert_allclose(found(score[:1], possible[:1], view), by_enumeration(weight[:1], view), atol=1e-12)
     order = np.array([3, 0, 4, 1, 2])
-    shuffled = Detections(
-        detections.view[order], np.full(5, 4), np.zeros((5, 2)), np.ones(5), nothing, np.zeros(0)
-    )
-    again = view_assignment.probabilities(score[::-1][:, order], possible[::-1][:, order], shuffled, 2)
-    np.testing.assert_allclose(again[::-1], found[:, order], atol=1e-12)
+    again = found(score[::-1][:, order], possible[::-1][:, order], view[order])
+    np.testing.assert_allclose(again[::-1], both[:, order], atol=1e-12)
 
 
 def test_two_people_side_by_side_are_less_certain_than_one_alone(five_cameras, two_people, seen_exactly):

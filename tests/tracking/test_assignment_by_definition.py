@@ -132,7 +132,7 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
     predicted, crowded, five_cameras, monkeypatch, settle
 ):
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
-    monkeypatch.setattr(view_assignment, "probabilities", lambda score, *_: np.full(score.shape, 0.6))
+    monkeypatch.setattr(view_assignment, "probabilities", lambda near, _: np.full(len(near.score), 0.6))
     settle(passes=1, overlap_m=0.3, farthest_m=0.2)
     chosen, probability = view_assignment.assign_with_probability(predicted, crowded, five_cameras, BODY_25)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))

@@ -1,9 +1,19 @@
 """The Kalman filter of joints: against the same numbers by hand."""
 
-import numpy as np
+from dataclasses import replace
 
-from factors import CONSTANT_VELOCITY
+import numpy as np
+import pytest
+
+from factors import CONSTANT_VELOCITY, kernel_weight
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.tracking import measuring
+from shapepose_fg.tracking.measuring import measured
 from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 PSD = np.array([4.0, 9.0])
 
@@ -32,17 +42,55 @@ def test_a_step_back_returns_to_where_it_came_from_less_certain():
     assert (np.linalg.eigvalsh(grown) > -1e-9).all() and np.trace(grown, axis1=2, axis2=3).min() > 0
 
 
-def test_an_update_is_the_information_filter_s_also_for_a_ray():
-    before = states(1)
-    ray = np.diag([2.0, 3.0, 0.0])  # nothing along z
-    place = before.position + np.array([0.3, -0.2, 0.7])
-    after = before.updated(
-        np.broadcast_to(ray, (3, 2, 3, 3)), np.einsum("ij,...j->...i", ray, place - before.position)
+def test_a_measurement_is_the_information_filter_s_also_for_a_ray(five_cameras, two_people, seen_exactly):
+    """Of what the views say of a joint after three linearisations; a wrist is seen by one view, a knee by none."""
+    rng, names = np.random.default_rng(3), BODY_25.joints
+    seen = seen_exactly(five_cameras, two_people)
+    seen = replace(seen, xy=seen.xy + rng.normal(0, 4, seen.xy.shape), confidence=rng.uniform(0.2, 1, len(seen)))
+    sure, lost = np.full((2, 25), 0.05), np.zeros((2, 25), dtype=bool)
+    candidate = assign(Predicted(two_people, sure, lost), seen, five_cameras, BODY_25)
+    wrist, knee, ankle = (names.index(name) for name in ("RWrist", "RKnee", "LAnkle"))
+    candidate[:, wrist, 1:] = candidate[:, knee] = -1
+    candidate[0, ankle] = candidate[1, ankle]  # all of them outside the gate
+    before = JointStates.at(two_people + rng.normal(0, 0.03, two_people.shape), sure, (2.0,))
+    config, views = ObservationConfig(), Views.of(five_cameras)
+    rows, at = Observations.of(candidate, seen, before.position), before.position
+    sigmas = observation_sigmas(rows, at, views, config, names)
+    for _ in range(3):
+        said = linearise(rows, sigmas, at, views, config)
+        full = np.zeros((2, 25, 6, 6))
+        full[..., :3, :3] = said.information
+        precision = np.linalg.inv(before.covariance)
+        covariance = np.linalg.inv(precision + full)
+        pull = np.einsum("...ij,...j->...i", said.information, at) - said.gradient
+        right = np.einsum("...ij,...j->...i", precision, before.mean)
+        right[..., :3] += pull
+        mean = np.einsum("...ij,...j->...i", covariance, right)
+        at = mean[..., :3]
+    after, inlier = measured(before, lost, candidate, seen, five_cameras, config, names)
+    np.testing.assert_allclose(after.mean, mean, atol=1e-9)
+    np.testing.assert_allclose(after.covariance, covariance, atol=1e-9)
+    np.testing.assert_array_equal(inlier, said.inlier)
+    assert (
+        inlier[:, wrist, 0].all()
+        and not inlier[0, ankle].any()
+        and (after.mean[:, knee] == before.mean[:, knee]).all()
     )
-    full = np.zeros((6, 6))
-    full[:3, :3] = ray
-    precision = np.linalg.inv(before.covariance[2, 0])
-    covariance = np.linalg.inv(precision + full)
-    mean = covariance @ (precision @ before.mean[2, 0] + full @ np.append(place[2, 0], np.zeros(3)))
-    np.testing.assert_allclose(after.covariance[2, 0], covariance, atol=1e-10)
-    np.testing.assert_allclose(after.mean[2, 0], mean, atol=1e-10)
+
+
+def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, seen_exactly):
+    """Half a metre beside, where no gate would let its detections through."""
+    seen, sure = seen_exactly(five_cameras, two_people), np.full((2, 25), 0.4)
+    lost = np.arange(50).reshape(2, 25) == 4
+    candidate = assign(Predicted(two_people, sure / 20, lost & False), seen, five_cameras, BODY_25)
+    before = JointStates.at(two_people + 0.5 * lost[..., None], sure, (2.0,))
+    after, inlier = measured(before, lost, candidate, seen, five_cameras, ObservationConfig(), BODY_25.joints)
+    assert inlier.all()
+    np.testing.assert_allclose(after.position, two_people, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
+def test_robust_kernels_are_those_of_the_factors(name):
+    for ratio in (0.0, 0.3, 0.99, 1.5, 4.0):
+        expected = kernel_weight(None if name == "none" else name, ratio, 1.0)
+        assert measuring._weight(measuring._KERNELS.index(name), ratio) == pytest.approx(float(expected))
