@@ -301,6 +301,14 @@ class Views:
         """(V,) or (N, V) mean of the two focal lengths, pixels."""
         return (self.K[..., 0, 0] + self.K[..., 1, 1]) / 2
 
+    @cached_property
+    def projection(self) -> Array:
+        """(S, V, 3, 4) K [R | t]: pixels times depth, and depth, of points; S is 1, or N where cameras are given row
+        by row.
+        """
+        both = self.K @ self.cTw
+        return np.ascontiguousarray(both if both.ndim == 4 else both[None])
+
     def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""
         K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))

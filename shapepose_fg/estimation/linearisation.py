@@ -116,6 +116,12 @@ class Message:
         """Some of the rows."""
         return Message(self.xyz[index], self.information[index])
 
+    def where(self, chosen: Mask, times: float = 1.0) -> "Message":
+        """What is said of the `chosen` (T, J) joints, its information so many `times` as much; of others nothing."""
+        chosen = chosen & self.known
+        information = np.where(chosen[..., None, None], self.information * times, 0.0)
+        return Message(np.where(chosen[..., None], self.xyz, 0.0), information)
+
 
 def symmetric_roots(information: Array) -> Array:
     """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
