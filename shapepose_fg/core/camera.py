@@ -303,11 +303,14 @@ class Views:
 
     @cached_property
     def projection(self) -> Array:
-        """(S, V, 3, 4) K [R | t]: pixels times depth, and depth, of points; S is 1, or N where cameras are given row
-        by row.
-        """
+        """(1, V, 3, 4) or (N, V, 3, 4) K [R | t]: gives pixels times depth, and depth, of points."""
         both = self.K @ self.cTw
-        return np.ascontiguousarray(both if both.ndim == 4 else both[None])
+        return np.ascontiguousarray(both.reshape(-1, *both.shape[-3:]))
+
+    @cached_property
+    def focal(self) -> Array:
+        """(1, V) or (N, V) the same as `focal_px`."""
+        return np.ascontiguousarray(self.focal_px.reshape(-1, len(self)))
 
     def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""

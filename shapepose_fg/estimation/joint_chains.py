@@ -1,8 +1,7 @@
 """A window's joints as chains over time: each joint's state hangs on those of the frames before and after it.
 
-All of a window's graph is so but factors of the user's own, which these chains leave out. Solved by themselves they
-are where GTSAM starts from, and what it ends with needs one step of it to be confirmed; linearised at its solution
-they give covariances.
+All of a window's graph is so but factors of the user's own, which these chains leave out. GTSAM starts where they
+end, and without such factors a step of it confirms that; linearised at its solution they give covariances.
 """
 
 from collections.abc import Iterable
@@ -181,10 +180,9 @@ class Problem:
     def _add_offsets(self, joints: Index, said: Said, at: int, to: tuple[Array, Array, Array]) -> None:
         """Add what is said with offsets, which are the states' part `at`; and these fade (`factors.lasting`)."""
         diagonal, below, right = to
-        there, span = ((mask[:, joints]).T for mask in (said.where & said.message.known, spanned(said.where)))
-        xyz, information = (
-            each[:, joints].swapaxes(0, 1)[there] for each in (said.message.xyz, said.message.information)
-        )
+        message, span = said.message, spanned(said.where)[:, joints].T
+        there = (said.where & message.known)[:, joints].T
+        xyz, information = (each[:, joints].swapaxes(0, 1)[there] for each in (message.xyz, message.information))
         roots = symmetric_roots(information / said.scale)
         of_joint, of_offset, expected = lasting_blocks(xyz, roots, said.errors.white_share)
         for one, first in ((0, of_joint), (at, of_offset)):

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.estimation.joint_chains import determined
 from shapepose_fg.estimation.window_graph import WindowGraph
 

@@ -27,8 +27,8 @@ from factors import (
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.contact import walking
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
@@ -68,7 +68,7 @@ class WindowGraph:
         `sigmas_px` (T, J, V), 0 where the view did not see the joint; `views` are their cameras; `rows` (T,) says
         which rows of a larger problem they are.
         """
-        T, J, V = sigmas_px.shape
+        T, J, _ = sigmas_px.shape
         if np.any(np.diff(observations.frame) <= 0):
             raise ValueError(f"a person's frames must rise, got {observations.frame}")
         self.config = config.graph
@@ -176,8 +176,8 @@ class WindowGraph:
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
         seen. `feet` (F,): joints that may stand (`contact.walking`).
 
-        In a window of several frames each joint is solved by itself first (`joint_chains`), without factors of your
-        own. Levenberg-Marquardt starts there, and has the last word.
+        In a window of several frames each joint is solved by itself first (`joint_chains`), without factors of
+        your own. Levenberg-Marquardt starts there, and has the last word.
         """
         self.failure, self.chains = "", []
         self.present = np.asarray(np.isfinite(initial).all(axis=2))
@@ -219,33 +219,29 @@ class WindowGraph:
     def _problem(self, inlier: Mask, views: Message, body: Message, near: Array, lost: Mask | None) -> Problem:
         """What `solve` is asked; how far joints may turn goes by their speed `near` where they are."""
         of_views = of_body = self.present & self.with_offsets
-        density, T = np.zeros((0, near.shape[1])), len(self)
-        share = self._motion.views.white_share if self.temporal else 1.0
+        density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
         if self.temporal:
-            speed = speeds(near, self.times_s)
+            share, speed = self._motion.views.white_share, speeds(near, self.times_s)
             density = self._motion.density(speed)
             if lost is not None:
-                of_body = self.present & (
-                    self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s)
-                )
+                around = near_in_time(lost, self.times_s, self._motion.around_s)
+                of_body = self.present & (self.with_offsets | around)
                 density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
         # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
         # wide as before either changed the sigma.
+        scale, weight, xy = np.sqrt(share / self.config.weight_2d), self.config.weight_shape, self._observations.xy
         used = inlier & (self._sigmas_px > 0) & (self.present & ~of_views)[..., None]
-        scale, weights = np.sqrt(share / self.config.weight_2d), (self.config.weight_2d, self.config.weight_shape)
         return Problem(
             times_s=self.times_s,
             law=self._motion.law,
             density=density,
-            seen=Projections(
-                self._views, self._observations.xy, self._sigmas_px * scale, used, self._kernel, scale
-            ),
-            pulls=body.where(self.present & ~of_body, self.config.weight_shape / share),
+            seen=Projections(self._views, xy, self._sigmas_px * scale, used, self._kernel, scale),
+            pulls=body.where(self.present & ~of_body, weight / share),
             said=(
-                Said(views, 1 / weights[0], self._motion.views, of_views),
-                Said(body, 1 / weights[1], self._motion.body, of_body),
+                Said(views, 1.0 / self.config.weight_2d, self._motion.views, of_views),
+                Said(body, 1.0 / weight, self._motion.body, of_body),
             ),
-            standing=np.full((T - 1, near.shape[1]), np.inf),
+            standing=np.full(density.shape, np.inf),
         )
 
     def _optimise(self) -> None:
