@@ -32,7 +32,7 @@ format: $(VENV)/installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-## Milliseconds a frame, stage by stage, on a real recording (see scripts/benchmark.py --help).
+## Seconds of whole commands and their stages (see scripts/benchmark.py --help).
 benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
 

@@ -23,7 +23,7 @@ from factors.keys import (
     velocity_key,
     velocity_keys,
 )
-from factors.lasting import lasting_difference_factors, lasting_prior_factors, offset_factors
+from factors.lasting import lasting_blocks, lasting_difference_factors, lasting_prior_factors, offset_factors
 from factors.motion import (
     CONSTANT_ACCELERATION,
     CONSTANT_VELOCITY,
@@ -88,6 +88,7 @@ __all__ = [
     "joint_key",
     "joint_keys",
     "kernel_weight",
+    "lasting_blocks",
     "lasting_difference_factors",
     "lasting_prior_factors",
     "make_calibration",

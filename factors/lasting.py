@@ -68,14 +68,21 @@ def lasting_prior_factors(
         raise ValueError("a mean or a root holds a value that is not finite: give no prior to such a joint")
     if not 0 < white_share < 1:
         raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
-    scaled = whiten / np.sqrt(white_share)
-    of_offsets = -np.sqrt((1.0 - white_share) / white_share) * _projectors(whiten)
-    right = np.einsum("dij,dj->di", scaled, points)
+    scaled, of_offsets, right = lasting_blocks(points, whiten, white_share)
     linear = map(
         gtsam.JacobianFactor, positions.tolist(), scaled, offsets.tolist(), of_offsets, right,
         repeat(noiseModel.Unit.Create(3)),
     )  # fmt: skip
     return contained(linear, np.concatenate([positions, offsets]))
+
+
+def lasting_blocks(
+    means: NDArray[np.float64], roots: NDArray[np.float64], white_share: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """What `lasting_prior_factors` are, whitened: r = A x + B b - c, with A and B (D, 3, 3) and c (D, 3)."""
+    scaled = roots / np.sqrt(white_share)
+    of_offsets = -np.sqrt((1.0 - white_share) / white_share) * _projectors(roots)
+    return scaled, of_offsets, (scaled @ means[..., None])[..., 0]
 
 
 def lasting_difference_factors(
@@ -113,7 +120,11 @@ def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Singular values below 1e-5 of the largest are rounding: the root of information that is zero up to 1e-10.
     """
-    left, values, _ = np.linalg.svd(matrices)
+    projectors = np.tile(np.eye(3), (len(matrices), 1, 1))
+    # The determinant over the trace cubed is less than the smallest singular value over the largest.
+    open_ones = np.linalg.det(matrices) <= 1e-5 * np.trace(matrices, axis1=1, axis2=2) ** 3
+    left, values, _ = np.linalg.svd(matrices[open_ones])
     ranged = left * (values > 1e-5 * values[:, :1])[:, None]
     full = (values[:, 2] > 1e-5 * values[:, 0])[:, None, None]
-    return np.where(full, np.eye(3), ranged @ ranged.swapaxes(1, 2))
+    projectors[open_ones] = np.where(full, np.eye(3), ranged @ ranged.swapaxes(1, 2))
+    return projectors

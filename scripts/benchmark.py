@@ -1,177 +1,179 @@
-"""Milliseconds a frame, with time and frame by frame: python scripts/benchmark.py [--data FOLDER].
+"""What whole commands cost, here and at an earlier commit: python scripts/benchmark.py [--against COMMIT].
 
-Reconstructs the Shelf recording (or another one, or the built-in scene where there is no recording) both ways,
-alternately in one run, and prints the time of every stage, the processor's time and the clock's, and their
-ratios; then the clock with worker processes. Then a cheap recording (two people, four cameras) of rising
-`--lengths`: time a frame must not grow, nor memory beyond the rows of the result. On a machine that does nothing
-else.
+Runs `shapepose-fg reconstruct` as a process of its own on one recording after the other, alternately from this
+checkout and from the commit's, each `--rounds` times after one short run that is not counted (it compiles). Prints
+medians of the processor's time, the clock's and peak memory with their spread, the ratio, and the clock's time of
+each stage. One thread a process; on a machine that does nothing else.
+
+The recording is Shelf where it is found (`--data`), the built-in scene otherwise; `crowd` is salsa of eight people
+before six cameras, from recorded motions where they are found. Longer ones are played forwards and backwards.
 """
 
 import argparse
+import json
 import os
 import platform
-import resource
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
-import torch
 from rich.console import Console
 from rich.table import Table
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.detections import DetectionSequence, Recording
 from shapepose_fg.core.provenance import versions
-from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation.mocap import Mocap
+from shapepose_fg.simulation.sequences import sequence
+
+HERE = Path(__file__).parents[1]
+CASES = {
+    "recording": ("short", ()),
+    "frame by frame": ("short", ("--no-temporal",)),
+    "one frame": ("short", ("--frames", "0:1")),
+    "crowd": ("crowd", ()),
+    "long": ("long", ()),
+    "long, two processes": ("long", ("--workers", "2")),
+}
+"""Which recording, and options beside those of all."""
+_LONG = 3000
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True)
 class Spent:
-    """What a run took."""
+    """What a run of a command took."""
 
-    people: Reconstruction
-    """What came out."""
-    cpu_ms: float
-    """Milliseconds a frame of all processors, of processes that it started too."""
-    wall_ms: float
-    """Milliseconds a frame of the clock."""
-    stages_ms: dict[str, float]
-    """The clock's milliseconds a frame of each stage, without those of stages inside it."""
-
-
-@dataclass(frozen=True)
-class BackAndForth:
-    """A long recording made of a short one, played forwards and backwards in turn, so that no person jumps."""
-
-    sequence: DetectionSequence
-    """The short recording."""
-    frames: int
-    """Frames of the long one."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.sequence.skeleton
-
-    def __len__(self) -> int:
-        return self.frames
-
-    def __getitem__(self, frame: int, /) -> Detections:
-        count = len(self.sequence)
-        turn, place = divmod(frame, count)
-        return self.sequence[place if turn % 2 == 0 else count - 1 - place]
+    cpu_s: float
+    """Seconds of all processors, of processes that it started too."""
+    wall_s: float
+    """Seconds of the clock."""
+    peak_mib: float
+    """The most memory of its largest process, MiB."""
+    stages_s: dict[str, float]
+    """The clock's seconds of each stage, without those of stages inside it."""
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = os.environ.get("SHAPEPOSE_DATA", Path(__file__).parents[2] / "shared")
-    parser.add_argument("--data", type=Path, default=data, help="folder with calibration.json, or with data/shelf")
-    parser.add_argument("--scene", action="store_true", help="the built-in scene, even where there is a recording")
-    parser.add_argument("--frames", type=int, help="the first frames only (default: all)")
-    parser.add_argument("--rounds", type=int, default=2, help="runs of each mode, the best counts; 0: none")
-    parser.add_argument("--workers", type=int, nargs="*", default=[2], help="processes, beside one")
-    parser.add_argument("--lengths", type=int, nargs="*", default=[300, 3000], help="of the cheap recording")
+    data = os.environ.get("SHAPEPOSE_DATA", HERE.parent / "shared")
+    parser.add_argument(
+        "--against", metavar="COMMIT", help="compare with this commit, which is checked out beside"
+    )
+    parser.add_argument(
+        "--cases", nargs="*", default=list(CASES), choices=CASES, metavar="CASE", help=str([*CASES])
+    )
+    parser.add_argument("--rounds", type=int, default=5, help="counted runs of each")
+    parser.add_argument("--data", type=Path, default=data, help="folder with data/shelf, or with calibration.json")
+    parser.add_argument("--frames", type=int, help="the first frames of each recording only (default: all)")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    console, config = Console(), PipelineConfig()
+    console = Console()
     console.print(_machine(), highlight=False)
-    if arguments.rounds > 0:
-        name, detections, rig = _recording(arguments.data, arguments.scene)
-        frames = min(len(detections), arguments.frames or len(detections))
-        best = compare(detections, rig, config, frames, arguments.rounds)
-        console.print(_stage_table(f"{name}: {frames} frames, {len(rig)} cameras", best, frames))
-        for line in side_by_side(detections, rig, config, frames, arguments.workers):
-            console.print(line, highlight=False)
-    for line in linearity(config, sorted(arguments.lengths)):
-        console.print(line, highlight=False)
+    with tempfile.TemporaryDirectory() as work, _checkouts(arguments.against, Path(work)) as trees:
+        made: dict[str, tuple[list[str], int]] = {}
+        for case in arguments.cases:
+            kind, more = CASES[case]
+            if kind not in made:
+                made[kind] = _written(kind, arguments.data, Path(work) / kind, arguments.frames)
+            options, frames = made[kind]
+            spent = compare(trees, [*options, *more], Path(work), arguments.rounds)
+            console.print(_table(case if "--frames" in more else f"{case}: {frames} frames", spent))
 
 
-def compare(
-    detections: DetectionSequence, rig: Rig, config: PipelineConfig, frames: int, rounds: int
-) -> dict[bool, Spent]:
-    """With time (True) and frame by frame, alternately; the best of `rounds` of each, by the processor's time."""
-    spend(detections, rig, config, min(frames, 8))  # warm-up
-    best: dict[bool, Spent] = {}
+def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int) -> dict[str, list[Spent]]:
+    """The command in each tree, alternately, `rounds` times after a warm-up."""
+    spent: dict[str, list[Spent]] = {name: [] for name in trees}
+    for name in trees:
+        short = [] if "--frames" in options else ["--frames", "0:8"]
+        spend(trees[name], [*options, *short], work / "results")
     for _ in range(rounds):
-        for temporal in (False, True):
-            now = spend(detections, rig, replace(config, temporal=temporal), frames)
-            if temporal not in best or now.cpu_ms < best[temporal].cpu_ms:
-                best[temporal] = now
-    return best
+        for name in trees:
+            spent[name].append(spend(trees[name], options, work / "results"))
+    return spent
 
 
-def side_by_side(
-    detections: DetectionSequence, rig: Rig, config: PipelineConfig, count: int, workers: list[int]
-) -> Iterator[str]:
-    """Lines about the clock with more processes: the recording as it is, and played four times over.
-
-    Starting the processes is in the time; of a longer recording it is less.
-    """
-    for length in (count, 4 * count) if len(workers) > 0 else ():
-        played = BackAndForth(detections, length)
-        one = spend(played, rig, config, length).wall_ms
-        for number in workers:
-            now = spend(played, rig, config, length, number).wall_ms
-            yield (
-                f"{length} frames, {number} workers: clock {now:.1f} ms a frame,"
-                f" {one:.1f} with one, ratio {one / now:.2f}"
-            )
-
-
-def linearity(config: PipelineConfig, lengths: list[int]) -> Iterator[str]:
-    """Lines about one recording, longer and longer: time a frame, peak memory."""
-    if len(lengths) == 0:
-        return
-    scene = built_in_scene(people=2, cameras=4, frames=100)
-    short = simulate(scene)
-    spend(short, scene.rig, config, len(short))  # warm-up: what is loaded once counts for none
-    for length in lengths:
-        now = spend(BackAndForth(short, length), scene.rig, config, length)
-        yield (
-            f"{length} frames: processor {now.cpu_ms:.2f} ms a frame, peak memory {peak_mib():.0f} MiB,"
-            f" {rows_mib(now.people):.1f} MiB of it rows of the result"
+def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
+    """Run `reconstruct` of the checkout `tree`; the error that it printed where it fails."""
+    workers = [] if "--workers" in options else ["--workers", "1"]
+    command = [sys.executable, "-m", "shapepose_fg", "reconstruct", *options, *workers, "--overwrite"]
+    environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(tree)}
+    with tempfile.TemporaryFile() as said:
+        start = time.perf_counter()
+        process = subprocess.Popen(
+            [*command, "--output", str(output)], cwd=output.parent, env=environment, stdout=said, stderr=said
         )
+        _, status, used = os.wait4(process.pid, 0)
+        wall_s = time.perf_counter() - start
+        process.returncode = os.waitstatus_to_exitcode(status)
+        said.seek(0)
+        if process.returncode != 0:
+            raise SystemExit(f"{tree}: {' '.join(command)} failed:\n{said.read().decode()}")
+    peak_mib = used.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    stages_s = json.loads((output / "run.json").read_text(encoding="utf-8"))["seconds"]
+    return Spent(used.ru_utime + used.ru_stime, wall_s, peak_mib, stages_s)
 
 
-def spend(recording: DetectionSequence, rig: Rig, config: PipelineConfig, frames: int, workers: int = 1) -> Spent:
-    """Reconstruct the first so many frames, and look at the clocks before and after."""
-    before, start = os.times(), time.perf_counter()
-    people = reconstruct(recording, rig, config, frames=range(frames), execution=Execution(workers=workers))
-    wall_s, after = time.perf_counter() - start, os.times()
-    stages = {name: 1e3 * seconds / frames for name, seconds in people.run["seconds"].items()}
-    return Spent(people, 1e3 * (sum(after[:4]) - sum(before[:4])) / frames, 1e3 * wall_s / frames, stages)
+def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
+    """So many frames of a recording, played forwards and backwards in turn: no person jumps."""
+    count = len(recording)
+    turns = (divmod(frame, count) for frame in range(frames))
+    return Recording(recording.skeleton, [recording[p if turn % 2 == 0 else count - 1 - p] for turn, p in turns])
 
 
-def peak_mib() -> float:
-    """The most memory that this process has had so far, MiB; it never falls."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+@contextmanager
+def _checkouts(commit: str | None, work: Path) -> Iterator[dict[str, Path]]:
+    """Checkouts by their names: this one, and that of a commit where one is asked for."""
+    if commit is None:
+        yield {"here": HERE}
+        return
+    git = ["git", "-C", str(HERE), "worktree"]
+    subprocess.run([*git, "add", "--detach", str(work / "against"), commit], check=True, capture_output=True)
+    try:
+        yield {commit: work / "against", "here": HERE}
+    finally:
+        subprocess.run([*git, "remove", "--force", str(work / "against")], check=True, capture_output=True)
 
 
-def rows_mib(people: Reconstruction) -> float:
-    """Memory of a result's rows and of their observations, MiB."""
-    tables = [people] if people.observations is None else [people, people.observations]
-    return sum(getattr(table, name).nbytes for table in tables for name in table.ROWS) / 2**20
+def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[list[str], int]:
+    """Options that name a recording, which is written into `folder` where no file holds it, and its frames."""
+    recording, rig, fps = _crowd(data) if kind == "crowd" else _short(data)
+    count = _LONG if kind == "long" else len(recording)
+    count = min(count, frames or count)
+    write_association(to_and_fro(recording, count), rig, folder)
+    named = ["--calibration", str(folder / "calibration.json"), "--detections", str(folder / "detection")]
+    return [*named, "--fps", str(fps)], count
 
 
-def _recording(data: Path, built_in: bool) -> tuple[str, DetectionSequence, Rig]:
-    """Name, frames and cameras of what was asked for."""
+def _short(data: Path) -> tuple[DetectionSequence, Rig, float]:
+    """Shelf, or the recording in `data`, or the built-in scene."""
     inner = data / "data" / "shelf"
     folder = inner if inner.is_dir() else data
-    if built_in or not (folder / "calibration.json").is_file():
+    if not (folder / "calibration.json").is_file():
         scene = built_in_scene()
-        return "the built-in scene", simulate(scene), scene.rig
+        return simulate(scene), scene.rig, scene.fps
     rig = read_rig(folder / "calibration.json")
-    return folder.resolve().name, read_detections(folder, rig), rig
+    return read_detections(folder, rig), rig, 25.0
+
+
+def _crowd(data: Path) -> tuple[DetectionSequence, Rig, float]:
+    """Eight people before six cameras: who dance salsa, or of the built-in scene."""
+    motions = data / "data" / "cmu_mocap" / "cmu_smpl24.npz"
+    if motions.is_file():
+        scene = sequence("salsa", "report", Mocap.load(motions), cameras=6, until=408).part(range(108, 408))
+    else:
+        scene = built_in_scene(people=8)
+    return simulate(scene), scene.rig, scene.fps
 
 
 def _machine() -> str:
@@ -182,25 +184,30 @@ def _machine() -> str:
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     numbers = versions()
-    packages = ", ".join(f"{name} {numbers[name]}" for name in ("python", "numpy", "gtsam", "torch"))
+    packages = ", ".join(f"{name} {numbers[name]}" for name in ("python", "numpy", "gtsam"))
     return f"{[*named, platform.processor() or platform.machine()][0]}, {cores} cores{load}\n{packages}"
 
 
-def _stage_table(title: str, best: dict[bool, Spent], frames: int) -> Table:
-    """Time by stage of both modes."""
-    over_time, single = best[True], best[False]
-    title += f", {len(over_time.people) / frames:.1f} people a frame"
+def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
+    """Medians with least and most, and the last tree's share of the first's."""
     table = Table(title=title, title_justify="left")
-    table.add_column("milliseconds a frame")
-    for heading in ("with time", "frame by frame", "ratio"):
-        table.add_column(heading, justify="right")
-    for stage in over_time.stages_ms | single.stages_ms:
-        table.add_row(stage, *(f"{each.stages_ms.get(stage, 0.0):.1f}" for each in (over_time, single)))
+    table.add_column("seconds")
+    for name in spent:
+        table.add_column(name, justify="right")
+    table.add_column("ratio", justify="right")
+
+    def row(label: str, values: list[list[float]], digits: int, style: str | None = None) -> None:
+        cells = [f"{median(v):.{digits}f} ({min(v):.{digits}f} to {max(v):.{digits}f})" for v in values]
+        first, last = median(values[0]), median(values[-1])
+        table.add_row(label, *cells, f"{last / first:.2f}" if first > 0 else "", style=style)
+
+    runs = list(spent.values())
+    row("processor", [[each.cpu_s for each in tree] for tree in runs], 2, "bold")
+    row("clock", [[each.wall_s for each in tree] for tree in runs], 2)
+    row("peak memory, MiB", [[each.peak_mib for each in tree] for tree in runs], 0)
     table.add_section()
-    for name, of in (("all, processor", "cpu_ms"), ("all, clock", "wall_ms")):
-        both = getattr(over_time, of), getattr(single, of)
-        cells = (*(f"{each:.1f}" for each in both), f"{both[0] / both[1]:.2f}")
-        table.add_row(name, *cells, style="bold")
+    for stage in dict.fromkeys(stage for tree in runs for each in tree for stage in each.stages_s):
+        row(stage, [[each.stages_s.get(stage, 0.0) for each in tree] for tree in runs], 2)
     return table
 
 

@@ -4,7 +4,6 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,15 +12,25 @@ import typer
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.export import export
-from shapepose_fg.cli.options import INPUT, REQUIRED, RESULT, argument, grouped, json_option, option
+from shapepose_fg.cli.options import (
+    INPUT,
+    REQUIRED,
+    RESULT,
+    Preset,
+    argument,
+    grouped,
+    json_option,
+    option,
+    preset_option,
+)
 from shapepose_fg.cli.overlay import overlay
 from shapepose_fg.cli.reconstruct.command import reconstruct
 from shapepose_fg.cli.report import report
 from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
+from shapepose_fg.cli.terminal import note_log, say, show, use_any_streams
 from shapepose_fg.cli.terminal import progress as progress_bar
-from shapepose_fg.cli.terminal import say, show, use_any_streams
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.train_fitter import train_fitter
 from shapepose_fg.cli.view import view
@@ -57,6 +66,7 @@ _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line. An error is one sentence on stderr and exit code 2."""
     use_any_streams()
+    note_log()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with stoppable():
@@ -130,21 +140,13 @@ def demo(
 app.command(rich_help_panel=_TRY)(simulate)
 
 
-class Preset(StrEnum):
-    """Settings that hang together."""
-
-    DEFAULT = "default"
-    PAPER = "paper"
-
-
 @app.command("config", rich_help_panel=_RECORDING)
 @grouped
-def config(preset: Preset = option(RESULT, "paper: the method as the paper has it.", Preset.DEFAULT)) -> None:
+def config(preset: Preset = preset_option(Preset.ACCURATE)) -> None:
     """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
-    from shapepose_fg.pipeline.pipeline import PipelineConfig
 
-    print(toml_text(PipelineConfig.paper() if preset is Preset.PAPER else PipelineConfig()), end="")
+    print(toml_text(preset.settings()), end="")
 
 
 @app.command(rich_help_panel=_TRY)

@@ -1,5 +1,6 @@
 """What the commands say on a terminal: results, notes, a bar while something runs."""
 
+import logging
 import os
 import re
 import sys
@@ -105,6 +106,22 @@ def note(*messages: str) -> None:
 def warn(message: str) -> None:
     """Say on stderr, in one paragraph, what looks wrong."""
     say("warning", message, "bold yellow")
+
+
+class _Noted(logging.Handler):
+    """Says what is logged as notes, where stderr is a terminal."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if console(stderr=True).is_terminal:
+            note(record.getMessage())
+
+
+def note_log() -> None:
+    """Say on a terminal what the package logs: what takes long once."""
+    logger = logging.getLogger("shapepose_fg")
+    if len(logger.handlers) == 0:
+        logger.addHandler(_Noted(logging.INFO))
+        logger.setLevel(logging.INFO)
 
 
 @contextmanager

@@ -301,6 +301,17 @@ class Views:
         """(V,) or (N, V) mean of the two focal lengths, pixels."""
         return (self.K[..., 0, 0] + self.K[..., 1, 1]) / 2
 
+    @cached_property
+    def projection(self) -> Array:
+        """(1, V, 3, 4) or (N, V, 3, 4) K [R | t]: gives pixels times depth, and depth, of points."""
+        both = self.K @ self.cTw
+        return np.ascontiguousarray(both.reshape(-1, *both.shape[-3:]))
+
+    @cached_property
+    def focal(self) -> Array:
+        """(1, V) or (N, V) the same as `focal_px`."""
+        return np.ascontiguousarray(self.focal_px.reshape(-1, len(self)))
+
     def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""
         K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))

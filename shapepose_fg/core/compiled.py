@@ -5,8 +5,8 @@ into arrays that it is given, so that Python is entered once for many rows. It c
 Numba compiles a function anew when *its* file has changed.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import logging
+from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
@@ -21,24 +21,20 @@ def kernel(function: F) -> F:
     return cast(F, compiled(function))
 
 
-@contextmanager
-def told_of_compiling(say: Callable[[], None]) -> Iterator[None]:
-    """Call `say` once, when this process first compiles a kernel inside the block."""
-    listener = _First(say)
-    with event.install_listener("numba:compile", listener):
-        yield
+class _Compiling(event.Listener):
+    """Logs once that this process compiles: it takes seconds, and not again."""
 
-
-class _First(event.Listener):
-    """Calls a function at the first event."""
-
-    def __init__(self, say: Callable[[], None]):
-        self._say, self._said = say, False
+    def __init__(self) -> None:
+        self._told = False
 
     def on_start(self, event: Any) -> None:
-        if not self._said:
-            self._said = True
-            self._say()
+        ours = event.data["dispatcher"].py_func.__module__.startswith("shapepose_fg.")
+        if ours and not self._told:
+            self._told = True
+            logging.getLogger(__name__).info("compiling for this machine, once: some ten seconds")
 
     def on_end(self, event: Any) -> None:
         pass
+
+
+event.register("numba:compile", _Compiling())

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -43,6 +44,26 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.view)
+
+    @cached_property
+    def columns(self) -> tuple[Index, Index, Array, Index, Array]:
+        """View, joint, xy, pairs and affinity as kernels take them."""
+        whole = (np.require(each, np.intp, ["C", "W"]) for each in (self.view, self.joint, self.pairs))
+        view, joint, pairs = whole
+        return (
+            view,
+            joint,
+            np.require(self.xy, float, ["C", "W"]),
+            pairs,
+            np.require(self.affinity, float, ["C", "W"]),
+        )
+
+    @cached_property
+    def rank(self) -> Array:
+        """(D,) from 0 to 1, an order by what they are: equals are told apart by it, and not by their place."""
+        rank = np.empty(len(self))
+        rank[np.lexsort((*self.xy.T, self.confidence))] = np.arange(len(self)) / max(len(self), 1)
+        return rank
 
     def only(self, keep: Mask) -> "Detections":
         """The candidates of the mask `keep` (D,), and the affinities between them."""

@@ -1,14 +1,13 @@
 """Feet that stand: how probably, by their speeds over a window, and what that says of their next step."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.estimation.in_time import near_in_time
-from shapepose_fg.estimation.linearisation import Message
-from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.joint_chains import Problem
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, on either side, each by itself: toes stand while the heel rises."""
@@ -40,27 +39,24 @@ def feet_of(joints: Sequence[str]) -> Index:
     return np.array([n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp)
 
 
-def walking(
-    graph: WindowGraph, problem: tuple[Mask, Message, Message], initial: Array, lost: Mask | None, feet: Index
-) -> Array | None:
-    """(T - 1, J) `standing` of `WindowGraph.solve`, whose first arguments these are; None without `feet` (F,).
+def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) -> Problem:
+    """The same, in which those of the `feet` (F,) stand that do; arguments as those of `WindowGraph.solve`.
 
-    The feet are solved by themselves, without knowing of any standing: their joints are chains of their own.
+    The feet are solved by themselves, without knowing of any standing.
     """
-    if not graph.temporal or len(feet) == 0:
-        return None
-    alone = np.full(initial.shape, np.nan)
-    alone[:, feet] = initial[:, feet]
-    graph.solve(*problem, alone, lost)
-    _, covariance = state_covariances([graph])[0]
-    velocity = graph.velocity()
-    if lost is not None:
-        # A body's guess that stands still is no foot that does, but for a while.
-        velocity[~near_in_time(~lost, graph.times_s, UNSEEN_S)] = np.nan
-    density = standing_density(velocity[:, feet], covariance[:, feet], graph.times_s)
-    result = np.full((len(graph) - 1, initial.shape[1]), np.inf)
-    result[:, feet] = np.where(density > FREE_M2_S, np.inf, density)
-    return result
+    standing = problem.standing.copy()
+    for chains in problem.chains(feet.tolist()):
+        joints, states = chains.joints, chains.solved(initial)
+        at, velocity = initial.copy(), states[..., 3:6].swapaxes(0, 1)
+        at[:, joints] = states[..., :3].swapaxes(0, 1)
+        if lost is not None:
+            # A body's guess that stands still is no foot that does, but for a while.
+            velocity = np.where(
+                near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None], velocity, np.nan
+            )
+        density = standing_density(velocity, chains.covariances(at)[1], problem.times_s)
+        standing[:, joints] = np.where(density > FREE_M2_S, np.inf, density)
+    return replace(problem, standing=standing)
 
 
 def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Array:

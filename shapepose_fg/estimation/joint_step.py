@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.estimation.contact import feet_of, walking
+from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import interpolated
 from shapepose_fg.estimation.linearisation import Message, ViewEvidence
@@ -27,5 +27,4 @@ def solve_joints(
     initial[:, ~mentioned] = np.nan
     lost = sigma_m > LOST_M
     feet = feet_of(config.joints if config.motion.contact else ())
-    standing = walking(person, (inlier, views, body), initial, lost, feet)
-    return person.solve(inlier, views, body, initial, lost, standing)
+    return person.solve(inlier, views, body, initial, lost, feet)

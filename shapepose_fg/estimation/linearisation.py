@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Interval
 
-from factors import KernelName, in_front, inlier_gate, kernel_weight, sigma_px
-from shapepose_fg.core.arrays import Array, Index, Mask, Real
+from factors import DEFAULT_WIDTH_SIGMA, KernelName
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.kernels import ROBUST, look, ready, sigmas_px
 
 MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
@@ -74,10 +74,6 @@ class ObservationConfig(Settings):
         """The kernel's name, None for plain least squares."""
         return None if self.kernel == "none" else self.kernel
 
-    def depth(self, depth: Array) -> Array:
-        """The depths (...), metres, at which lengths are meant for joints at these depths (...)."""
-        return np.full_like(depth, self.fixed_depth_m) if self.fixed_depth_m > 0 else depth
-
     def scatter(self, joints: Sequence[str]) -> Array:
         """(J,) what sigma is multiplied with for each joint; 1 for names that are not known."""
         return np.array([JOINT_SCATTER.get(name, 1.0) if self.by_joint else 1.0 for name in joints])
@@ -116,6 +112,12 @@ class Message:
         """Some of the rows."""
         return Message(self.xyz[index], self.information[index])
 
+    def where(self, chosen: Mask, times: float = 1.0) -> "Message":
+        """What is said of the `chosen` (T, J) joints, information `times` this number; nothing of others."""
+        chosen = chosen & self.known
+        information = np.where(chosen[..., None, None], self.information * times, 0.0)
+        return Message(np.where(chosen[..., None], self.xyz, 0.0), information)
+
 
 def symmetric_roots(information: Array) -> Array:
     """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
@@ -138,44 +140,27 @@ class ViewEvidence:
     gradient: Array
     """(N, J, 3) J^T W r over the inliers, 1/m."""
 
-    @cached_property
-    def _decomposed(self) -> tuple[Array, Array]:
-        """Eigenvalues (N, J, 3), rising, and eigenvectors (N, J, 3, 3) of the information."""
-        return np.linalg.eigh(self.information)
+    target: Array
+    """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
 
-    @cached_property
-    def target(self) -> Array:
-        """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
-
-        A joint that one view saw stays at its depth and moves onto the ray: directions below 1e-6 of the strongest
-        are left out. NaN where `points` is.
-        """
-        values, vectors = self._decomposed
-        certain = values > 1e-6 * np.maximum(values[..., -1:], 1e-12)
-        inverse = np.where(certain, 1.0 / np.where(certain, values, 1.0), 0.0)
-        along = np.einsum("...jk,...j->...k", vectors, self.gradient)
-        return self.points - np.einsum("...ik,...k->...i", vectors, inverse * along)
+    A joint that one view saw stays at its depth and moves onto the ray: directions below 1e-6 of the strongest are
+    left out. NaN where `points` is.
+    """
+    sigma_m: Array
+    """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
 
     @property
     def message(self) -> Message:
         """The same as Gaussians."""
         return Message(self.target, self.information)
 
-    @cached_property
-    def sigma_m(self) -> Array:
-        """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
-        return _weakest(self._decomposed[0])
-
 
 def weakest_sigma(information: Array) -> Array:
     """Standard deviation (...,) along the direction that `information` (..., 3, 3) knows least; infinite for a
     ray.
     """
-    return _weakest(np.asarray(np.linalg.eigvalsh(information), dtype=np.float64))
-
-
-def _weakest(values: Real) -> Array:
-    """The same from eigenvalues (..., 3), rising. Under 1e-10 of the strongest is rounding: nothing."""
+    values = np.asarray(np.linalg.eigvalsh(information), dtype=np.float64)
+    # Under 1e-10 of the strongest is rounding: nothing.
     weakest = np.where(values[..., 0] > 1e-10 * values[..., 2], values[..., 0], 0.0)
     with np.errstate(divide="ignore"):
         return 1.0 / np.sqrt(weakest)
@@ -189,23 +174,12 @@ def observation_sigmas(
     `joints` are the J joints' names: some are seen more sharply than others. A joint whose place is not known
     takes the mean depth of the person's known ones.
     """
-    _, depth, _ = views.project(points)
-    usable = depth >= MIN_DEPTH_M
-    mean = np.where(usable, depth, 0.0).sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
-    depth = np.where(usable, depth, np.maximum(mean, MIN_DEPTH_M)[:, None, :])
-    seen = observations.seen
     sigmas = np.zeros(observations.confidence.shape)
-    focal = _per_joint(views.focal_px, sigmas.shape)
-    scatter = np.broadcast_to(config.scatter(joints)[:, None], seen.shape)
-    sigmas[seen] = sigma_px(
-        config.weight(observations.confidence[seen]) / scatter[seen] ** 2,
-        config.depth(depth[seen]),
-        focal[seen],
-        sigma_m=config.sigma_m,
-        floor_px=config.floor_rad * focal[seen],
-    )
-    # What is as probably somebody else's says half as much.
-    sigmas[seen] /= np.sqrt(np.maximum(observations.probability[seen], LEAST_PROBABILITY))
+    sigmas_px(
+        ready(points), views.projection, views.focal, ready(observations.confidence),
+        ready(observations.probability), config.scatter(joints), config.sigma_m, config.confidence_power,
+        config.least_weight, config.floor_rad, config.fixed_depth_m, MIN_DEPTH_M, LEAST_PROBABILITY, sigmas,
+    )  # fmt: skip
     return sigmas
 
 
@@ -223,29 +197,18 @@ def linearise(
     place of gates and kernel: a weight of a quarter at this distance from the projection, as a length at the
     joint's depth. `inlier` is then every observation before its camera.
     """
-    projected, depth, jacobian = views.project(points)
-    usable = observations.seen & in_front(depth, MIN_DEPTH_M)
-    residual = np.where(usable[..., None], projected - observations.xy, np.nan)
-    distance = np.linalg.norm(residual, axis=-1)
-    px_per_m = _per_joint(views.focal_px, depth.shape) / config.depth(np.where(usable, depth, 1.0))
-    inlier = inlier_gate(distance, config.rho_2d_m * px_per_m) if reach_m is None else usable
-    sigma, far = np.where(inlier, sigmas, 1.0), np.where(inlier, distance, 0.0)
-    if reach_m is None:
-        weight = kernel_weight(config.robust_kernel, far / sigma)
-    else:
-        weight = kernel_weight("geman_mcclure", far / (reach_m * px_per_m), 1.0)
-    # Whitened rows of all views one below the other: A and b of least squares, zero where there is no inlier.
-    root, rows = (inlier * np.sqrt(weight) / sigma)[..., None], (*points.shape[:2], 2 * inlier.shape[2])
-    A = np.where(inlier[..., None, None], jacobian * root[..., None], 0.0).reshape(*rows, 3)
-    b = np.where(inlier[..., None], residual * root, 0.0).reshape(*rows, 1)
-    information = A.mT @ A
-    gradient = (A.mT @ b)[..., 0]
-    return ViewEvidence(points, inlier, residual, information, gradient)
-
-
-def _per_joint(of_views: Array, shape: tuple[int, ...]) -> Array:
-    """A value of each view, (V,) or (N, V), for each joint: (N, J, V)."""
-    return np.broadcast_to(of_views[:, None] if of_views.ndim == 2 else of_views, shape)
+    shape, kernel = observations.confidence.shape, config.robust_kernel
+    inlier, residual = np.zeros(shape, dtype=bool), np.full((*shape, 2), np.nan)
+    information, gradient = np.zeros((*shape[:2], 3, 3)), np.zeros((*shape[:2], 3))
+    target, sigma_m = np.empty((*shape[:2], 3)), np.empty(shape[:2])
+    look(
+        ready(points), views.projection, views.focal, ready(observations.xy),
+        ready(np.where(observations.seen, sigmas, 0.0)), config.fixed_depth_m, MIN_DEPTH_M,
+        config.rho_2d_m if reach_m is None else reach_m, reach_m is not None, ROBUST[kernel],
+        1.0 if kernel is None else DEFAULT_WIDTH_SIGMA[kernel],
+        inlier, residual, information, gradient, target, sigma_m,
+    )  # fmt: skip
+    return ViewEvidence(points, inlier, residual, information, gradient, target, sigma_m)
 
 
 def mean_confidence(observations: Observations, inlier: Mask) -> Array:

@@ -4,15 +4,14 @@ Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Thet
 more than one frame, joints have velocities too, and motion factors between their states.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
+from collections import deque
+from collections.abc import Callable, Iterable
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import (
-    DEFAULT_WIDTH_SIGMA,
     body_prior_factors,
     diagonal,
     lasting_prior_factors,
@@ -28,10 +27,12 @@ from factors import (
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
+from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
-from shapepose_fg.estimation.motion_model import Lasting, MotionModel
+from shapepose_fg.estimation.motion_model import MotionModel
 
 _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
@@ -67,7 +68,7 @@ class WindowGraph:
         `sigmas_px` (T, J, V), 0 where the view did not see the joint; `views` are their cameras; `rows` (T,) says
         which rows of a larger problem they are.
         """
-        T, J, V = sigmas_px.shape
+        T, J, _ = sigmas_px.shape
         if np.any(np.diff(observations.frame) <= 0):
             raise ValueError(f"a person's frames must rise, got {observations.frame}")
         self.config = config.graph
@@ -90,21 +91,9 @@ class WindowGraph:
         self.failure = ""
         """Why the last solution is none; empty where it is one."""
         self._motion = motion
-        self._frame, self._joint, self._view = seen = np.nonzero(sigmas_px > 0)
-        share = motion.views.white_share if T > 1 else 1.0
-        scale = np.sqrt(share / self.config.weight_2d)
-        # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
-        # wide as before either changed the sigma.
-        kernel = config.observations.robust_kernel
-        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
-        self._projections = projection_factors(
-            _cameras(views),
-            self._frame * V + self._view if views.rows_known is not None else self._view,
-            self.keys[self._frame, self._joint],
-            observations.xy[seen],
-            sigmas_px[seen] * scale,
-            robust_kernel(kernel, width),
-        )
+        self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
+        self._cameras = _cameras(views)
+        self._kernel = config.observations.robust_kernel
         self._offset_keys = np.stack(
             [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
@@ -114,6 +103,8 @@ class WindowGraph:
         """(J,) joints on which there is a factor of your own."""
         self.present: Mask = np.zeros((T, J), dtype=bool)
         """(T, J) which joints were in the last problem."""
+        self.chains: list[Chains] = []
+        """The last problem of several frames joint by joint, but for factors of your own."""
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -176,58 +167,95 @@ class WindowGraph:
         body: Message,
         initial: Array,
         lost: Mask | None = None,
-        standing: Array | None = None,
+        feet: Index | None = None,
     ) -> Array:
         """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
         a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
-        seen. `standing` (T - 1, J): how little they walk in each step, m²/s, infinite where they do not stand.
+        seen. `feet` (F,): joints that may stand (`contact.walking`).
+
+        In a window of several frames each joint is solved by itself first (`joint_chains`), without factors of
+        your own. Levenberg-Marquardt starts there, and has the last word.
         """
-        self.failure = ""
+        self.failure, self.chains = "", []
         self.present = np.asarray(np.isfinite(initial).all(axis=2))
         if self.temporal:
             self.present &= np.asarray(self.present.all(axis=0))
-        of_views = self.present & self.with_offsets
-        of_body = of_views
-        if self.temporal and lost is not None:
-            of_body = self.present & (self.with_offsets | near_in_time(lost, self.times_s, self._motion.around_s))
-        self.values = self._start(initial, np.stack([spanned(of_views), spanned(of_body)]))
-        self.graph = gtsam.NonlinearFactorGraph()
-        self._push(self._seen(inlier & (self.present & ~of_views)[..., None]))
-        self._push(self._priors(body, self.present & ~of_body))
-        self._push(self._lasting(views, 1.0 / self.config.weight_2d, self._motion.views, _OF_VIEWS, of_views))
-        self._push(self._lasting(body, 1.0 / self.config.weight_shape, self._motion.body, _OF_BODY, of_body))
+        problem = self._problem(inlier, views, body, initial, lost)
+        joints = np.flatnonzero(self.present[0])
+        if self.temporal and feet is not None:
+            problem = walking(problem, np.intersect1d(joints, feet), initial, lost)
+        states = np.full((*self.states.shape, 3), np.nan)
+        states[self.present, 0] = initial[self.present]
         if self.temporal:
-            self._push(self._motions(initial, lost))
-        if standing is not None:
-            step, joint = np.nonzero(np.isfinite(standing) & self.present[1:])
-            before, after = self.keys[step, joint], self.keys[step + 1, joint]
-            self._push(standing_factors(before, after, np.diff(self.times_s)[step], standing[step, joint]))
+            self.chains = problem.chains(joints.tolist())
+            for chains in self.chains:
+                chains.put(chains.solved(initial), states)
+        self._start(states)
+        self.graph = gtsam.NonlinearFactorGraph()
+        self._add(self._seen(problem.seen))
+        self._add(self._pulled(problem.pulls))
+        for source, said in enumerate(problem.said):
+            self._add(self._lasting(said, source))
+        if self.temporal:
+            self._add(self._moving(problem))
         exists = self.values.exists
-        self._push([factor for factor, keys in self._added if all(map(exists, keys))])
+        self._add(factor for factor, keys in self._added if all(map(exists, keys)))
         if self.values.empty():
             return np.full(initial.shape, np.nan)
         self._optimise()
+        return self.positions()
+
+    def positions(self) -> Array:
+        """(T, J, 3) positions of the last solution, metres; NaN where there are none."""
         return self._points()[0]
 
     def velocity(self) -> Array:
         """(T, J, 3) velocities of the last solution, m/s; NaN where there are none."""
         return self._points()[1]
 
-    @cached_property
-    def _parameters(self) -> gtsam.LevenbergMarquardtParams:
+    def _problem(self, inlier: Mask, views: Message, body: Message, near: Array, lost: Mask | None) -> Problem:
+        """What `solve` is asked; how far joints may turn goes by their speed `near` where they are."""
+        of_views = of_body = self.present & self.with_offsets
+        density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
+        if self.temporal:
+            share, speed = self._motion.views.white_share, speeds(near, self.times_s)
+            density = self._motion.density(speed)
+            if lost is not None:
+                around = near_in_time(lost, self.times_s, self._motion.around_s)
+                of_body = self.present & (self.with_offsets | around)
+                density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
+        # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
+        # wide as before either changed the sigma.
+        scale, weight, xy = np.sqrt(share / self.config.weight_2d), self.config.weight_shape, self._observations.xy
+        used = inlier & (self._sigmas_px > 0) & (self.present & ~of_views)[..., None]
+        return Problem(
+            times_s=self.times_s,
+            law=self._motion.law,
+            density=density,
+            seen=Projections(self._views, xy, self._sigmas_px * scale, used, self._kernel, scale),
+            pulls=body.where(self.present & ~of_body, weight / share),
+            said=(
+                Said(views, 1.0 / self.config.weight_2d, self._motion.views, of_views),
+                Said(body, 1.0 / weight, self._motion.body, of_body),
+            ),
+            standing=np.full(density.shape, np.inf),
+        )
+
+    def _optimise(self) -> None:
+        """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self.config.max_iterations)
         # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
         parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
-        return parameters
-
-    def _optimise(self) -> None:
-        """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""
+        if len(self.coupled) == 0:
+            # Joint by joint, each from frame to frame: what is eliminated so fills nothing in.
+            by_joint = self.states.swapaxes(0, 1)
+            parameters.setOrdering(gtsam.Ordering(by_joint[self._there.swapaxes(0, 1)].tolist()))
         try:
-            optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, self._parameters)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, parameters)
             self.values = optimizer.optimize()
         except RuntimeError:
             self.failure = "the solver failed: its system is singular"
@@ -235,70 +263,59 @@ class WindowGraph:
         if not np.isfinite(optimizer.error()):
             self.failure = "the solver left the finite numbers"
 
-    def _push(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        push = self.graph.push_back
-        for factor in factors:
-            push(factor)
+    def _add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
+        deque(map(self.graph.add, factors), maxlen=0)
 
-    def _seen(self, inlier: Mask) -> list[gtsam.NonlinearFactor]:
-        """The projection factors of `inlier` (T, J, V)."""
-        chosen = np.flatnonzero(inlier[self._frame, self._joint, self._view])
-        return [self._projections[n] for n in chosen.tolist()]
+    def _seen(self, seen: Projections) -> list[gtsam.NonlinearFactor]:
+        """The observations that count."""
+        frame, joint, view = chosen = np.nonzero(seen.used)
+        return projection_factors(
+            self._cameras,
+            frame * len(self._views) + view if self._views.rows_known is not None else view,
+            self.keys[frame, joint],
+            seen.xy[chosen],
+            seen.sigmas_px[chosen],
+            robust_kernel(seen.kernel, None if seen.kernel is None else seen.width),
+        )
 
-    def _priors(self, body: Message, where: Mask) -> list[gtsam.NonlinearFactor]:
-        """The body's pull on the joints of `where` (T, J)."""
-        known = body.known & where
-        share = self._motion.views.white_share if self.temporal else 1.0
-        covariances = np.linalg.inv(body.information[known]) * (share / self.config.weight_shape)
+    def _pulled(self, pulls: Message) -> list[gtsam.NonlinearFactor]:
+        """The body's pull on joints."""
+        known = pulls.known
+        covariances = np.linalg.inv(pulls.information[known])
         symmetric = (covariances + covariances.swapaxes(1, 2)) / 2
-        return list(body_prior_factors(self.keys[known], body.xyz[known], symmetric))
+        return list(body_prior_factors(self.keys[known], pulls.xyz[known], symmetric))
 
-    def _lasting(
-        self, said: Message, scale: float, errors: Lasting, source: int, chosen: Mask
-    ) -> list[gtsam.NonlinearFactor]:
-        """What is `said` of the joints of `chosen` (T, J), with an offset each that decays slowly."""
-        known, keys = said.known & chosen, self._offset_keys[source]
-        roots = symmetric_roots(said.information[known] / scale)
-        factors = lasting_prior_factors(self.keys[known], keys[known], said.xyz[known], roots, errors.white_share)
-        # An offset in every frame between two, so that a joint's states are a chain (`state_covariances`).
-        chain = spanned(chosen)
+    def _lasting(self, said: Said, source: int) -> list[gtsam.NonlinearFactor]:
+        """What is said of joints with an offset each that decays slowly."""
+        known, keys = said.message.known & said.where, self._offset_keys[source]
+        roots = symmetric_roots(said.message.information[known] / said.scale)
+        xyz, share = said.message.xyz[known], said.errors.white_share
+        factors = lasting_prior_factors(self.keys[known], keys[known], xyz, roots, share)
+        # An offset in every frame between two, so that a joint's states are a chain.
+        chain = spanned(said.where)
         for joint in np.flatnonzero(chain.any(axis=0)).tolist():
             there = chain[:, joint]
-            factors += offset_factors(keys[there, joint], self.times_s[there], errors.correlation_s)
+            factors += offset_factors(keys[there, joint], self.times_s[there], said.errors.correlation_s)
         return factors
 
-    def _motions(self, near: Array, lost: Mask | None) -> list[gtsam.NonlinearFactor]:
-        """Motion of the joints that are in the problem; how far they may turn goes by their speed at `near`."""
-        speed = speeds(near, self.times_s)
-        density = self._motion.density(speed)
-        if lost is not None:
-            density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
-        law, factors = self._motion.law, list[gtsam.NonlinearFactor]()
-        unknown = [diagonal(np.full(3, sigma)) for sigma in law.start]
+    def _moving(self, problem: Problem) -> list[gtsam.NonlinearFactor]:
+        """Motion of the joints that are in the problem, and feet that stand."""
+        factors = list[gtsam.NonlinearFactor]()
+        unknown = [diagonal(np.full(3, sigma)) for sigma in problem.law.start]
         for joint in np.flatnonzero(self.present[0]).tolist():
             states = self.state_keys[:, joint]
             for key, noise in zip(states[0, 1:].tolist(), unknown, strict=True):
                 factors.append(gtsam.PriorFactorPoint3(key, np.zeros(3), noise))
-            factors += law.factors(states, self.times_s, density[:, joint])
-        return factors
+            factors += problem.law.factors(states, self.times_s, problem.density[:, joint])
+        step, joint = np.nonzero(np.isfinite(problem.standing))
+        before, after, held = self.keys[step, joint], self.keys[step + 1, joint], problem.standing[step, joint]
+        return factors + standing_factors(before, after, np.diff(self.times_s)[step], held)
 
-    def _start(self, initial: Array, offsets: Mask) -> gtsam.Values:
-        """`initial` (T, J, 3) with its derivatives; `offsets` (2, T, J) of views and body start as they ended."""
-        values = gtsam.Values()
-        insert = values.insert
-        for key, point in zip(self.keys[self.present].tolist(), initial[self.present], strict=True):
-            insert(key, point)
-        if not self.temporal:
-            return values
-        last, derivative = self.values, initial
-        for keys in np.moveaxis(self.state_keys[..., 1:], -1, 0):
-            derivative = np.gradient(derivative, self.times_s, axis=0)
-            for key, value in zip(keys[self.present].tolist(), derivative[self.present], strict=True):
-                insert(key, last.atPoint3(key) if last.exists(key) else value)
-        zero = np.zeros(3)
-        for key in self._offset_keys[offsets].tolist():
-            insert(key, last.atPoint3(key) if last.exists(key) else zero)
-        return values
+    def _start(self, states: Array) -> None:
+        """Make `values` of `states` (T, J, S, 3), NaN where there are none."""
+        self._there = np.isfinite(states[..., 0])
+        self.values = gtsam.Values()
+        deque(map(self.values.insert, self.states[self._there].tolist(), states[self._there]), maxlen=0)
 
     def _points(self) -> tuple[Array, Array]:
         """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then

@@ -3,6 +3,7 @@
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
+from shapepose_fg.core.compiled import kernel
 
 
 def lesser(value: Real | Whole) -> Mask:
@@ -13,24 +14,24 @@ def lesser(value: Real | Whole) -> Mask:
 def match_best_first(left: Index, right: Index, score: Array) -> Index:
     """Greedy one-to-one matching of edges (left, right) by falling score; returns indices of picked edges.
 
-    Edges that are the best of both their ends would be picked before any rival, so all of them are picked in a
-    round; a few rounds give the same matching as one edge at a time.
+    Of equal scores the first edge is picked. Ends are numbers from 0.
     """
-    rank = np.empty(len(score), dtype=np.intp)
-    rank[np.argsort(-score, kind="stable")] = np.arange(len(score))
-    live = np.arange(len(score))
-    picked = []
-    ends = max(left.max(initial=-1), right.max(initial=-1)) + 1
-    while len(live) > 0:
-        best_left = np.full(ends, len(score))
-        best_right = np.full(ends, len(score))
-        np.minimum.at(best_left, left[live], rank[live])
-        np.minimum.at(best_right, right[live], rank[live])
-        wins = live[(best_left[left[live]] == rank[live]) & (best_right[right[live]] == rank[live])]
-        picked.append(wins)
-        used_left = np.zeros(ends, dtype=bool)
-        used_right = np.zeros(ends, dtype=bool)
-        used_left[left[wins]] = True
-        used_right[right[wins]] = True
-        live = live[~used_left[left[live]] & ~used_right[right[live]]]
-    return np.concatenate(picked) if picked else live
+    order = np.argsort(-score, kind="stable")
+    ends = left.max(initial=-1) + 1, right.max(initial=-1) + 1
+    taken = np.zeros(ends[0], dtype=bool), np.zeros(ends[1], dtype=bool)
+    return order[
+        : _pick(order, np.require(left, np.intp, ["C", "W"]), np.require(right, np.intp, ["C", "W"]), *taken)
+    ]
+
+
+@kernel
+def _pick(order: Index, left: Index, right: Index, taken_left: Mask, taken_right: Mask) -> int:
+    """Move the edges whose ends are free, in `order`, to its front; returns their number."""
+    count = 0
+    for k in range(len(order)):
+        edge = order[k]
+        if not taken_left[left[edge]] and not taken_right[right[edge]]:
+            taken_left[left[edge]] = taken_right[right[edge]] = True
+            order[count] = edge
+            count += 1
+    return count

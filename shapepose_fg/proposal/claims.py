@@ -4,14 +4,15 @@ One rule for the proposals of a frame, for hypotheses of who may be there, and f
 differ in how near is near, and in what is sought of joints whose place is not known.
 """
 
+import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import match_best_first
@@ -57,11 +58,6 @@ class Claims:
     sure_affinity: float
     """And so much of it must be there."""
 
-    @cached_property
-    def nearness(self) -> Array:
-        """(P, D) 1 on the projected joint, 0 far from it."""
-        return np.exp(-0.5 * self.distance_m**2 / self.variance)
-
     def of(self, people: Mask) -> "Claims":
         """The claims of some of the people, where `variance` is one for all."""
         arrays = {name: getattr(self, name)[people] for name in ("distance_m", "inside", "reachable")}
@@ -70,10 +66,10 @@ class Claims:
     def scored(self, owns: Mask) -> Scored:
         """The rule, for people who are thought to have the detections `owns` (P, D)."""
         affinity, neighbours = mean_affinity(owns, self.detections, self.skeleton, self.views)
-        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-        score = self.nearness + np.where(neighbours > 0, affinity, LEAST_AFFINITY)
-        likely = self.inside & (score >= 2 * LEAST_AFFINITY)
-        likely |= self.reachable & (neighbours > 0) & (affinity >= self.sure_affinity)
+        score, likely = np.zeros(affinity.shape), np.zeros(affinity.shape, dtype=bool)
+        variance = np.require(np.broadcast_to(self.variance, affinity.shape), float, ["C", "W"])
+        near = (self.distance_m, variance, self.inside, self.reachable)
+        _score(*near, LEAST_AFFINITY, self.sure_affinity, affinity, neighbours, score, likely)
         return Scored(score, likely, affinity)
 
     def matched(self, scored: Scored, world: Index | None = None) -> Index:
@@ -82,9 +78,11 @@ class Claims:
         """
         shape, found = (len(scored.likely), len(self.skeleton), self.views), self.detections
         person, detection = np.nonzero(scored.likely)
-        slot = np.ravel_multi_index((person, found.joint[detection], found.view[detection]), shape)
+        slot = (person * shape[1] + found.joint[detection]) * shape[2] + found.view[detection]
         once = detection if world is None else detection + len(found) * world[person]
-        picked = match_best_first(slot, once, _without_ties(scored.score, found)[person, detection])
+        # People whom the detector has grouped have affinities of exactly 1: equal scores are told apart.
+        score = np.round(scored.score[person, detection], 9) + 1e-10 * found.rank[detection]
+        picked = match_best_first(slot, once, score)
         chosen = np.full(shape, -1, dtype=np.intp)
         chosen.reshape(-1)[slot[picked]] = detection[picked]
         return chosen
@@ -103,11 +101,11 @@ def projected_distances(projected: tuple[Array, Array], joint: Index, detections
 
     `projected` is what `rig.project` gives of people's joints; infinite where a joint is not known.
     """
-    xy, depth = projected
-    at = (detections.view, slice(None), joint)
-    distance_px = np.hypot(*np.moveaxis(xy[at] - detections.xy[:, None], -1, 0)).T
-    distance_m = distance_px * depth[at].T / rig.focal_px[detections.view]
-    return np.where(np.isnan(distance_px), np.inf, distance_m)
+    places, depth = (np.require(each, float, ["C", "W"]) for each in projected)
+    found = np.empty((depth.shape[1], len(detections)))
+    view, _, xy, *_ = detections.columns
+    _distances(places, depth, np.require(joint, np.intp, ["C", "W"]), view, xy, rig.focal_px, found)
+    return found
 
 
 def owned(chosen: Index, count: int) -> Mask:
@@ -120,26 +118,80 @@ def owned(chosen: Index, count: int) -> Mask:
 
 def mean_affinity(owns: Mask, detections: Detections, skeleton: Skeleton, views: int) -> tuple[Array, Index]:
     """(P, D) mean affinity of each detection to what the person owns at its limbs' other ends, and the number."""
-    people, count = owns.shape
-    head, tail = detections.pairs.T
-    total = np.zeros((people, count))
-    for end, other in ((head, tail), (tail, head)):
-        person, edge = np.nonzero(owns[:, other])
-        key = person * count + end[edge]
-        total += np.bincount(key, detections.affinity[edge], people * count).reshape(people, count)
-    sees = np.zeros((people, views, len(skeleton)), dtype=bool)
-    person, detection = np.nonzero(owns)
-    sees[person, detections.view[detection], detections.joint[detection]] = True
-    neighbours = (sees @ skeleton.adjacency)[:, detections.view, detections.joint]
-    return total / np.maximum(neighbours, 1), neighbours
+    mean, neighbours = np.zeros(owns.shape), np.zeros(owns.shape, dtype=np.intp)
+    view, joint, _, pairs, affinity = detections.columns
+    sees = np.zeros((views, len(skeleton)), dtype=bool)
+    _mean_affinity(owns, view, joint, pairs, affinity, skeleton.adjacency, sees, mean, neighbours)
+    return mean, neighbours
 
 
-def _without_ties(score: Array, detections: Detections) -> Array:
-    """`score` (P, D) with equal scores of two detections told apart by what these are, not by their order.
+@kernel
+def _distances(
+    places: Array, depth: Array, joint: Index, view: Index, xy: Array, focal_px: Array, distance_m: Array
+) -> None:
+    """`projected_distances` into `distance_m` (P, D), from `places` (V, P, J, 2) in pixels."""
+    for p in range(len(distance_m)):
+        for d in range(len(joint)):
+            v, j = view[d], joint[d]
+            x, y = places[v, p, j, 0] - xy[d, 0], places[v, p, j, 1] - xy[d, 1]
+            distance = math.hypot(x, y) * depth[v, p, j] / focal_px[v]
+            distance_m[p, d] = math.inf if math.isnan(distance) else distance
 
-    People whom the detector has grouped have affinities of exactly 1.
-    """
-    order = np.lexsort((*detections.xy.T, detections.confidence))
-    rank = np.empty(len(order))
-    rank[order] = np.arange(len(order))
-    return np.round(score, 9) + 1e-10 * rank / max(len(order), 1)
+
+@kernel
+def _mean_affinity(
+    owns: Mask,
+    view: Index,
+    joint: Index,
+    pairs: Index,
+    affinity: Array,
+    adjacency: Index,
+    sees: Mask,
+    mean: Array,
+    neighbours: Index,
+) -> None:
+    """`mean_affinity` into `mean` and `neighbours` (P, D), which are zero; `sees` (V, J) is for work."""
+    count = np.zeros(sees.shape, dtype=np.intp)
+    for p in range(len(owns)):
+        sees[:] = False
+        count[:] = 0
+        for d in range(len(view)):
+            v, j = view[d], joint[d]
+            if owns[p, d] and not sees[v, j]:
+                sees[v, j] = True
+                for other in range(len(adjacency)):
+                    count[v, other] += adjacency[j, other]
+        for e in range(len(pairs)):
+            if owns[p, pairs[e, 1]]:
+                mean[p, pairs[e, 0]] += affinity[e]
+        for e in range(len(pairs)):
+            if owns[p, pairs[e, 0]]:
+                mean[p, pairs[e, 1]] += affinity[e]
+        for d in range(len(view)):
+            neighbours[p, d] = count[view[d], joint[d]]
+            mean[p, d] /= max(neighbours[p, d], 1)
+
+
+@kernel
+def _score(
+    distance_m: Array,
+    variance: Array,
+    inside: Mask,
+    reachable: Mask,
+    least_affinity: float,
+    sure_affinity: float,
+    affinity: Array,
+    neighbours: Index,
+    score: Array,
+    likely: Mask,
+) -> None:
+    """`Claims.scored` into `score` and `likely` (P, D)."""
+    for p in range(len(score)):
+        for d in range(score.shape[1]):
+            # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+            told = neighbours[p, d] > 0
+            nearness = math.exp(-0.5 * distance_m[p, d] ** 2 / variance[p, d])
+            score[p, d] = nearness + (affinity[p, d] if told else least_affinity)
+            likely[p, d] = (inside[p, d] and score[p, d] >= 2 * least_affinity) or (
+                reachable[p, d] and told and affinity[p, d] >= sure_affinity
+            )

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 
 
@@ -34,15 +35,43 @@ def group_people(found: Detections) -> list[Index]:
     As OpenPose does, by the affinities alone: pairs in falling order; a pair joins its two groups unless
     both have a candidate of one kind of joint, so that nobody gets two left knees.
     """
-    group = list(range(len(found)))
-    members = [[row] for row in group]
-    kinds = [1 << joint for joint in found.joint.tolist()]
-    for first, second in found.pairs[np.argsort(-found.affinity, kind="stable")].tolist():
-        one, other = group[first], group[second]
-        if one == other or kinds[one] & kinds[other]:
-            continue
-        members[one] += members[other]
-        kinds[one] |= kinds[other]
-        for row in members[other]:
-            group[row] = one
-    return [np.array(members[one], dtype=np.intp) for one in sorted(set(group))]
+    _, joint, _, pairs, affinity = found.columns
+    count = len(found)
+    order, stop = np.empty(count, dtype=np.intp), np.empty(count, dtype=np.intp)
+    has = np.zeros((count, joint.max(initial=-1) + 1), dtype=bool)
+    groups = _group(pairs[np.argsort(-affinity, kind="stable")], joint, has, order, stop)
+    return np.split(order, stop[: groups - 1]) if count > 0 else []
+
+
+@kernel
+def _group(pairs: Index, joint: Index, has: Mask, order: Index, stop: Index) -> int:
+    """`group_people`: its groups one after the other into `order` (N,), their ends into `stop`; their number.
+
+    `has` (N, J) is False everywhere: which kinds of joints each group has.
+    """
+    count = len(joint)
+    group, after, last = np.arange(count), np.full(count, -1), np.arange(count)
+    for row in range(count):
+        has[row, joint[row]] = True
+    for pair in range(len(pairs)):
+        one, other = group[pairs[pair, 0]], group[pairs[pair, 1]]
+        row, apart = other, one != other
+        while apart and row >= 0:
+            apart = not has[one, joint[row]]
+            row = after[row]
+        if apart:
+            row = other
+            while row >= 0:
+                group[row], has[one, joint[row]] = one, True
+                row = after[row]
+            after[last[one]], last[one] = other, last[other]
+    place, groups = 0, 0
+    for first in range(count):
+        row = first if group[first] == first else -1
+        while row >= 0:
+            order[place] = row
+            place, row = place + 1, after[row]
+        if group[first] == first:
+            stop[groups] = place
+            groups += 1
+    return groups

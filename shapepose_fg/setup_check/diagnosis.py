@@ -190,7 +190,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
     findings += _blind(given)
-    look = replace(given, evidence=evidence)
+    look = given if evidence is given.evidence else replace(given, evidence=evidence)  # what it found stays
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)

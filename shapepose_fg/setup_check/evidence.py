@@ -1,5 +1,6 @@
 """What the check looks at: people seen at some frames of a recording, and the cameras as they are taken to be."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -8,6 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
 from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
@@ -75,16 +77,16 @@ class Structure:
     """(P, J, 3) in the world, the calibration's unit; NaN where fewer than two cameras saw a joint."""
     xy: Array
     """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
-    residual: Array
-    """(P, J, V, 2) projection minus detection, pixels; NaN where there is none."""
+    miss_px: Array
+    """(P, J, V) distance of each projection from its detection, pixels; NaN where there is none."""
     depth: Array
     """(P, J, V) depth of each joint before each camera, the calibration's unit."""
     size_px: Array
     """(P, V) the person's size in each picture."""
     weight: Array
     """(P, J, V) robust weight of each detection, in 1 / pixels^2 of a unit of its noise; 0 where there is none."""
-    jacobian: Array
-    """(P, J, V, 2, 3) derivative of each projection by the point."""
+    slope: Array
+    """(P, J, V) sum of the squares of each projection's derivatives by the point."""
 
 
 def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]:
@@ -101,43 +103,105 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     seen = ~np.isnan(xy[..., 0])
     prior = np.where(seen, confidence, 0.0) / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
-    points = _linear(xy, prior, views)
-    weight = prior
-    for step in range(steps + 1):
-        pixels, depth, jacobian = views.project(points)
-        residual = np.where((prior > 0)[..., None], pixels - xy, np.nan)
-        if step == steps:
-            break
-        ok = ~np.isnan(residual[..., 0])
-        square = np.where(ok, prior * np.nansum(residual**2, axis=-1), 0.0)
-        weight = np.where(ok, prior / (1 + square), 0.0)
-        root = np.sqrt(weight)[..., None]
-        A = np.where(ok[..., None, None], jacobian, 0.0) * root[..., None]
-        A = A.reshape(*A.shape[:2], 2 * len(views), 3)
-        r = (np.where(ok[..., None], residual, 0.0) * root).reshape(*A.shape[:3], 1)
-        H = A.swapaxes(-1, -2) @ A
-        scale = np.trace(H, axis1=-2, axis2=-1)[..., None, None]
-        H = H + (1e-9 * scale + 1e-300) * np.eye(3)
-        points = points - np.linalg.solve(H, A.swapaxes(-1, -2) @ r)[..., 0]
-    return Structure(points, xy, residual, depth, size, weight, jacobian)
+    xy = np.ascontiguousarray(xy)
+    points = np.empty((*prior.shape[:2], 3))
+    miss_px, depth, weight, slope = (np.empty(prior.shape) for _ in range(4))
+    to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ np.linalg.inv(views.K)
+    cameras = (views.K @ views.cTw, to_world, centres_of(views))
+    _triangulate(xy, prior, *cameras, steps, points, miss_px, depth, weight, slope)
+    return Structure(points, xy, miss_px, depth, size, weight, slope)
 
 
-def _linear(xy: Array, weight: Array, views: Views) -> Array:
-    """(P, J, 3) points nearest to all rays, squares weighted; NaN where fewer than two cameras see a joint."""
-    inverse = np.linalg.inv(views.K)
-    to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ inverse
-    rays = (to_world[:, :, :2] @ xy[..., None])[..., 0] + to_world[:, :, 2]
-    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    seen = weight > 0
-    rays = np.where(seen[..., None], rays, 0.0)
-    centres = centres_of(views)
-    # Sum over views of (1 - d d') x = sum of (1 - d d') c.
-    A = seen.sum(axis=-1)[..., None, None] * np.eye(3) - rays.swapaxes(-1, -2) @ rays
-    along = (rays * centres).sum(axis=-1, keepdims=True)
-    b = seen.astype(np.float64) @ centres - (rays * along).sum(axis=-2)
-    enough = seen.sum(axis=-1) >= 2
-    A = np.where(enough[..., None, None], A + 1e-12 * np.eye(3), np.eye(3))
-    return np.where(enough[..., None], np.linalg.solve(A, b[..., None])[..., 0], np.nan)
+@kernel
+def _triangulate(
+    xy: Array,
+    prior: Array,
+    cameras: Array,
+    to_world: Array,
+    centres: Array,
+    steps: int,
+    points: Array,
+    miss_px: Array,
+    depth: Array,
+    weight: Array,
+    slope: Array,
+) -> None:
+    """`triangulate` with K [R t] as `cameras` (V, 3, 4), from pixels to rays (V, 3, 3), and `centres` (V, 3)."""
+    A, b, x, ray, gu, gv = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    views = len(cameras)
+    for p in range(prior.shape[0]):
+        for j in range(prior.shape[1]):
+            # The point nearest to all rays d from c: sum of (1 - d d') x = sum of (1 - d d') c.
+            A[:], b[:], seen = 0.0, 0.0, 0
+            for v in range(views):
+                weight[p, j, v] = prior[p, j, v]
+                if prior[p, j, v] > 0:
+                    seen += 1
+                    for i in range(3):
+                        ray[i] = to_world[v, i, 0] * xy[p, j, v, 0] + to_world[v, i, 1] * xy[p, j, v, 1]
+                        ray[i] += to_world[v, i, 2]
+                    length = math.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+                    along = (ray[0] * centres[v, 0] + ray[1] * centres[v, 1] + ray[2] * centres[v, 2]) / length
+                    for i in range(3):
+                        b[i] += centres[v, i] - ray[i] / length * along
+                        for k in range(3):
+                            A[i, k] += (1.0 if i == k else 0.0) - ray[i] * ray[k] / length**2
+            for i in range(3):
+                A[i, i] += 1e-12
+            if seen >= 2:
+                _solve(A, b, x)
+            else:
+                x[:] = math.nan
+            for step in range(steps + 1):
+                A[:], b[:] = 0.0, 0.0
+                for v in range(views):
+                    M = cameras[v]
+                    z = M[2, 0] * x[0] + M[2, 1] * x[1] + M[2, 2] * x[2] + M[2, 3]
+                    depth[p, j, v], miss_px[p, j, v], slope[p, j, v] = z, math.nan, math.nan
+                    if step < steps:
+                        weight[p, j, v] = 0.0
+                    if not z > 0:
+                        continue
+                    u = (M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2] + M[0, 3]) / z
+                    w = (M[1, 0] * x[0] + M[1, 1] * x[1] + M[1, 2] * x[2] + M[1, 3]) / z
+                    slope[p, j, v] = 0.0
+                    for i in range(3):
+                        gu[i], gv[i] = (M[0, i] - u * M[2, i]) / z, (M[1, i] - w * M[2, i]) / z
+                        slope[p, j, v] += gu[i] ** 2 + gv[i] ** 2
+                    if not prior[p, j, v] > 0:
+                        continue
+                    du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
+                    square = du * du + dw * dw
+                    miss_px[p, j, v] = math.sqrt(square)
+                    if step < steps:
+                        weight[p, j, v] = prior[p, j, v] / (1 + prior[p, j, v] * square)
+                        for i in range(3):
+                            b[i] += weight[p, j, v] * (gu[i] * du + gv[i] * dw)
+                            for k in range(3):
+                                A[i, k] += weight[p, j, v] * (gu[i] * gu[k] + gv[i] * gv[k])
+                if step < steps:
+                    least = 1e-9 * (A[0, 0] + A[1, 1] + A[2, 2]) + 1e-300
+                    for i in range(3):
+                        A[i, i] += least
+                    _solve(A, b, gu)
+                    for i in range(3):
+                        x[i] -= gu[i]
+            points[p, j] = x
+
+
+@kernel
+def _solve(A: Array, b: Array, x: Array) -> None:
+    """A x = b for a symmetric A (3, 3)."""
+    c0 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
+    c1 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
+    c2 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    d1 = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
+    d2 = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
+    d3 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+    determinant = A[0, 0] * c0 + A[0, 1] * c1 + A[0, 2] * c2
+    x[0] = (c0 * b[0] + c1 * b[1] + c2 * b[2]) / determinant
+    x[1] = (c1 * b[0] + d1 * b[1] + d2 * b[2]) / determinant
+    x[2] = (c2 * b[0] + d2 * b[1] + d3 * b[2]) / determinant
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +313,7 @@ class Look:
     def total(self) -> float:
         """How well everything fits: 1 if every sighting is a person without error, 0 if none is anybody."""
         groups, structure = self.structure(steps=3)
-        error = np.linalg.norm(structure.residual, axis=-1) / structure.size_px[:, None]
-        median = median_of(np.moveaxis(error, 1, 2), ~np.isnan(np.moveaxis(error, 1, 2)))
+        error = np.moveaxis(structure.miss_px / structure.size_px[:, None], 1, 2)
+        median = median_of(error, ~np.isnan(error))
         worth = np.maximum(1 - median / GATE, 0.0)
         return float(worth[groups.member >= 0].sum() / max(len(self.sightings), 1))

@@ -11,7 +11,7 @@ from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import FOCAL, POSE, TURN, Others, Pinhole, match
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, residuals, same_frame
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
 
 _MIN_AGREEMENT = 0.12
 _MIN_LAG_GAIN = 0.004
@@ -93,8 +93,8 @@ class _Nearest:
 
 def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
     person, sighting = same_frame(others.frame, seen.frame - lag)
-    residual = residuals(others.points[person], seen.xy[sighting], camera.K, camera.cTw)
-    error = np.linalg.norm(residual, axis=-1) / seen.size_px[sighting][:, None]
+    error = miss_px(others.points[person], seen.xy, sighting, camera.K, camera.cTw)
+    error /= seen.size_px[sighting][:, None]
     both = ~np.isnan(error)
     mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
     mean = np.where(both.sum(axis=1) >= MIN_JOINTS, mean, GATE)

@@ -4,6 +4,7 @@ Nothing here has a unit: an error is a part of the person's own size in the pict
 wrong unit matches as well as the right one.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.people_2d import group_people
@@ -235,8 +237,7 @@ def distances(
     person (E,), sighting (E,) and error (E,), a part of the sighting's size.
     """
     person, sighting = same_frame(frame, seen.frame - lag)
-    residual = residuals(points[person], seen.xy[sighting], K, cTw)
-    error = np.linalg.norm(residual, axis=-1)
+    error = miss_px(points[person], seen.xy, sighting, K, cTw)
     both = ~np.isnan(error)
     median = np.where(both.sum(axis=1) >= MIN_JOINTS, median_of(error, both), np.inf)
     return person, sighting, median / seen.size_px[sighting]
@@ -253,22 +254,61 @@ def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
 
 def least_of_each(key: Index, value: Array) -> Index:
     """The row with the least `value` (N,) of each `key` (N,); the first of equal ones."""
-    order = np.lexsort((value, key))
-    return order[np.unique(key[order], return_index=True)[1]]
+    best = np.full(key.max(initial=-1) + 1, -1, dtype=np.intp)
+    _least_of_each(key, value, best)
+    return best[best >= 0]
 
 
-def residuals(points: Array, xy: Array, K: Array, cTw: Array) -> Array:
-    """Projection minus detection (N, J, 2), pixels; infinite behind the camera, NaN where nothing was seen."""
-    camera = points @ cTw[:, :3].T + cTw[:, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = (camera @ K.T)[..., :2] / camera[..., 2:]
-    residual = np.where(camera[..., 2:] > 0, pixels - xy, np.inf)
-    return np.where(np.isnan(xy) | np.isnan(camera[..., 2:]), np.nan, residual)
+@kernel
+def _least_of_each(key: Index, value: Array, best: Index) -> None:
+    """The row with the least `value` of each `key` into `best`, which is -1 everywhere."""
+    for row in range(len(key)):
+        if best[key[row]] < 0 or value[row] < value[best[key[row]]]:
+            best[key[row]] = row
+
+
+def miss_px(points: Array, xy: Array, sighting: Index, K: Array, cTw: Array) -> Array:
+    """(N, J) how far `points` (N, J, 3) are projected from the joints `xy` (S, J, 2) of their `sighting` (N,),
+    pixels; infinite behind the camera, NaN where nothing was seen.
+    """
+    miss = np.empty(points.shape[:2])
+    _miss_px(np.require(points, float, ["C", "W"]), np.require(xy, float, ["C", "W"]), sighting, K @ cTw, miss)
+    return miss
+
+
+@kernel
+def _miss_px(points: Array, xy: Array, sighting: Index, M: Array, miss: Array) -> None:
+    """`miss_px` into `miss` (N, J), with M (3, 4) the camera's K [R t]."""
+    for n in range(len(miss)):
+        for j in range(miss.shape[1]):
+            x, y, z = points[n, j]
+            px, py = xy[sighting[n], j]
+            depth = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
+            dx = (M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]) / depth - px
+            dy = (M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]) / depth - py
+            behind = depth <= 0 and not math.isnan(px)
+            miss[n, j] = math.inf if behind else math.sqrt(dx * dx + dy * dy)
 
 
 def median_of(values: Array, valid: Mask) -> Array:
     """(...) median of the valid values of the last axis, lower of the two middles; inf where there is none."""
-    ordered = np.sort(np.where(valid, values, np.nan), axis=-1)  # NaN last
-    middle = np.maximum(valid.sum(axis=-1) - 1, 0) // 2
-    median = np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0]
-    return np.where(np.isnan(median), np.inf, median)
+    median = np.empty(values.shape[:-1])
+    rows = np.where(valid, values, np.nan).reshape(median.size, values.shape[-1])
+    _medians(rows, median.reshape(-1))
+    return median
+
+
+@kernel
+def _medians(rows: Array, median: Array) -> None:
+    """The median of each of the `rows` (N, J), without its NaN, by insertion; `rows` are used up."""
+    for n in range(len(rows)):
+        count = 0
+        for j in range(rows.shape[1]):
+            value, place = rows[n, j], count
+            if not math.isnan(value):
+                while place > 0 and rows[n, place - 1] > value:
+                    rows[n, place] = rows[n, place - 1]
+                    place -= 1
+                rows[n, place] = value
+                count += 1
+        median[n] = rows[n, (count - 1) // 2] if count > 0 else math.inf

@@ -19,7 +19,7 @@ from shapepose_fg.setup_check.diagnosis import Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
 from shapepose_fg.setup_check.fit import match
-from shapepose_fg.setup_check.matching import GATE, residuals, size_of
+from shapepose_fg.setup_check.matching import GATE, miss_px, size_of
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
     """One entry for every camera."""
     look = diagnosis.look
     groups, structure = look.structure(steps=5)
-    px = np.linalg.norm(structure.residual, axis=-1)
+    px = structure.miss_px
     mm = 1e3 * px * structure.depth / look.views.focal_px
     seen = np.bincount(look.sightings.view, minlength=len(rig))
     remaining = [lag.frames if lag.is_offset else 0 for lag in diagnosis.lags] or [0] * len(rig)
@@ -129,7 +129,7 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
         others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
-        out_px = np.linalg.norm(residuals(points, mine.xy[matched.sighting], camera.K, camera.cTw), axis=-1)
+        out_px = miss_px(points, mine.xy, matched.sighting, camera.K, camera.cTw)
         depth = points @ camera.cTw[2, :3] + camera.cTw[2, 3]
         out_px = np.where(np.isfinite(out_px), out_px, np.nan)
         figures = CameraFigures(

@@ -53,7 +53,7 @@ class Normal:
 def normal_equations(structure: Structure, views: Views) -> Normal:
     """The normal equations at a structure that is triangulated (see `triangulate`), with its robust weights."""
     V = len(views)
-    ok = (structure.weight > 0) & np.isfinite(structure.residual[..., 0]) & (structure.depth > 0)
+    ok = (structure.weight > 0) & np.isfinite(structure.miss_px) & (structure.depth > 0)
     used, graph, values = np.flatnonzero(ok.any(axis=-1)), gtsam.NonlinearFactorGraph(), gtsam.Values()
     precision = gtsam.noiseModel.Isotropic.Precision
     poses, lenses, points = ([name(index) for index in range(n)] for name, n in ((C, V), (K, V), (P, len(used))))
@@ -65,7 +65,7 @@ def normal_equations(structure: Structure, views: Views) -> Normal:
         graph.add(gtsam.PriorFactorPose3(pose, values.atPose3(pose), precision(6, 1e-12)))
         graph.add(gtsam.PriorFactorCal3_S2(lens, values.atCal3_S2(lens), precision(5, 1e-12)))
     ok, weight = ok.reshape(-1, V)[used], structure.weight.reshape(-1, V)[used]
-    slope = np.square(structure.jacobian.reshape(-1, V, 6)[used]).sum(axis=-1)
+    slope = structure.slope.reshape(-1, V)[used]
     weak = _WEAK * np.where(ok, weight * slope, 0.0).sum(axis=-1)
     for point, xyz, least in zip(points, structure.points.reshape(-1, 3)[used], weak, strict=True):
         values.insert(point, xyz)
@@ -214,6 +214,6 @@ def _sparse_step(parts: Parts, normal: Normal, structure: Structure, total: Arra
 def _cost(structure: Structure) -> float:
     """Sum of the residuals' robust costs (Cauchy), in parts of people's sizes."""
     scale = (KERNEL * np.where(np.isnan(structure.size_px), 1.0, structure.size_px)[:, None]) ** 2
-    square = (structure.residual**2).sum(axis=-1) / scale
+    square = structure.miss_px**2 / scale
     seen = (structure.weight > 0) & np.isfinite(square)
     return float(np.log1p(square[seen]).sum())

@@ -1,13 +1,12 @@
 """scripts/benchmark.py: that it measures what it says; how long things take is not tested."""
 
 import importlib.util
+import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmark.py"
@@ -24,44 +23,29 @@ def benchmark():
     del sys.modules["benchmark"]
 
 
-@pytest.fixture
-def five_frames(benchmark, monkeypatch):
-    monkeypatch.setattr(benchmark, "built_in_scene", lambda **more: built_in_scene(**(more | {"frames": 5})))
+def test_a_long_recording_goes_back_and_forth(benchmark):
+    short = simulate(built_in_scene(frames=5))
+    long = benchmark.to_and_fro(short, 12)
+    assert [id(long[t]) for t in range(12)] == [id(short[t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)]
 
 
-@pytest.fixture(scope="module")
-def recording():
-    scene = built_in_scene(frames=5)
-    return simulate(scene), scene.rig
-
-
-@pytest.mark.parametrize("temporal", [False, True])
-def test_times_of_stages_add_up(benchmark, recording, temporal):
-    spent = benchmark.spend(*recording, replace(PipelineConfig(), temporal=temporal), 5)
-    assert len(spent.people) == 20
-    whole = sum(spent.stages_ms.values())
-    # All but what lies between the stages is in one of them.
-    assert 0.5 * spent.wall_ms < whole <= 1.001 * spent.wall_ms
-    assert spent.stages_ms["solve"] > 0 and min(spent.stages_ms.values()) >= 0
-
-
-def test_a_long_recording_goes_back_and_forth(benchmark, recording):
-    long = benchmark.BackAndForth(recording[0], 12)
-    assert len(long) == 12
-    assert [id(long[t]) for t in range(12)] == [id(recording[0][t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)]
-
-
-def test_memory_of_rows(benchmark, recording):
-    spent = benchmark.spend(*recording, PipelineConfig(), 2)
-    assert 0 < benchmark.rows_mib(spent.people) < benchmark.peak_mib()
+def test_a_command_that_fails_is_shown_with_what_it_said(benchmark, tmp_path):
+    with pytest.raises(SystemExit, match=r"(?s)--detections here .*failed.*here"):
+        benchmark.spend(benchmark.HERE, ["--calibration", "no.json", "--detections", "here"], tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_prints_machine_stages_and_ratios(benchmark, five_frames, monkeypatch, capsys):
-    monkeypatch.setattr(
-        sys, "argv", ["benchmark.py", "--scene", "--frames", "3", "--rounds", "1", "--lengths", "7"]
-    )
+def test_two_commits_are_timed_alternately(benchmark, monkeypatch, capsys, tmp_path):
+    """No recording in the folder: the built-in scene is taken."""
+    git = subprocess.run(["git", "-C", str(benchmark.HERE), "rev-parse", "HEAD"], capture_output=True, text=True)
+    if git.returncode != 0:
+        pytest.skip("not a git checkout")
+    commit = git.stdout.strip()
+    options = ["--against", commit, "--cases", "one frame", "--rounds", "1", "--data", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["benchmark.py", *options, "--frames", "2"])
     benchmark.main()
     printed = capsys.readouterr().out
-    for part in ("cores", "torch", "the built-in scene: 3 frames", "all, processor", "7 frames: "):
+    for part in ("cores", "numpy", "one frame", "here", "processor", "peak memory", "solve", "ratio"):
         assert part in printed
+    left = subprocess.run(["git", "-C", str(benchmark.HERE), "worktree", "list"], capture_output=True, text=True)
+    assert "against" not in left.stdout

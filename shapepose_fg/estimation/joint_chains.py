@@ -1,0 +1,208 @@
+"""A window's joints as chains over time: each joint's state hangs on those of the frames before and after it.
+
+All of a window's graph is so but factors of the user's own, which these chains leave out. GTSAM starts where they
+end, and without such factors a step of it confirms that; linearised at its solution they give covariances.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.camera import Views
+from shapepose_fg.estimation.in_time import spanned
+from shapepose_fg.estimation.kernels import ROBUST, descend, spread
+from shapepose_fg.estimation.linearisation import Message, symmetric_roots
+from shapepose_fg.estimation.motion_model import Lasting
+
+_SETTLED_M = 1e-4
+"""Chains are solved until no joint moves by more, metres."""
+_STEPS = 20
+"""Or for so many steps: under a robust kernel the last ones halve what is left."""
+
+
+UNDETERMINED_M = 10.0
+"""A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
+determined."""
+
+
+@dataclass(frozen=True)
+class Projections:
+    """The observations of a window's joints."""
+
+    views: Views
+    """The cameras, T rows of them where they move."""
+    xy: Array
+    """(T, J, V, 2) undistorted pixels."""
+    sigmas_px: Array
+    """(T, J, V) of what is new in every frame, pixels."""
+    used: Mask
+    """(T, J, V) which observations count."""
+    kernel: KernelName | None
+    """The robust kernel."""
+    scale: float
+    """What all sigmas were multiplied with; the kernel is as wide as if they were not."""
+
+    @property
+    def width(self) -> float:
+        """The kernel's width, standard deviations."""
+        return 1.0 if self.kernel is None else DEFAULT_WIDTH_SIGMA[self.kernel] / self.scale
+
+    @cached_property
+    def weight(self) -> Array:
+        """(T, J, V) 1 / sigma², 1/px²; 0 where an observation does not count."""
+        return np.where(self.used, 1.0 / np.where(self.used, self.sigmas_px, 1.0) ** 2, 0.0)
+
+
+@dataclass(frozen=True)
+class Said:
+    """A message about a window's joints whose error lasts."""
+
+    message: Message
+    """What is said, T rows."""
+    scale: float
+    """Covariances are multiplied with this."""
+    errors: Lasting
+    """How its error lasts."""
+    where: Mask
+    """(T, J) where it counts, with an offset."""
+
+
+@dataclass(frozen=True)
+class Chains:
+    """C joints whose states have the same d numbers: three of each of their parts."""
+
+    joints: Index
+    """(C,) which of the window's."""
+    parts: tuple[int, ...]
+    """Which columns of `WindowGraph.states` the parts are, position first."""
+    diagonal: Array
+    """(C, T, d, d) information of what is linear, of each state with itself."""
+    below: Array
+    """(C, T - 1, d, d) of each state, rows, with the one before it, columns."""
+    right: Array
+    """(C, T, d) information times what is expected."""
+    there: Mask
+    """(T, C, p) which parts there are in which frames: offsets are not in all."""
+    seen: Projections
+    """What is not linear."""
+
+    def solved(self, initial: Array) -> Array:
+        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself."""
+        states = np.zeros(self.right.shape)
+        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
+        descend(states, *self._problem(), _SETTLED_M, _STEPS)
+        return states
+
+    def covariances(self, points: Array) -> tuple[Array, Array]:
+        """Marginal covariances (T, C, 3, 3) of positions and of velocities where joints are at `points` (T, J, 3);
+        NaN in all of a chain that is singular, and where one is not determined.
+        """
+        states, found = np.zeros(self.right.shape), np.empty((*self.right.shape[:2], 2, 3, 3))
+        states[..., :3] = points[:, self.joints].swapaxes(0, 1)
+        spread(states, *self._problem(), found)
+        return determined(found[:, :, 0].swapaxes(0, 1)), determined(found[:, :, 1].swapaxes(0, 1))
+
+    def put(self, states: Array, into: Array) -> None:
+        """Write `states` (C, T, d) `into` those of the window (T, J, S, 3), each part to its place."""
+        parts = states.reshape(*states.shape[:2], -1, 3).swapaxes(0, 1)
+        for n, part in enumerate(self.parts):
+            into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
+
+    def _problem(self):
+        seen = self.seen
+        return (
+            self.joints, self.diagonal, self.below, self.right, seen.views.projection, seen.xy, seen.weight,
+            ROBUST[seen.kernel], seen.width,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that is known of a window's joints, each by itself."""
+
+    times_s: Array
+    """(T,) of the frames, rising, seconds."""
+    law: Motion
+    """How joints move."""
+    density: Array
+    """(T - 1, J) of the noise in it."""
+    seen: Projections
+    """Observations that count."""
+    pulls: Message
+    """What pulls joints and is new in every frame, T rows."""
+    said: tuple[Said, Said]
+    """What views and body say with errors that last: an offset each."""
+    standing: Array
+    """(T - 1, J) how little joints walk in each step, m²/s; infinite where they do not stand."""
+
+    def chains(self, joints: Iterable[int]) -> list[Chains]:
+        """The chains of some `joints`, those with the same parts together."""
+        alike: dict[tuple[int, ...], list[int]] = {}
+        offsets = [each.where.any(axis=0) for each in self.said]
+        for joint in joints:
+            there = (self.law.order + n for n, has in enumerate(offsets) if has[joint])
+            alike.setdefault((*range(self.law.order), *there), []).append(joint)
+        return [self._alike(np.array(each, dtype=np.intp), parts) for parts, each in alike.items()]
+
+    def _alike(self, joints: Index, parts: tuple[int, ...]) -> Chains:
+        C, T, p, n = len(joints), len(self.times_s), len(parts), self.law.order
+        diagonal, below = np.zeros((C, T, p, 3, p, 3)), np.zeros((C, T - 1, p, 3, p, 3))
+        right, dt = np.zeros((C, T, p, 3)), np.diff(self.times_s)
+        F = self.law.transition(dt)
+        noise = np.linalg.inv(self.law.noise(dt)) / self.density[:, joints].T[..., None, None]
+        into = noise @ F
+        for axis in range(3):
+            diagonal[:, 1:, :n, axis, :n, axis] += noise
+            diagonal[:, :-1, :n, axis, :n, axis] += F.mT @ into
+            below[:, :, :n, axis, :n, axis] -= into
+            for part, sigma in enumerate(self.law.start, 1):
+                diagonal[:, 0, part, axis, part, axis] += sigma**-2
+        xyz, information = (each[:, joints].swapaxes(0, 1) for each in (self.pulls.xyz, self.pulls.information))
+        diagonal[:, :, 0, :, 0] += information
+        right[:, :, 0] += (information @ xyz[..., None])[..., 0]
+        holds = 1.0 / (self.standing[:, joints].T * dt)
+        for axis in range(3):
+            diagonal[:, 1:, 0, axis, 0, axis] += holds
+            diagonal[:, :-1, 0, axis, 0, axis] += holds
+            below[:, :, 0, axis, 0, axis] -= holds
+        there = np.ones((T, C, p), dtype=bool)
+        for at in range(n, p):
+            there[..., at] = spanned(self.said[parts[at] - n].where)[:, joints]
+            self._add_offsets(joints, self.said[parts[at] - n], at, (diagonal, below, right))
+        d = 3 * p
+        matrices = diagonal.reshape(C, T, d, d), below.reshape(C, T - 1, d, d), right.reshape(C, T, d)
+        return Chains(joints, parts, *matrices, there, self.seen)
+
+    def _add_offsets(self, joints: Index, said: Said, at: int, to: tuple[Array, Array, Array]) -> None:
+        """Add what is said with offsets, which are the states' part `at`; and these fade (`factors.lasting`)."""
+        diagonal, below, right = to
+        message, span = said.message, spanned(said.where)[:, joints].T
+        there = (said.where & message.known)[:, joints].T
+        xyz, information = (each[:, joints].swapaxes(0, 1)[there] for each in (message.xyz, message.information))
+        roots = symmetric_roots(information / said.scale)
+        of_joint, of_offset, expected = lasting_blocks(xyz, roots, said.errors.white_share)
+        for one, first in ((0, of_joint), (at, of_offset)):
+            right[there, one] += (first.mT @ expected[..., None])[..., 0]
+            for other, second in ((0, of_joint), (at, of_offset)):
+                diagonal[:, :, one, :, other][there] += first.mT @ second
+        passed = np.diff(self.times_s) / said.errors.correlation_s
+        link = (span[:, 1:] & span[:, :-1]) / -np.expm1(-2.0 * passed)
+        begins = span & (np.cumsum(span, axis=1) == 1)
+        for axis in range(3):
+            own = diagonal[:, :, at, axis, at, axis]
+            own += begins | ~span  # one that is not there is 0
+            own[:, 1:] += link
+            own[:, :-1] += link * np.exp(-2.0 * passed)
+            below[:, :, at, axis, at, axis] -= link * np.exp(-passed)
+
+
+def determined(covariance: Array) -> Array:
+    """The same (..., 3, 3), NaN where it is more than `UNDETERMINED_M` in some direction."""
+    largest = np.trace(covariance, axis1=-2, axis2=-1)  # at the most
+    doubtful = np.isfinite(largest) & (largest >= UNDETERMINED_M**2)
+    largest[doubtful] = np.linalg.eigvalsh(covariance[doubtful])[..., -1]
+    return np.where((largest < UNDETERMINED_M**2)[..., None, None], covariance, np.nan)

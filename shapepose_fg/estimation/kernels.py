@@ -1,0 +1,329 @@
+"""The compiled loops of stage II: what views say of joints, and joints as chains of states over time.
+
+Rows or frames are N or T, joints J, views V, chains C. `cameras` (S, V, 3, 4) are K [R | t] of each view; S is 1
+where cameras stand still, else the number of rows.
+"""
+
+import math
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.compiled import kernel
+
+ROBUST = {None: 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
+"""Robust kernels by their number in kernels."""
+_GEMAN_MCCLURE = ROBUST["geman_mcclure"]
+_ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-17, 1e-6, 1e-10
+"""Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
+known less than by the last is not known at all."""
+_FARTHEST_M = 1e6
+"""A step that is longer, or not a number, is not taken."""
+
+
+def ready(values: Array) -> Array:
+    """The same as kernels take it: other types and orders, and what must not be written, are compiled anew."""
+    return np.require(values, np.float64, ("C", "W"))
+
+
+@kernel
+def _weight(robust, ratio):
+    """`factors.kernel_weight` of the squared norm over the squared width."""
+    if robust == 0:
+        return 1.0
+    if robust == 1:
+        return 1.0 / math.sqrt(max(ratio, 1.0))
+    if robust == 2:
+        return 1.0 / (1.0 + ratio)
+    if robust == 3:
+        return 1.0 / (1.0 + ratio) ** 2
+    return max(1.0 - ratio, 0.0) ** 2
+
+
+@kernel
+def _add_view(x, camera, u, v, weight, robust, width, information, gradient):
+    """Add J^T w J and J^T w r of a pixel (u, v), `weight` 1/sigma², of a point `x` that is before the camera."""
+    depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
+    if not depth > 0.0:
+        return
+    at_u = (camera[0, 0] * x[0] + camera[0, 1] * x[1] + camera[0, 2] * x[2] + camera[0, 3]) / depth
+    at_v = (camera[1, 0] * x[0] + camera[1, 1] * x[1] + camera[1, 2] * x[2] + camera[1, 3]) / depth
+    du, dv = at_u - u, at_v - v
+    w = weight * _weight(robust, (du * du + dv * dv) * weight / (width * width))
+    for a in range(3):
+        ua = (camera[0, a] - at_u * camera[2, a]) / depth
+        va = (camera[1, a] - at_v * camera[2, a]) / depth
+        gradient[a] += w * (ua * du + va * dv)
+        for b in range(3):
+            ub = (camera[0, b] - at_u * camera[2, b]) / depth
+            vb = (camera[1, b] - at_v * camera[2, b]) / depth
+            information[a, b] += w * (ua * ub + va * vb)
+
+
+@kernel
+def _eigen(A, values, vectors):
+    """Eigenvalues, rising, and eigenvectors (columns) of a symmetric (3, 3), which is lost: Jacobi's rotations."""
+    for a in range(3):
+        for b in range(3):
+            vectors[a, b] = 1.0 if a == b else 0.0
+    for _ in range(12):
+        if not abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2]) > _ROUNDING * (A[0, 0] + A[1, 1] + A[2, 2]):
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if A[p, q] == 0.0:
+                    continue
+                ratio = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+                t = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(ratio * ratio + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s, r = t * c, 3 - p - q
+                A[p, p] -= t * A[p, q]
+                A[q, q] += t * A[p, q]
+                A[p, q] = A[q, p] = 0.0
+                rp, rq = A[r, p], A[r, q]
+                A[r, p] = A[p, r] = c * rp - s * rq
+                A[r, q] = A[q, r] = s * rp + c * rq
+                for a in range(3):
+                    vp, vq = vectors[a, p], vectors[a, q]
+                    vectors[a, p], vectors[a, q] = c * vp - s * vq, s * vp + c * vq
+    for a in range(3):
+        values[a] = A[a, a]
+    for a in (0, 1, 0):
+        if values[a] > values[a + 1]:
+            values[a], values[a + 1] = values[a + 1], values[a]
+            for b in range(3):
+                vectors[b, a], vectors[b, a + 1] = vectors[b, a + 1], vectors[b, a]
+
+
+@kernel
+def look(
+    points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
+    inlier, residual, information, gradient, target, sigma_m,
+):  # fmt: skip
+    """`linearisation.linearise` into the last six: false, NaN, and zeros to begin with, the last two anything.
+
+    `sigmas` (N, J, V) are 0 where nothing is seen; `focal` (S, V) pixels. `reach` is the gate's, or
+    with `by_reach` the Geman-McClure kernel's, metres.
+    """
+    N, J, V = sigmas.shape
+    A, values, vectors = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for n in range(N):
+        for j in range(J):
+            x, H, g = points[n, j], information[n, j], gradient[n, j]
+            for v in range(V):
+                if not sigmas[n, j, v] > 0.0:
+                    continue
+                camera = cameras[n if cameras.shape[0] > 1 else 0, v]
+                depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
+                if not depth >= least_depth:
+                    continue
+                far = 0.0
+                for a in range(2):
+                    at = camera[a, 0] * x[0] + camera[a, 1] * x[1] + camera[a, 2] * x[2] + camera[a, 3]
+                    residual[n, j, v, a] = at / depth - xy[n, j, v, a]
+                    far += residual[n, j, v, a] ** 2
+                reach_px = reach * focal[n if focal.shape[0] > 1 else 0, v]
+                reach_px /= fixed_depth if fixed_depth > 0.0 else depth
+                inlier[n, j, v] = by_reach or math.sqrt(far) < reach_px
+                if inlier[n, j, v]:
+                    kind, wide = robust, width
+                    if by_reach:
+                        kind, wide = _GEMAN_MCCLURE, reach_px / sigmas[n, j, v]
+                    weight = 1.0 / (sigmas[n, j, v] * sigmas[n, j, v])
+                    _add_view(x, camera, xy[n, j, v, 0], xy[n, j, v, 1], weight, kind, wide, H, g)
+            for a in range(3):
+                target[n, j, a] = x[a]
+                for b in range(3):
+                    A[a, b] = H[a, b]
+            _eigen(A, values, vectors)
+            for k in range(3):
+                if values[k] > _LEAST_KNOWN * max(values[2], 1e-12):
+                    along = 0.0
+                    for a in range(3):
+                        along += vectors[a, k] * g[a]
+                    for a in range(3):
+                        target[n, j, a] -= vectors[a, k] * along / values[k]
+            sigma_m[n, j] = 1.0 / math.sqrt(values[0]) if values[0] > _NOTHING * values[2] else np.inf
+
+
+@kernel
+def sigmas_px(
+    points, cameras, focal, confidence, probability, scatter, sigma_m, power, least_weight, floor_rad, fixed_depth,
+    least_depth, least_probability, sigmas,
+):  # fmt: skip
+    """`linearisation.observation_sigmas` into `sigmas` (N, J, V), zeros; `scatter` (J,) is the joints'."""
+    N, J, V = sigmas.shape
+    depth = np.empty(J)
+    for n in range(N):
+        for v in range(V):
+            camera, f = cameras[n if cameras.shape[0] > 1 else 0, v], focal[n if focal.shape[0] > 1 else 0, v]
+            mean, count = 0.0, 0
+            for j in range(J):
+                x = points[n, j]
+                depth[j] = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
+                if depth[j] >= least_depth:
+                    mean, count = mean + depth[j], count + 1
+            mean = max(mean / max(count, 1), least_depth)
+            for j in range(J):
+                if confidence[n, j, v] > 0.0:
+                    at = fixed_depth if fixed_depth > 0.0 else (depth[j] if depth[j] >= least_depth else mean)
+                    weight = (confidence[n, j, v] ** power + least_weight) / (1.0 + least_weight)
+                    weight *= max(probability[n, j, v], least_probability) / (scatter[j] * scatter[j])
+                    of_joint, floor = sigma_m * f / at, floor_rad * f
+                    sigmas[n, j, v] = math.sqrt((of_joint * of_joint + floor * floor) / weight)
+
+
+@kernel
+def _normal(state, joint, diagonal, below, right, cameras, xy, weight, robust, width, H, g):
+    """Information H (T, d, d) and minus the gradient g (T, d) of one chain at `state` (T, d)."""
+    T, d = state.shape
+    for t in range(T):
+        for a in range(d):
+            total = right[t, a]
+            for b in range(d):
+                H[t, a, b] = diagonal[t, a, b]
+                total -= diagonal[t, a, b] * state[t, b]
+                if t > 0:
+                    total -= below[t - 1, a, b] * state[t - 1, b]
+                if t + 1 < T:
+                    total -= below[t, b, a] * state[t + 1, b]
+            g[t, a] = -total
+        for v in range(weight.shape[2]):
+            if weight[t, joint, v] > 0.0:
+                camera = cameras[t if cameras.shape[0] > 1 else 0, v]
+                u, w = xy[t, joint, v, 0], xy[t, joint, v, 1]
+                _add_view(state[t], camera, u, w, weight[t, joint, v], robust, width, H[t], g[t])
+        for a in range(d):
+            g[t, a] = -g[t, a]
+
+
+@kernel
+def _factored(H, below, Z):
+    """Block Cholesky down a chain, in place: H_t = L_t L_t^T, Z_t = L_t^-1 B_t^T. False where it is singular."""
+    T, d = H.shape[:2]
+    for t in range(T):
+        L = H[t]
+        for k in range(d):
+            pivot = L[k, k]
+            for a in range(k):
+                pivot -= L[k, a] * L[k, a]
+            if not pivot > 0.0:
+                return False
+            L[k, k] = math.sqrt(pivot)
+            for b in range(k + 1, d):
+                total = L[b, k]
+                for a in range(k):
+                    total -= L[b, a] * L[k, a]
+                L[b, k] = total / L[k, k]
+        if t + 1 < T:
+            after = Z[t]
+            for k in range(d):
+                for b in range(d):
+                    after[k, b] = below[t, b, k]
+                for a in range(k):
+                    for b in range(d):
+                        after[k, b] -= L[k, a] * after[a, b]
+                for b in range(d):
+                    after[k, b] /= L[k, k]
+            for k in range(d):
+                for a in range(d):
+                    for b in range(a + 1):
+                        H[t + 1, a, b] -= after[k, a] * after[k, b]
+    return True
+
+
+@kernel
+def descend(states, joints, diagonal, below, right, cameras, xy, weight, robust, width, tolerance, most):
+    """Gauss-Newton of C chains by themselves, in place, until positions move by less than `tolerance` metres.
+
+    A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
+    (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
+    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). Robust weights are as at the step
+    before, which no step makes worse but for the curvature of the projection; a singular chain stays.
+    """
+    C, T, d = states.shape
+    H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
+    for c in range(C):
+        x = states[c]
+        for _ in range(most):
+            _normal(x, joints[c], diagonal[c], below[c], right[c], cameras, xy, weight, robust, width, H, g)
+            if not _factored(H, below[c], Z):
+                break
+            for t in range(T):
+                for k in range(d):
+                    total = g[t, k]
+                    if t > 0:
+                        for a in range(d):
+                            total -= Z[t - 1, a, k] * g[t - 1, a]
+                    for a in range(k):
+                        total -= H[t, k, a] * g[t, a]
+                    g[t, k] = total / H[t, k, k]
+            furthest = 0.0
+            for t in range(T - 1, -1, -1):
+                for k in range(d - 1, -1, -1):
+                    total = g[t, k]
+                    if t + 1 < T:
+                        for a in range(d):
+                            total -= Z[t, k, a] * g[t + 1, a]
+                    for a in range(k + 1, d):
+                        total -= H[t, a, k] * g[t, a]
+                    g[t, k] = total / H[t, k, k]
+                    if k < 3 and not abs(g[t, k]) <= furthest:
+                        furthest = abs(g[t, k])
+            if not furthest < _FARTHEST_M:
+                break
+            for t in range(T):
+                for k in range(d):
+                    x[t, k] += g[t, k]
+            if furthest < tolerance:
+                break
+
+
+@kernel
+def spread(states, joints, diagonal, below, right, cameras, xy, weight, robust, width, covariance):
+    """Marginal `covariance` (C, T, 2, 3, 3) of positions and velocities of chains as in `descend`; NaN where a
+    chain is singular: the blocks on the diagonal of the inverse, from the end of the chain back.
+    """
+    C, T, d = states.shape
+    H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
+    M, G, S, part = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    for c in range(C):
+        _normal(states[c], joints[c], diagonal[c], below[c], right[c], cameras, xy, weight, robust, width, H, g)
+        if not _factored(H, below[c], Z):
+            covariance[c] = np.nan
+            continue
+        for t in range(T - 1, -1, -1):
+            L = H[t]
+            for k in range(d):  # M = L^-T, upper
+                M[k, k] = 1.0 / L[k, k]
+                for b in range(k + 1, d):
+                    total = 0.0
+                    for a in range(k, b):
+                        total -= L[b, a] * M[k, a]
+                    M[k, b] = total / L[b, b]
+            if t + 1 < T:
+                for a in range(d):
+                    for b in range(d):
+                        total = 0.0
+                        for k in range(a, d):
+                            total += M[a, k] * Z[t, k, b]
+                        G[a, b] = total
+                for a in range(d):
+                    for b in range(d):
+                        total = 0.0
+                        for k in range(d):
+                            total += G[a, k] * S[k, b]
+                        part[a, b] = total
+            for a in range(d):
+                for b in range(a + 1):
+                    total = 0.0
+                    for k in range(a, d):
+                        total += M[a, k] * M[b, k]
+                    if t + 1 < T:
+                        for k in range(d):
+                            total += part[a, k] * G[b, k]
+                    S[a, b] = S[b, a] = total
+            for n in range(2):
+                for a in range(3):
+                    for b in range(3):
+                        covariance[c, t, n, a, b] = S[3 * n + a, 3 * n + b]

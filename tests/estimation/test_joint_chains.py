@@ -1,0 +1,104 @@
+"""Joints as chains: the compiled solution and covariances against dense matrices and against GTSAM."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
+from shapepose_fg.estimation.joint_chains import Chains, Projections
+from shapepose_fg.estimation.linearisation import Message, ObservationConfig
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.window_graph import WindowGraph
+
+LOST, FEET = 4, np.array([11, 22])
+"""A joint that is lost for some frames, and two that stand."""
+
+
+def linear(diagonal, below, right) -> Chains:
+    """Chains without observations."""
+    C, T, d = right.shape
+    nobody = Views(np.eye(3)[None], np.eye(3, 4)[None])
+    seen = Projections(nobody, np.zeros((T, C, 1, 2)), np.zeros((T, C, 1)), np.zeros((T, C, 1), bool), None, 1.0)
+    return Chains(np.arange(C), (0, 1), diagonal, below, right, np.ones((T, C, d // 3), dtype=bool), seen)
+
+
+def test_a_chain_is_solved_and_inverted_as_its_matrix_is():
+    """Seven states of six numbers against the dense inverse."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(2, 90, 42))
+    band = np.abs(np.arange(42)[:, None] // 6 - np.arange(42) // 6) <= 1
+    H = A.swapaxes(1, 2) @ A * band + 60 * np.eye(42)
+    blocks, steps, right = H.reshape(2, 7, 6, 7, 6).swapaxes(2, 3), np.arange(7), rng.normal(size=(2, 7, 6))
+    chains = linear(*(blocks[:, steps[n:], steps[: 7 - n]].copy() for n in (0, 1)), right)
+    start = np.zeros((7, 2, 3))
+    expected = np.linalg.solve(H, right.reshape(2, 42, 1)).reshape(2, 7, 6)
+    np.testing.assert_allclose(chains.solved(start), expected, rtol=1e-9, atol=1e-12)
+    dense = np.linalg.inv(H).reshape(2, 7, 6, 7, 6).swapaxes(2, 3)[:, steps, steps].swapaxes(0, 1)
+    for n, found in enumerate(chains.covariances(start)):
+        part = slice(3 * n, 3 * n + 3)
+        np.testing.assert_allclose(found, dense[..., part, part], rtol=1e-9, atol=1e-12)
+
+
+def test_what_nothing_determines_is_nan_and_other_chains_are_not():
+    """The middle one of three chains has a last state that hangs on nothing: it stays where it starts."""
+    diagonal = np.tile(np.eye(6), (3, 3, 1, 1))
+    diagonal[1, 2] = 0.0
+    chains = linear(diagonal, np.zeros((3, 2, 6, 6)), np.ones((3, 3, 6)))
+    start = np.full((3, 3, 3), 0.5)
+    for found in chains.covariances(start):
+        assert np.isnan(found[:, 1]).all()
+        np.testing.assert_array_equal(found[:, [0, 2]], np.tile(np.eye(3), (3, 2, 1, 1)))
+    states = chains.solved(start)
+    np.testing.assert_array_equal(states[1, :, :3], start[:, 1])
+    np.testing.assert_allclose(states[[0, 2]], 1.0)
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
+@pytest.mark.parametrize("law", [CONSTANT_VELOCITY, CONSTANT_ACCELERATION], ids=["velocity", "acceleration"])
+def test_gtsam_ends_where_the_chains_do(five_cameras, two_people, kernel, law):
+    """One of six views 40 px off, a joint that is lost, feet that stand: nothing is left for GTSAM to gain, and
+    from elsewhere it comes back to the same joints."""
+    rng, T = np.random.default_rng(0), 12
+    truth = two_people[0] + 0.3 * np.linspace(0, 1, T)[:, None, None] * np.array([1.0, 0.0, 0.0])
+    truth[:, FEET] = truth[:1, FEET]
+    xy = np.moveaxis(five_cameras.project(truth)[0], 0, 2) + rng.normal(0, 3, (T, 25, 5, 2))
+    xy[:, 7, 1] += 40.0
+    sigmas = rng.uniform(3.0, 8.0, xy.shape[:3])
+    lost = np.zeros((T, 25), dtype=bool)
+    lost[4:8, LOST] = True
+    seen = Observations(
+        xy, np.full(sigmas.shape, 0.8), np.full((T, 25, 3), np.nan), np.zeros(T, dtype=int), np.arange(T),
+        np.repeat(np.arange(T)[:, None] / 25, 5, axis=1),
+    )  # fmt: skip
+    config = EstimatorConfig(ObservationConfig(kernel=kernel), WindowGraphConfig())
+    motion = MotionModel.load(BODY_25.joints, law=law)
+    window = WindowGraph(seen, sigmas, Views.of(five_cameras), config, motion)
+    body = Message(truth + rng.normal(0, 0.02, truth.shape), np.tile(np.eye(3) / 0.03**2, (T, 25, 1, 1)))
+    starts, optimizer = list[tuple[float, float]](), gtsam.LevenbergMarquardtOptimizer
+
+    class Told(optimizer):
+        def optimize(self):
+            before = self.error()
+            found = super().optimize()
+            starts.append((before, self.error()))
+            return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", Told)
+        found = window.solve(~lost[..., None] & (sigmas > 0), body, body, truth, lost, FEET)
+    ((before, after),) = starts
+    assert 0 <= before - after < 1e-5 * before
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-10)
+    away = gtsam.Values()
+    for key in window.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+        away.insert(key, window.values.atPoint3(key) + rng.normal(0, 0.01, 3))
+    whole = optimizer(window.graph, away, parameters).optimize()
+    again = np.array([[whole.atPoint3(key) for key in row] for row in window.keys.tolist()])
+    np.testing.assert_allclose(again, found, atol=1e-4)
+    assert len({chains.parts for chains in window.chains}) == 2, "the lost joint has an offset"
+    assert np.ptp(found[:, FEET], axis=0).max() < 0.02
