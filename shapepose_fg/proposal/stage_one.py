@@ -18,6 +18,9 @@ from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
 
+_POINTS_LEFT, _CANDIDATES_LEFT = 1000, 50
+"""Points and candidates of one joint at the most among what evidence leaves over."""
+
 
 @dataclass(frozen=True)
 class StageOne:
@@ -35,6 +38,11 @@ class StageOne:
     def by_hips(self) -> "StageOne":
         """The same with people sought by their hips, as in the paper, and not judged by evidence."""
         return replace(self, proposals=replace(self.proposals, evidence=False))
+
+    def of_the_rest(self) -> "StageOne":
+        """`by_hips` for what evidence leaves over: hips that two views saw, of few people; little is kept."""
+        few = replace(self.candidates, min_votes=1, most_points=_POINTS_LEFT, most_candidates=_CANDIDATES_LEFT)
+        return replace(self.by_hips(), candidates=few)
 
     def __call__(self, detections: Detections, rig: Rig) -> Observations:
         """The people of a frame."""
