@@ -69,9 +69,13 @@ class JointStates:
 
         A negative step predicts into the past.
         """
-        F, noise = (np.kron(each, np.eye(3)) for each in motion.step(step_s, density))
-        mean, covariance = np.empty_like(self.mean), np.empty_like(self.covariance)
-        _predict(self.mean, self.covariance, F, noise, np.empty_like(F), mean, covariance)
+        F, noise = motion.step(step_s, density)
+        mean, covariance, half = (
+            np.empty_like(self.mean),
+            np.empty_like(self.covariance),
+            np.empty(self.mean.shape[-1]),
+        )
+        _predict(self.mean, self.covariance, F, noise, half, mean, covariance)
         return JointStates(mean, covariance)
 
     def with_derivatives(self, *derivatives: Array) -> "JointStates":
@@ -81,23 +85,21 @@ class JointStates:
 
 @kernel
 def _predict(mean, covariance, F, noise, half, mean_after, covariance_after):
-    """F m and F P F^T + Q of all joints, with F (S, S) and Q (J, S, S) that leave the axes apart."""
+    """F m and F P F^T + Q of all joints, with F (n, n) and Q (J, n, n) for each axis; `half` (S,) is for work."""
     people, joints, size = mean.shape
     for a in range(people):
         for j in range(joints):
             for row in range(size):
                 total = 0.0
                 for k in range(row % 3, size, 3):
-                    total += F[row, k] * mean[a, j, k]
+                    total += F[row // 3, k // 3] * mean[a, j, k]
                 mean_after[a, j, row] = total
                 for column in range(size):
-                    total = 0.0
+                    half[column] = 0.0
                     for k in range(row % 3, size, 3):
-                        total += F[row, k] * covariance[a, j, k, column]
-                    half[row, column] = total
-            for row in range(size):
+                        half[column] += F[row // 3, k // 3] * covariance[a, j, k, column]
                 for column in range(size):
-                    total = noise[j, row, column]
+                    total = noise[j, row // 3, column // 3] if row % 3 == column % 3 else 0.0
                     for k in range(column % 3, size, 3):
-                        total += half[row, k] * F[column, k]
+                        total += half[k] * F[column // 3, k // 3]
                     covariance_after[a, j, row, column] = total
