@@ -131,8 +131,8 @@ def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: 
     """The detections (A, J, V), and all that are near."""
     gate_m = np.where(predicted.lost, _REACH_M, np.minimum(_FAR_M + 2 * predicted.sigma_m, FARTHEST_M))
     world = np.zeros(len(gate_m), dtype=np.intp) if predicted.world is None else predicted.world
-    first, *found = _found(predicted.places, np.maximum(gate_m, OVERLAP_M), world, rig, skeleton, detections)
-    person, detection, distance_m = found
+    reach_m = np.maximum(gate_m, OVERLAP_M)
+    first, person, detection, distance_m = _found(predicted.places, reach_m, world, rig, skeleton, detections)
     at = person, detections.joint[detection]
     within, lost, sigma_m = distance_m < gate_m[at], predicted.lost[at], predicted.sigma_m[at]
     nearness = np.exp(-0.5 * distance_m**2 / (_NEAR_M**2 + sigma_m**2))
