@@ -1,10 +1,13 @@
-"""Which detections are near whose joints, how they are tied to what a person has, and who gets which.
+"""Whose a detection is: by how near it is to a person's joint, and by its affinities to what the person has.
 
-Lists of what is possible, not tables of everybody and everything: most detections are nowhere near most people.
+One rule for the proposals of a frame, for hypotheses of who may be there, and for people who are followed. They
+differ in how near is near, and in what is sought of joints whose place is not known. Lists of what is possible,
+not tables of everybody and everything: most detections are nowhere near most people.
 """
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +16,24 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import LEAST_AFFINITY, OVERLAP_M
+
+LEAST_AFFINITY = 0.3
+"""What counts as affinity where no neighbour is seen, and half of the least score: unrelated pairs are mostly 0,
+true ones above 0.4."""
+OVERLAP_M = 0.025
+"""Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
+serves both. A detector is 2 to 3 cm off."""
+
+
+class Claims(NamedTuple):
+    """What speaks for each of N detections being people's."""
+
+    tied: Array
+    """(N,) mean affinity to what the person has at the other ends of the joint's limbs; 0 where there is none."""
+    score: Array
+    """(N,) nearness and affinity."""
+    likely: Mask
+    """(N,) where these are enough."""
 
 
 @dataclass(frozen=True)
@@ -29,15 +49,31 @@ class Nearby:
     distance_m: Array
     """(N,) from the joint's projection, metres at its depth."""
 
-    def matched(self, score: Array, likely: Mask, world: Index, chosen: Index, detections: Detections) -> Index:
-        """Like `chosen` (A, J, V): -1 for none, else what people get of that which is `likely` (N,), the best
-        `score` (N,) first, each detection once in a `world` (A,), each person one for a joint and view.
+    def claimed(
+        self,
+        nearness: Array,
+        lost: Mask,
+        sure: float,
+        own: Index,
+        world: Index,
+        detections: Detections,
+        skeleton: Skeleton,
+    ) -> tuple[Index, Claims]:
+        """The detections (A, J, V) that people get, -1 for none, who are thought to have `own` (A, J, V): the best
+        score first, each detection once in a `world` (A,), each person one for a joint and view.
+
+        The score is `nearness` (N,), 1 on the joint and 0 far from it, and mean affinity to the person's own. Of
+        joints that are `lost` (N,) only affinity tells, and so much of it must be there.
         """
+        tied, neighbours = own_affinity(self.person, self.detection, own, detections, skeleton)
+        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+        score = nearness + np.where(neighbours > 0, tied, LEAST_AFFINITY)
+        likely = np.where(lost, (neighbours > 0) & (tied >= sure), score >= 2 * LEAST_AFFINITY)
         # People whom the detector has grouped have affinities of exactly 1: equal scores are told apart.
-        key, found = np.round(score, 9) + 1e-10 * detections.rank[self.detection], np.full_like(chosen, -1)
+        key, chosen = np.round(score, 9) + 1e-10 * detections.rank[self.detection], np.full_like(own, -1)
         queue, taken = np.empty(len(key), dtype=np.intp), np.empty(len(detections), dtype=np.intp)
-        _match(self.first, self.person, self.detection, key, likely, world, queue, taken, found)
-        return found
+        _match(self.first, self.person, self.detection, key, likely, world, queue, taken, chosen)
+        return chosen, Claims(tied, score, likely)
 
     def with_tied(self, own: Index, unplaced: Mask, detections: Detections, views: int) -> "Nearby":
         """And detections of joints that are `unplaced` (A, J), infinitely far, which affinities tie to people's

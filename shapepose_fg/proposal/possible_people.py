@@ -12,8 +12,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import LEAST_AFFINITY
-from shapepose_fg.proposal.nearby import nearby, own_affinity
+from shapepose_fg.proposal.nearby import nearby
 
 _NEAR_M = 0.06
 """How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
@@ -133,14 +132,11 @@ def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Ind
     unplaced = np.isnan(places[..., 0])
     if unplaced.any():
         near = near.with_tied(own, unplaced, found, V)
-    tied, neighbours = own_affinity(near.person, near.detection, own, found, frame.skeleton)
-    # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-    score = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2) + np.where(neighbours > 0, tied, LEAST_AFFINITY)
-    sure = (neighbours > 0) & (tied >= _SURE_AFFINITY)
-    likely = np.where(np.isfinite(near.distance_m), score >= 2 * LEAST_AFFINITY, sure)
-    chosen = near.matched(score, likely, world, own, found)
+    nearness = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2)
+    lost = np.isinf(near.distance_m)
+    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, found, frame.skeleton)
     if exclusive:
-        near.share(tied, chosen, found)
+        near.share(claims.tied, chosen, found)
     return chosen
 
 

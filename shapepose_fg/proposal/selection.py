@@ -9,8 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.claims import LEAST_AFFINITY
-from shapepose_fg.proposal.nearby import own_affinity
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, own_affinity
 from shapepose_fg.proposal.pairs_of_people import pooled
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, settled
 

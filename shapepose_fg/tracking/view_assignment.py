@@ -9,8 +9,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import LEAST_AFFINITY, OVERLAP_M
-from shapepose_fg.proposal.nearby import Nearby, nearby, own_affinity
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, OVERLAP_M, Nearby, nearby
 
 _NEAR_M = 0.06
 """How closeness to the predicted joint falls off where the prediction is exact: sigma of a Gaussian, as a length
@@ -109,20 +108,17 @@ def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: 
     near = nearby(predicted.places, np.maximum(gate_m, OVERLAP_M), world, rig, skeleton, detections)
     at = near.person, detections.joint[near.detection]
     within, lost, sigma_m = near.distance_m < gate_m[at], predicted.lost[at], predicted.sigma_m[at]
-    nearness = np.exp(-0.5 * near.distance_m**2 / (_NEAR_M**2 + sigma_m**2))
-    chosen = np.full((len(gate_m), len(skeleton), len(rig)), -1, dtype=np.intp)
-    for _ in range(_PASSES + 1):
-        before = chosen
-        tied, neighbours = own_affinity(near.person, near.detection, before, detections, skeleton)
-        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-        score = nearness + np.where(neighbours > 0, tied, LEAST_AFFINITY)
-        sure = (neighbours > 0) & (tied >= LEAST_AFFINITY)
-        likely = within & np.where(lost, sure, score >= 2 * LEAST_AFFINITY)
-        chosen = near.matched(score, likely, world, before, detections)
+    nearness = np.where(within, np.exp(-0.5 * near.distance_m**2 / (_NEAR_M**2 + sigma_m**2)), -np.inf)
+    rule = nearness, lost & within, LEAST_AFFINITY
+    before = np.full((len(gate_m), len(skeleton), len(rig)), -1, dtype=np.intp)
+    chosen, claims = near.claimed(*rule, before, world, detections, skeleton)
+    for _ in range(_PASSES):
         if (chosen == before).all():
             break
-    near.share(tied, chosen, detections)
-    return chosen, Scored(near, score, (within & ~lost) | likely)
+        before = chosen
+        chosen, claims = near.claimed(*rule, before, world, detections, skeleton)
+    near.share(claims.tied, chosen, detections)
+    return chosen, Scored(near, claims.score, (within & ~lost) | claims.likely)
 
 
 @kernel

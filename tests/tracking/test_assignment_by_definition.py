@@ -9,7 +9,7 @@ import pytest
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal import claims, nearby
+from shapepose_fg.proposal import nearby
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, probabilities_of, reassociate, who_goes
 from shapepose_fg.tracking.view_assignment import Predicted, assign
@@ -50,7 +50,7 @@ def settle(monkeypatch):
 
     def settle(**settings):
         for name, value in settings.items():
-            for module in (view_assignment, nearby, claims):
+            for module in (view_assignment, nearby):
                 for constant in (name.upper(), f"_{name.upper()}"):
                     if hasattr(module, constant):
                         monkeypatch.setattr(module, constant, value)
