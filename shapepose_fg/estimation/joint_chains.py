@@ -14,7 +14,7 @@ from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.in_time import spanned
-from shapepose_fg.estimation.kernels import ROBUST, descend, spread
+from shapepose_fg.estimation.kernels import ROBUST, ready, solve_chains
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting
 
@@ -90,34 +90,30 @@ class Chains:
     seen: Projections
     """What is not linear."""
 
-    def solved(self, initial: Array) -> Array:
-        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself."""
-        states = np.zeros(self.right.shape)
-        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
-        descend(states, *self._problem(), _SETTLED_M, _STEPS)
-        return states
+    def solved(self, initial: Array, steps: int = _STEPS) -> tuple[Array, Array]:
+        """(C, T, d) states of least cost, from `initial` positions (T, J, 3), each chain by itself; and marginal
+        covariances (2, T, C, 3, 3) of positions and velocities there.
 
-    def covariances(self, points: Array) -> tuple[Array, Array]:
-        """Marginal covariances (T, C, 3, 3) of positions and of velocities where joints are at `points` (T, J, 3);
-        NaN in all of a chain that is singular, and where one is not determined.
+        These are NaN in all of a chain that is singular, and where one is not determined.
         """
         states, found = np.zeros(self.right.shape), np.empty((*self.right.shape[:2], 2, 3, 3))
-        states[..., :3] = points[:, self.joints].swapaxes(0, 1)
-        spread(states, *self._problem(), found)
-        return determined(found[:, :, 0].swapaxes(0, 1)), determined(found[:, :, 1].swapaxes(0, 1))
+        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
+        seen = self.seen
+        solve_chains(
+            states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
+            seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, found,
+        )  # fmt: skip
+        return states, determined(np.ascontiguousarray(found.transpose(2, 1, 0, 3, 4)))
+
+    def covariances(self, points: Array) -> Array:
+        """Those (2, T, C, 3, 3) where joints are at `points` (T, J, 3)."""
+        return self.solved(points, 0)[1]
 
     def put(self, states: Array, into: Array) -> None:
         """Write `states` (C, T, d) `into` those of the window (T, J, S, 3), each part to its place."""
         parts = states.reshape(*states.shape[:2], -1, 3).swapaxes(0, 1)
         for n, part in enumerate(self.parts):
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
-
-    def _problem(self):
-        seen = self.seen
-        return (
-            self.joints, self.diagonal, self.below, self.right, seen.views.projection, seen.xy, seen.weight,
-            ROBUST[seen.kernel], seen.width,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)

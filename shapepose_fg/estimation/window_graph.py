@@ -192,7 +192,7 @@ class WindowGraph:
         if self.temporal:
             self.chains = problem.chains(joints.tolist())
             for chains in self.chains:
-                chains.put(chains.solved(initial), states)
+                chains.put(chains.solved(initial)[0], states)
         self._start(states)
         self.graph = gtsam.NonlinearFactorGraph()
         self._add(self._seen(problem.seen))
