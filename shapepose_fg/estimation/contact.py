@@ -46,14 +46,14 @@ def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) ->
     """
     standing = problem.standing.copy()
     for chains in problem.chains(feet.tolist()):
-        joints, (states, (_, covariance)) = chains.joints, chains.solved(initial)
-        velocity = states[..., 3:6].swapaxes(0, 1)
+        joints, states, at = chains.joints, chains.solved(initial), initial.copy()
+        at[:, joints], velocity = states[..., :3].swapaxes(0, 1), states[..., 3:6].swapaxes(0, 1)
         if lost is not None:
             # A body's guess that stands still is no foot that does, but for a while.
             velocity = np.where(
                 near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None], velocity, np.nan
             )
-        density = standing_density(velocity, covariance, problem.times_s)
+        density = standing_density(velocity, chains.covariances(at)[1], problem.times_s)
         standing[:, joints] = np.where(density > FREE_M2_S, np.inf, density)
     return replace(problem, standing=standing)
 

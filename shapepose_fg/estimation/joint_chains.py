@@ -90,24 +90,27 @@ class Chains:
     seen: Projections
     """What is not linear."""
 
-    def solved(self, initial: Array, steps: int = _STEPS) -> tuple[Array, Array]:
-        """(C, T, d) states of least cost, from `initial` positions (T, J, 3), each chain by itself; and marginal
-        covariances (2, T, C, 3, 3) of positions and velocities there.
-
-        These are NaN in all of a chain that is singular, and where one is not determined.
-        """
-        states, found = np.zeros(self.right.shape), np.empty((*self.right.shape[:2], 2, 3, 3))
-        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
-        seen = self.seen
-        solve_chains(
-            states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
-            seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, found,
-        )  # fmt: skip
-        return states, determined(np.ascontiguousarray(found.transpose(2, 1, 0, 3, 4)))
+    def solved(self, initial: Array, steps: int = _STEPS) -> Array:
+        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself."""
+        return self._solve(initial, steps, np.empty((0, 1, 2, 3, 3)))
 
     def covariances(self, points: Array) -> Array:
-        """Those (2, T, C, 3, 3) where joints are at `points` (T, J, 3)."""
-        return self.solved(points, 0)[1]
+        """(2, T, C, 3, 3) marginal covariances of positions and velocities where joints are at `points` (T, J, 3).
+
+        NaN in all of a chain that is singular, and where one is not determined.
+        """
+        found = np.empty((*self.right.shape[:2], 2, 3, 3))
+        self._solve(points, 0, found)
+        return determined(np.ascontiguousarray(found.transpose(2, 1, 0, 3, 4)))
+
+    def _solve(self, initial: Array, steps: int, covariance: Array) -> Array:
+        states, seen = np.zeros(self.right.shape), self.seen
+        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
+        solve_chains(
+            states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
+            seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
+        )  # fmt: skip
+        return states
 
     def put(self, states: Array, into: Array) -> None:
         """Write `states` (C, T, d) `into` those of the window (T, J, S, 3), each part to its place."""

@@ -279,14 +279,14 @@ def _marginals(H, Z, M, G, S, covariance):
 def solve_chains(
     states, joints, diagonal, below, right, cameras, xy, weight, robust, width, steps, tolerance, covariance
 ):
-    """Gauss-Newton of C chains by themselves, in place, and marginal `covariance` (C, T, 2, 3, 3) of positions and
-    velocities where it ends; NaN where a chain is singular, which stays where it is.
+    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, 2, 3, 3), or (0, ...)
+    for none, of positions and velocities where it ends; NaN where a chain is singular, which stays where it is.
 
     A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
     (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
-    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many `steps`,
-    until one moves no position by `tolerance` metres; without any there are covariances only. Robust weights are
-    those of the step before, which no step makes worse but for the curvature of the projection.
+    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
+    `steps`, until one moves no position by `tolerance` metres. Robust weights are those of the step before, which
+    no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
     H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
@@ -303,7 +303,7 @@ def solve_chains(
             n += 1
             if not moved < _FARTHEST_M:
                 break
-        if regular:
+        if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
-        else:
+        elif c < len(covariance):
             covariance[c] = np.nan

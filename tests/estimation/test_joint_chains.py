@@ -36,7 +36,7 @@ def test_a_chain_is_solved_and_inverted_as_its_matrix_is():
     chains = linear(*(blocks[:, steps[n:], steps[: 7 - n]].copy() for n in (0, 1)), right)
     start = np.zeros((7, 2, 3))
     expected = np.linalg.solve(H, right.reshape(2, 42, 1)).reshape(2, 7, 6)
-    np.testing.assert_allclose(chains.solved(start)[0], expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(chains.solved(start), expected, rtol=1e-9, atol=1e-12)
     dense = np.linalg.inv(H).reshape(2, 7, 6, 7, 6).swapaxes(2, 3)[:, steps, steps].swapaxes(0, 1)
     for n, found in enumerate(chains.covariances(start)):
         part = slice(3 * n, 3 * n + 3)
@@ -52,7 +52,7 @@ def test_what_nothing_determines_is_nan_and_other_chains_are_not():
     for found in chains.covariances(start):
         assert np.isnan(found[:, 1]).all()
         np.testing.assert_array_equal(found[:, [0, 2]], np.tile(np.eye(3), (3, 2, 1, 1)))
-    states, _ = chains.solved(start)
+    states = chains.solved(start)
     np.testing.assert_array_equal(states[1, :, :3], start[:, 1])
     np.testing.assert_allclose(states[[0, 2]], 1.0)
 
@@ -78,20 +78,10 @@ def test_gtsam_ends_where_the_chains_do(five_cameras, two_people, kernel, law):
     motion = MotionModel.load(BODY_25.joints, law=law)
     window = WindowGraph(seen, sigmas, Views.of(five_cameras), config, motion)
     body = Message(truth + rng.normal(0, 0.02, truth.shape), np.tile(np.eye(3) / 0.03**2, (T, 25, 1, 1)))
-    starts, optimizer = list[tuple[float, float]](), gtsam.LevenbergMarquardtOptimizer
-
-    class Told(optimizer):
-        def optimize(self):
-            before = self.error()
-            found = super().optimize()
-            starts.append((before, self.error()))
-            return found
-
+    optimizer = gtsam.LevenbergMarquardtOptimizer
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", Told)
+        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", lambda *_: pytest.fail("the start is far off"))
         found = window.solve(~lost[..., None] & (sigmas > 0), body, body, truth, lost, FEET)
-    ((before, after),) = starts
-    assert 0 <= before - after < 1e-5 * before
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-10)
     away = gtsam.Values()
