@@ -15,8 +15,10 @@ def to_pixels(
     `K` (..., 3, 3) broadcasts against the points. NaN pixels where the depth is not positive.
     """
     depth = points_camera[..., 2]
-    normalised = points_camera[..., :2] / np.where(depth > 0, depth, np.nan)[..., None]
-    return np.einsum("...ij,...j->...i", K[..., :2, :2], normalised) + K[..., :2, 2], depth
+    before = np.where(depth > 0, depth, np.nan)
+    x, y = points_camera[..., 0] / before, points_camera[..., 1] / before
+    rows = (K[..., n, 0] * x + K[..., n, 1] * y + K[..., n, 2] for n in range(2))
+    return np.stack(np.broadcast_arrays(*rows), axis=-1), depth
 
 
 def project_with_jacobian(

@@ -317,6 +317,13 @@ class Views:
         K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))
         return Views(K, cTw, self.image_sizes)
 
+    def pixels(self, points: Array) -> tuple[Array, Array]:
+        """The first two of `project`."""
+        P = self.projection.reshape(-1, 3 * len(self), 4)
+        ends = (points @ P[..., :3].mT + P[:, None, :, 3]).reshape(*points.shape[:2], len(self), 3)
+        depth = ends[..., 2]
+        return ends[..., :2] / np.where(depth > 0, depth, np.nan)[..., None], depth
+
     def project(self, points: Array) -> tuple[Array, Array, Array]:
         """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J, 3), metres.
 

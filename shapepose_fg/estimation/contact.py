@@ -46,9 +46,8 @@ def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) ->
     """
     standing = problem.standing.copy()
     for chains in problem.chains(feet.tolist()):
-        joints, states = chains.joints, chains.solved(initial)
-        at, velocity = initial.copy(), states[..., 3:6].swapaxes(0, 1)
-        at[:, joints] = states[..., :3].swapaxes(0, 1)
+        joints, states, at = chains.joints, chains.solved(initial), initial.copy()
+        at[:, joints], velocity = states[..., :3].swapaxes(0, 1), states[..., 3:6].swapaxes(0, 1)
         if lost is not None:
             # A body's guess that stands still is no foot that does, but for a while.
             velocity = np.where(

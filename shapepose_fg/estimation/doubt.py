@@ -78,8 +78,8 @@ def association_spread(
     row, joint, view = np.nonzero(doubtful)
     if len(row) == 0:
         return spread
-    _, _, jacobian = views.project(joints)
-    jacobian, residual = jacobian[row, joint, view], evidence.residual_px[row, joint, view]
+    _, _, jacobian = views.rows(row).project(joints[row, joint][:, None])
+    jacobian, residual = jacobian[np.arange(len(row)), 0, view], evidence.residual_px[row, joint, view]
     sigma, p = sigmas[row, joint, view], probability[row, joint, view]
     weight = kernel_weight(config.robust_kernel, np.linalg.norm(residual, axis=-1) / sigma) / sigma**2
     information = weight[:, None, None] * jacobian.mT @ jacobian

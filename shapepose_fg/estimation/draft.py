@@ -11,7 +11,13 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_step import MODEL_SIGMA_M, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import ViewEvidence, linearise, observation_sigmas, triangulate
+from shapepose_fg.estimation.linearisation import (
+    ViewEvidence,
+    inverses,
+    linearise,
+    observation_sigmas,
+    triangulate,
+)
 
 NARROWING_M = (0.2, 0.1, 0.05, 0.05)
 """A draft's body is fitted to the detections around it, fit by fit, under a kernel that narrows, as in SMPLify:
@@ -135,15 +141,18 @@ def drafted(evidence: ViewEvidence, body: BodyFit, disagreement: float) -> tuple
     """
     known = (body.ok[:, None] & np.isfinite(body.covariance).all(axis=(2, 3)))[..., None]
     covariance = np.where(known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3))
-    at = np.where(known, body.joints, np.nan_to_num(evidence.target))
-    apart = np.nan_to_num(evidence.target) - at
-    views = evidence.information
-    weight = views @ np.linalg.inv(np.eye(3) + covariance @ views)
-    agree = np.einsum("...i,...ij,...j->...", apart, weight, apart) < disagreement**2
-    views = np.where(agree[..., None, None], views, 0.0)
-    total = views + np.where(known[..., None], np.linalg.inv(covariance), 0.0)
-    determined = np.linalg.eigvalsh(total)[..., 0] > 1.0  # to a metre
-    joint_covariance = np.linalg.inv(np.where(determined[..., None, None], total, np.eye(3)))
-    place = at + np.einsum("...ij,...j->...i", joint_covariance @ views, apart)
-    place = np.where(determined[..., None], place, np.nan)
-    return place, np.where(determined[..., None, None], joint_covariance, np.nan)
+    of_body = np.where(known[..., None], inverses(covariance), 0.0)
+    views, target = evidence.information, np.nan_to_num(evidence.target)
+    at = np.where(known, body.joints, target)
+    pull = (views @ (target - at)[..., None])[..., 0]
+    spread = inverses(views + of_body)
+    step = (np.where(known[..., None], spread, 0.0) @ pull[..., None])[..., 0]
+    # d^T (C + H^-1)^-1 d, of information H that may be singular.
+    agree = ~known | (((target - at - step) * pull).sum(axis=-1, keepdims=True) < disagreement**2)
+    spread, place = np.where(agree[..., None], spread, covariance), np.where(agree, at + step, at)
+    # To a metre: what the body knows so well itself, and of all else what has so much information.
+    determined = known & (np.trace(covariance, axis1=2, axis2=3) < 1.0)[..., None]
+    asked = ~determined[..., 0]
+    total = (of_body + np.where(agree[..., None], views, 0.0))[asked]
+    determined[asked, 0] = np.linalg.eigvalsh(total)[..., 0] > 1.0
+    return np.where(determined, place, np.nan), np.where(determined[..., None], spread, np.nan)

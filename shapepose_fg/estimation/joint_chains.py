@@ -14,7 +14,7 @@ from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.in_time import spanned
-from shapepose_fg.estimation.kernels import ROBUST, descend, spread
+from shapepose_fg.estimation.kernels import ROBUST, ready, solve_chains
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting
 
@@ -90,34 +90,33 @@ class Chains:
     seen: Projections
     """What is not linear."""
 
-    def solved(self, initial: Array) -> Array:
+    def solved(self, initial: Array, steps: int = _STEPS) -> Array:
         """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself."""
-        states = np.zeros(self.right.shape)
-        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
-        descend(states, *self._problem(), _SETTLED_M, _STEPS)
-        return states
+        return self._solve(initial, steps, np.empty((0, 1, 2, 3, 3)))
 
-    def covariances(self, points: Array) -> tuple[Array, Array]:
-        """Marginal covariances (T, C, 3, 3) of positions and of velocities where joints are at `points` (T, J, 3);
+    def covariances(self, points: Array) -> Array:
+        """(2, T, C, 3, 3) marginal covariances of positions and velocities where joints are at `points` (T, J, 3).
+
         NaN in all of a chain that is singular, and where one is not determined.
         """
-        states, found = np.zeros(self.right.shape), np.empty((*self.right.shape[:2], 2, 3, 3))
-        states[..., :3] = points[:, self.joints].swapaxes(0, 1)
-        spread(states, *self._problem(), found)
-        return determined(found[:, :, 0].swapaxes(0, 1)), determined(found[:, :, 1].swapaxes(0, 1))
+        found = np.empty((*self.right.shape[:2], 2, 3, 3))
+        self._solve(points, 0, found)
+        return determined(np.ascontiguousarray(found.transpose(2, 1, 0, 3, 4)))
+
+    def _solve(self, initial: Array, steps: int, covariance: Array) -> Array:
+        states, seen = np.zeros(self.right.shape), self.seen
+        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
+        solve_chains(
+            states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
+            seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
+        )  # fmt: skip
+        return states
 
     def put(self, states: Array, into: Array) -> None:
         """Write `states` (C, T, d) `into` those of the window (T, J, S, 3), each part to its place."""
         parts = states.reshape(*states.shape[:2], -1, 3).swapaxes(0, 1)
         for n, part in enumerate(self.parts):
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
-
-    def _problem(self):
-        seen = self.seen
-        return (
-            self.joints, self.diagonal, self.below, self.right, seen.views.projection, seen.xy, seen.weight,
-            ROBUST[seen.kernel], seen.width,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)

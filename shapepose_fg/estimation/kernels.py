@@ -147,33 +147,6 @@ def look(
 
 
 @kernel
-def sigmas_px(
-    points, cameras, focal, confidence, probability, scatter, sigma_m, power, least_weight, floor_rad, fixed_depth,
-    least_depth, least_probability, sigmas,
-):  # fmt: skip
-    """`linearisation.observation_sigmas` into `sigmas` (N, J, V), zeros; `scatter` (J,) is the joints'."""
-    N, J, V = sigmas.shape
-    depth = np.empty(J)
-    for n in range(N):
-        for v in range(V):
-            camera, f = cameras[n if cameras.shape[0] > 1 else 0, v], focal[n if focal.shape[0] > 1 else 0, v]
-            mean, count = 0.0, 0
-            for j in range(J):
-                x = points[n, j]
-                depth[j] = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
-                if depth[j] >= least_depth:
-                    mean, count = mean + depth[j], count + 1
-            mean = max(mean / max(count, 1), least_depth)
-            for j in range(J):
-                if confidence[n, j, v] > 0.0:
-                    at = fixed_depth if fixed_depth > 0.0 else (depth[j] if depth[j] >= least_depth else mean)
-                    weight = (confidence[n, j, v] ** power + least_weight) / (1.0 + least_weight)
-                    weight *= max(probability[n, j, v], least_probability) / (scatter[j] * scatter[j])
-                    of_joint, floor = sigma_m * f / at, floor_rad * f
-                    sigmas[n, j, v] = math.sqrt((of_joint * of_joint + floor * floor) / weight)
-
-
-@kernel
 def _normal(state, joint, diagonal, below, right, cameras, xy, weight, robust, width, H, g):
     """Information H (T, d, d) and minus the gradient g (T, d) of one chain at `state` (T, d)."""
     T, d = state.shape
@@ -233,97 +206,104 @@ def _factored(H, below, Z):
 
 
 @kernel
-def descend(states, joints, diagonal, below, right, cameras, xy, weight, robust, width, tolerance, most):
-    """Gauss-Newton of C chains by themselves, in place, until positions move by less than `tolerance` metres.
-
-    A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
-    (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
-    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). Robust weights are as at the step
-    before, which no step makes worse but for the curvature of the projection; a singular chain stays.
-    """
-    C, T, d = states.shape
-    H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
-    for c in range(C):
-        x = states[c]
-        for _ in range(most):
-            _normal(x, joints[c], diagonal[c], below[c], right[c], cameras, xy, weight, robust, width, H, g)
-            if not _factored(H, below[c], Z):
-                break
-            for t in range(T):
-                for k in range(d):
-                    total = g[t, k]
-                    if t > 0:
-                        for a in range(d):
-                            total -= Z[t - 1, a, k] * g[t - 1, a]
-                    for a in range(k):
-                        total -= H[t, k, a] * g[t, a]
-                    g[t, k] = total / H[t, k, k]
-            furthest = 0.0
-            for t in range(T - 1, -1, -1):
-                for k in range(d - 1, -1, -1):
-                    total = g[t, k]
-                    if t + 1 < T:
-                        for a in range(d):
-                            total -= Z[t, k, a] * g[t + 1, a]
-                    for a in range(k + 1, d):
-                        total -= H[t, a, k] * g[t, a]
-                    g[t, k] = total / H[t, k, k]
-                    if k < 3 and not abs(g[t, k]) <= furthest:
-                        furthest = abs(g[t, k])
-            if not furthest < _FARTHEST_M:
-                break
-            for t in range(T):
-                for k in range(d):
-                    x[t, k] += g[t, k]
-            if furthest < tolerance:
-                break
+def _step(x, H, Z, g):
+    """Take the step of `_factored` blocks and minus the gradient `g` (T, d), which is lost; how far, metres."""
+    T, d = x.shape
+    for t in range(T):
+        for k in range(d):
+            total = g[t, k]
+            if t > 0:
+                for a in range(d):
+                    total -= Z[t - 1, a, k] * g[t - 1, a]
+            for a in range(k):
+                total -= H[t, k, a] * g[t, a]
+            g[t, k] = total / H[t, k, k]
+    farthest = 0.0
+    for t in range(T - 1, -1, -1):
+        for k in range(d - 1, -1, -1):
+            total = g[t, k]
+            if t + 1 < T:
+                for a in range(d):
+                    total -= Z[t, k, a] * g[t + 1, a]
+            for a in range(k + 1, d):
+                total -= H[t, a, k] * g[t, a]
+            g[t, k] = total / H[t, k, k]
+            if k < 3 and not abs(g[t, k]) <= farthest:
+                farthest = abs(g[t, k])
+    if farthest < _FARTHEST_M:
+        for t in range(T):
+            for k in range(d):
+                x[t, k] += g[t, k]
+    return farthest
 
 
 @kernel
-def spread(states, joints, diagonal, below, right, cameras, xy, weight, robust, width, covariance):
-    """Marginal `covariance` (C, T, 2, 3, 3) of positions and velocities of chains as in `descend`; NaN where a
-    chain is singular: the blocks on the diagonal of the inverse, from the end of the chain back.
+def _marginals(H, Z, M, G, S, covariance):
+    """The blocks on the diagonal of the inverse of `_factored` ones, from the end back: `covariance` (T, 2, 3, 3)
+    of the first three and the next three numbers.
+    """
+    T, d = H.shape[:2]
+    for t in range(T - 1, -1, -1):
+        for k in range(d):  # M = L^-T, upper
+            for b in range(k, d):
+                total = 1.0 if b == k else 0.0
+                for a in range(k, b):
+                    total -= H[t, b, a] * M[k, a]
+                M[k, b] = total / H[t, b, b]
+        if t + 1 < T:
+            for a in range(d):
+                for b in range(d):
+                    G[0, a, b] = 0.0
+                    for k in range(a, d):
+                        G[0, a, b] += M[a, k] * Z[t, k, b]
+            for a in range(d):
+                for b in range(d):
+                    G[1, a, b] = 0.0
+                    for k in range(d):
+                        G[1, a, b] += G[0, a, k] * S[k, b]
+        for a in range(d):
+            for b in range(a + 1):
+                total = 0.0
+                for k in range(a, d):
+                    total += M[a, k] * M[b, k]
+                if t + 1 < T:
+                    for k in range(d):
+                        total += G[1, a, k] * G[0, b, k]
+                S[a, b] = S[b, a] = total
+        for a in range(6):
+            for b in range(3):
+                covariance[t, a // 3, a % 3, b] = S[a, 3 * (a // 3) + b]
+
+
+@kernel
+def solve_chains(
+    states, joints, diagonal, below, right, cameras, xy, weight, robust, width, steps, tolerance, covariance
+):
+    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, 2, 3, 3), or (0, ...)
+    for none, of positions and velocities where it ends; NaN where a chain is singular, which stays where it is.
+
+    A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
+    (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
+    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
+    `steps`, until one moves no position by `tolerance` metres. Robust weights are those of the step before, which
+    no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
     H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
-    M, G, S, part = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.empty((d, d))
     for c in range(C):
-        _normal(states[c], joints[c], diagonal[c], below[c], right[c], cameras, xy, weight, robust, width, H, g)
-        if not _factored(H, below[c], Z):
+        x, fixed, linked = states[c], diagonal[c], below[c]
+        moved, n, regular = np.inf, 0, True
+        while regular and n <= steps:
+            _normal(x, joints[c], fixed, linked, right[c], cameras, xy, weight, robust, width, H, g)
+            regular = _factored(H, linked, Z)
+            if not regular or moved < tolerance or n == steps:
+                break
+            moved = _step(x, H, Z, g)
+            n += 1
+            if not moved < _FARTHEST_M:
+                break
+        if regular and c < len(covariance):
+            _marginals(H, Z, M, G, S, covariance[c])
+        elif c < len(covariance):
             covariance[c] = np.nan
-            continue
-        for t in range(T - 1, -1, -1):
-            L = H[t]
-            for k in range(d):  # M = L^-T, upper
-                M[k, k] = 1.0 / L[k, k]
-                for b in range(k + 1, d):
-                    total = 0.0
-                    for a in range(k, b):
-                        total -= L[b, a] * M[k, a]
-                    M[k, b] = total / L[b, b]
-            if t + 1 < T:
-                for a in range(d):
-                    for b in range(d):
-                        total = 0.0
-                        for k in range(a, d):
-                            total += M[a, k] * Z[t, k, b]
-                        G[a, b] = total
-                for a in range(d):
-                    for b in range(d):
-                        total = 0.0
-                        for k in range(d):
-                            total += G[a, k] * S[k, b]
-                        part[a, b] = total
-            for a in range(d):
-                for b in range(a + 1):
-                    total = 0.0
-                    for k in range(a, d):
-                        total += M[a, k] * M[b, k]
-                    if t + 1 < T:
-                        for k in range(d):
-                            total += part[a, k] * G[b, k]
-                    S[a, b] = S[b, a] = total
-            for n in range(2):
-                for a in range(3):
-                    for b in range(3):
-                        covariance[c, t, n, a, b] = S[3 * n + a, 3 * n + b]

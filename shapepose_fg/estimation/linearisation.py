@@ -12,7 +12,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.kernels import ROBUST, look, ready, sigmas_px
+from shapepose_fg.estimation.kernels import ROBUST, look, ready
 
 MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
@@ -125,6 +125,18 @@ def symmetric_roots(information: Array) -> Array:
     return np.einsum("dik,dk,djk->dij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
 
 
+def inverses(A: Array) -> Array:
+    """Inverses (..., 3, 3) of symmetric matrices, by their cofactors; nothing is raised for singular ones."""
+    a, b, c, d, e, f = (A[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    whole = np.stack(
+        [first, second, third, second, a * f - c * c, b * c - a * e, third, b * c - a * e, a * d - b * b]
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        whole /= a * first + b * second + c * third
+    return np.ascontiguousarray(np.moveaxis(whole, 0, -1).reshape(A.shape))
+
+
 @dataclass(frozen=True)
 class ViewEvidence:
     """What the observations say of the joints when these are at `points`."""
@@ -174,13 +186,19 @@ def observation_sigmas(
     `joints` are the J joints' names: some are seen more sharply than others. A joint whose place is not known
     takes the mean depth of the person's known ones.
     """
-    sigmas = np.zeros(observations.confidence.shape)
-    sigmas_px(
-        ready(points), views.projection, views.focal, ready(observations.confidence),
-        ready(observations.probability), config.scatter(joints), config.sigma_m, config.confidence_power,
-        config.least_weight, config.floor_rad, config.fixed_depth_m, MIN_DEPTH_M, LEAST_PROBABILITY, sigmas,
-    )  # fmt: skip
-    return sigmas
+    ahead = views.cTw[..., 2, :]
+    ahead = ahead if ahead.ndim == 3 else ahead[None]
+    depth = points @ ahead[..., :3].mT + ahead[:, None, :, 3]
+    usable = depth >= MIN_DEPTH_M
+    mean = np.where(usable, depth, 0.0).sum(axis=1) / np.maximum(usable.sum(axis=1), 1)
+    depth = np.where(usable, depth, np.maximum(mean, MIN_DEPTH_M)[:, None, :])
+    focal, scatter = views.focal[:, None], config.scatter(joints)[:, None]
+    weight = config.weight(observations.confidence) / scatter**2
+    # What is as probably somebody else's says half as much.
+    weight *= np.maximum(observations.probability, LEAST_PROBABILITY)
+    at = config.fixed_depth_m if config.fixed_depth_m > 0 else depth
+    sigma = np.hypot(config.floor_rad * focal, config.sigma_m * focal / at)
+    return np.where(observations.seen, sigma / np.sqrt(np.where(observations.seen, weight, 1.0)), 0.0)
 
 
 def linearise(

@@ -37,7 +37,7 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     for person, (of_positions, of_velocities) in zip(people, state_covariances(people), strict=True):
         solved[person.rows] = covariance[person.rows] = of_positions
         if person.temporal:
-            velocity[person.rows] = person.velocity()
+            velocity[person.rows] = person.velocity
             velocity_covariance[person.rows] = of_velocities
             covariance[person.rows] = with_lasting(state, person, of_positions)
     X = limbs_kept(state, covariance, fitter) if state.config.motion.keep_limbs else state.joints

@@ -45,7 +45,7 @@ def elsewhere_variance(
     look at the joint in plain view, not behind anybody's limbs, either all have missed it, `MISSED` to the power
     of m, or it is elsewhere.
     """
-    xy, depth, _ = views.project(joints)
+    xy, depth = views.pixels(joints)
     inside = (depth > 0) & ((xy >= 0) & (xy < views.image_sizes)).all(axis=-1) & ~strong
     row, joint = np.nonzero(~strong.any(axis=-1) & (inside.sum(axis=-1) >= LEAST_VIEWS))
     focal = np.broadcast_to(views.focal_px, (len(joints), depth.shape[2]))

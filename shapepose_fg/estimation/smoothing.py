@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
+from shapepose_fg.core.compiled import kernel
+from shapepose_fg.estimation.kernels import ready
 from shapepose_fg.estimation.motion_model import MotionModel
 
 SPEED_M_S = 1.5
@@ -33,68 +34,100 @@ def smoothed(
     variance[at, who] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place, variance = np.where(known[..., None], place, 0.0), np.where(known, variance, _UNKNOWN)
-    density, weight = motion.density(np.full(shape[2], SPEED_M_S)), np.ones(shape)
-    mean, of_mean = place, variance
-    for _ in range(_ROUNDS):
-        mean, of_mean = _smooth(
-            place, np.where(known, variance / weight, _UNKNOWN), np.diff(times), density, motion.law
-        )
-        weight = 1 / (1 + ((place - mean) ** 2).sum(axis=-1) / (of_mean + variance) / KERNEL)
+    dt, M = np.diff(times), shape[1] * shape[2]
+    density = np.tile(motion.density(np.full(shape[2], SPEED_M_S)), shape[1])
+    mean, of_mean = np.empty((len(times), M, 3)), np.empty((len(times), M))
+    _smooth(
+        place.reshape(mean.shape), variance.reshape(of_mean.shape),
+        ready(motion.law.transition(dt)), ready(motion.law.noise(dt[:, None], density)),
+        np.array([_UNKNOWN, *np.square(motion.law.start)]), _ROUNDS, KERNEL, mean, of_mean,
+    )  # fmt: skip
+    mean, of_mean = mean.reshape(*shape, 3), of_mean.reshape(shape)
     ever = np.asarray(known.any(axis=0))[who]
     isotropic = of_mean[at, who][..., None, None] * np.eye(3)
     return np.where(ever[..., None], mean[at, who], np.nan), np.where(ever[..., None, None], isotropic, np.nan)
 
 
-def _smooth(place: Array, variance: Array, steps_s: Array, density: Array, law: Motion) -> tuple[Array, Array]:
-    """Mean (T, A, J, 3) and variance (T, A, J) of positions measured as `place` with `variance`.
+@kernel
+def _add_moved(F, state, part, to):
+    """Add to the state `to` what `F` (n, n) makes of another: F x and F P F^T. States are as in `_smooth`."""
+    n = len(F)
+    for a in range(n):
+        for b in range(n + 3):
+            part[a, b] = 0.0
+            for k in range(n):
+                part[a, b] += F[a, k] * state[k, b]
+            if b < 3:
+                to[a, b] += part[a, b]
+        for b in range(n):
+            for k in range(n):
+                to[a, b + 3] += part[a, k + 3] * F[b, k]
 
-    Rauch-Tung-Striebel, along all axes alike. A state x has n parts (A, J, 3), its covariance P n times n (A, J).
+
+@kernel
+def _find_gain(state, F, S, G):
+    """G (n, n) = P F^T S^-1, by Gauss's elimination; the covariance of the state `S` is lost."""
+    n = len(F)
+    for a in range(n):
+        for b in range(n):
+            G[b, a] = 0.0
+            for k in range(n):
+                G[b, a] += F[a, k] * state[k, b + 3]
+    for k in range(n):
+        for a in range(n):
+            if a != k:
+                times = S[a, k + 3] / S[k, k + 3]
+                for b in range(n):
+                    S[a, b + 3] -= times * S[k, b + 3]
+                    G[b, a] -= times * G[b, k]
+    for k in range(n):
+        for b in range(n):
+            G[b, k] /= S[k, k + 3]
+
+
+@kernel
+def _smooth(place, variance, F, Q, start, rounds, width, mean, of_mean):
+    """Smooth M joints, each by itself: `place` (T, M, 3) with `variance` (T, M), into `mean` and `of_mean`; by
+    Rauch, Tung and Striebel, `rounds` times with weights of Cauchy's kernel.
+
+    `F` (T - 1, n, n) and `Q` (T - 1, M, n, n) are the law of motion's steps, `start` (n,) variances before the
+    first. A state x is n by 3 numbers with the covariance P, the same along all axes, beside them: (n, 3 + n).
     """
-    n, shape = law.order, variance.shape[1:]
-    every, none = range(n), np.zeros(shape)
-    start = (_UNKNOWN, *np.square(law.start))
-    x = [np.zeros_like(place[0]) for _ in every]
-    P = [[np.full(shape, start[i]) if i == j else none for j in every] for i in every]
-    kept, predicted = [], []
-    for t in range(len(place)):
-        if t > 0:
-            F, Q = law.step(float(steps_s[t - 1]), density)
-            x = [sum(F[i, j] * x[j] for j in every) for i in every]
-            P = [[entry + Q[:, i, j] for j, entry in enumerate(row)] for i, row in enumerate(_congruent(F, P))]
-        predicted.append((x, P))
-        gain, apart = [row[0] / (P[0][0] + variance[t]) for row in P], place[t] - x[0]
-        x = [part + of_part[..., None] * apart for part, of_part in zip(x, gain, strict=True)]
-        first = [entry * (1 - gain[0]) for entry in P[0]]
-        rest = [[P[i][j] - gain[min(i, j)] * P[0][max(i, j)] for j in every] for i in every]
-        P = [[first[i + j] if i == 0 or j == 0 else rest[i][j] for j in every] for i in every]
-        kept.append((x, P))
-    means, variances = np.empty_like(place), np.empty_like(variance)
-    means[-1], variances[-1] = x[0], P[0][0]
-    for t in range(len(place) - 2, -1, -1):
-        (x0, P0), (x1, P1), F = kept[t], predicted[t + 1], law.transition(float(steps_s[t]))
-        G = _over([[sum(P0[i][k] * F[j, k] for k in every) for j in every] for i in every], P1)
-        x = [sum((G[i][j][..., None] * (x[j] - x1[j]) for j in every), x0[i]) for i in every]
-        P = _congruent(G, [[P[i][j] - P1[i][j] for j in every] for i in every], P0)
-        means[t], variances[t] = x[0], P[0][0]
-    return means, variances
-
-
-def _congruent(A, P, start=None) -> list[list[Array]]:
-    """A P A^T, plus `start` if that is given, of n times n arrays; P is symmetric."""
-    places = [(j, k) for j in range(len(P)) for k in range(j, len(P))]
-
-    def entry(i: int, m: int) -> Array:
-        weights = (A[i][j] * A[m][k] + (A[i][k] * A[m][j] if j < k else 0) for j, k in places)
-        terms = (weight * P[j][k] for weight, (j, k) in zip(weights, places, strict=True))
-        return sum(terms, np.zeros(()) if start is None else start[i][m])
-
-    return [[entry(i, m) for m in range(len(P))] for i in range(len(P))]
-
-
-def _over(B, S) -> list[list[Array]]:
-    """B S^-1 of n times n arrays; two by two by Cramer's rule, in a fraction of the time."""
-    if len(S) == 2:
-        (p, c), (_, v) = S
-        return [[(a * v - b * c) / (p * v - c**2), (b * p - a * c) / (p * v - c**2)] for a, b in B]
-    whole = np.linalg.solve(*(np.moveaxis(np.array(each), (0, 1), (-1, -2)) for each in (S, B)))
-    return list(np.moveaxis(whole, (-1, -2), (0, 1)))
+    T, M, n = variance.shape[0], variance.shape[1], len(start)
+    x, ahead, difference = np.zeros((T, n, n + 3)), np.zeros((T, n, n + 3)), np.zeros((n, n + 3))
+    part, G, S, weight = np.empty((n, n + 3)), np.empty((n, n)), np.empty((n, n + 3)), np.empty(T)
+    for m in range(M):
+        for t in range(T):
+            weight[t] = 1.0
+        for _ in range(rounds):
+            for t in range(T):
+                for a in range(n):
+                    for b in range(n + 3):
+                        ahead[t, a, b] = Q[t - 1, m, a, b - 3] if t > 0 and b > 2 else 0.0
+                    if t == 0:
+                        ahead[0, a, a + 3] = start[a]
+                if t > 0:
+                    _add_moved(F[t - 1], x[t - 1], part, ahead[t])
+                noise = variance[t, m] / weight[t]
+                total = ahead[t, 0, 3] + noise
+                for a in range(n):
+                    gain = ahead[t, a, 3] / total
+                    for b in range(n + 3):
+                        left = place[t, m, b] - ahead[t, 0, b] if b < 3 else -ahead[t, 0, b]
+                        x[t, a, b] = ahead[t, a, b] + gain * left
+                    # Of the position it is a small difference of large numbers while that is not known.
+                    x[t, a, 3] = x[t, 0, a + 3] = ahead[t, a, 3] * (noise / total)
+            for t in range(T - 1, -1, -1):
+                if t + 1 < T:
+                    for a in range(n):
+                        for b in range(n + 3):
+                            S[a, b] = ahead[t + 1, a, b]
+                            difference[a, b] = x[t + 1, a, b] - S[a, b]
+                    _find_gain(x[t], F[t], S, G)
+                    _add_moved(G, difference, part, x[t])
+                squared = 0.0
+                for i in range(3):
+                    mean[t, m, i] = x[t, 0, i]
+                    squared += (place[t, m, i] - x[t, 0, i]) ** 2
+                of_mean[t, m] = x[t, 0, 3]
+                weight[t] = 1.0 / (1.0 + squared / (of_mean[t, m] + variance[t, m]) / width)

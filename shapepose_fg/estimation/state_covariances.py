@@ -29,7 +29,7 @@ def _of_graph(graph: WindowGraph) -> tuple[Array, Array]:
     if graph.failure:
         return of_positions, of_velocities
     asked = graph.present & (graph.touched | (not graph.temporal))
-    points = graph.positions()
+    points = graph.positions
     for chains in graph.chains:
         of_positions[:, chains.joints], of_velocities[:, chains.joints] = chains.covariances(points)
     if asked.any():

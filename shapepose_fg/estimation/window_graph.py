@@ -103,6 +103,8 @@ class WindowGraph:
         """(J,) joints on which there is a factor of your own."""
         self.present: Mask = np.zeros((T, J), dtype=bool)
         """(T, J) which joints were in the last problem."""
+        self.positions = self.velocity = np.full((T, J, 3), np.nan)
+        """(T, J, 3) positions and velocities of the last solution, metres and m/s; NaN where there are none."""
         self.chains: list[Chains] = []
         """The last problem of several frames joint by joint, but for factors of your own."""
 
@@ -177,7 +179,7 @@ class WindowGraph:
         seen. `feet` (F,): joints that may stand (`contact.walking`).
 
         In a window of several frames each joint is solved by itself first (`joint_chains`), without factors of
-        your own. Levenberg-Marquardt starts there, and has the last word.
+        your own, and GTSAM starts there. It takes the last step, or as many as Levenberg-Marquardt needs.
         """
         self.failure, self.chains = "", []
         self.present = np.asarray(np.isfinite(initial).all(axis=2))
@@ -203,18 +205,10 @@ class WindowGraph:
             self._add(self._moving(problem))
         exists = self.values.exists
         self._add(factor for factor, keys in self._added if all(map(exists, keys)))
-        if self.values.empty():
-            return np.full(initial.shape, np.nan)
-        self._optimise()
-        return self.positions()
-
-    def positions(self) -> Array:
-        """(T, J, 3) positions of the last solution, metres; NaN where there are none."""
-        return self._points()[0]
-
-    def velocity(self) -> Array:
-        """(T, J, 3) velocities of the last solution, m/s; NaN where there are none."""
-        return self._points()[1]
+        if not self.values.empty():
+            self._optimise()
+        self.positions, self.velocity = self._points()
+        return self.positions
 
     def _problem(self, inlier: Mask, views: Message, body: Message, near: Array, lost: Mask | None) -> Problem:
         """What `solve` is asked; how far joints may turn goes by their speed `near` where they are."""
@@ -245,21 +239,36 @@ class WindowGraph:
         )
 
     def _optimise(self) -> None:
-        """Levenberg-Marquardt from `values`; where it fails they stay as they are, and `failure` says why."""
+        """Solve from `values`; where that fails they stay as they are, and `failure` says why."""
+        # Joint by joint, each from frame to frame: what is eliminated so fills nothing in.
+        by_joint = self.states.swapaxes(0, 1)
+        ordering = gtsam.Ordering(by_joint[self._there.swapaxes(0, 1)].tolist())
+        try:
+            if not (self.temporal and not self.touched.any() and self._confirmed(ordering)):
+                self._descend(None if self.coupled else ordering)
+        except RuntimeError:
+            self.failure = "the solver failed: its system is singular"
+
+    def _confirmed(self, ordering: gtsam.Ordering) -> bool:
+        """Whether the error falls by no more than the tolerance in a step by Gauss and Newton; if so, take it."""
+        linear = self.graph.linearize(self.values)
+        step = linear.eliminateSequential(ordering).optimize()
+        before, after = linear.error(gtsam.VectorValues.Zero(step)), linear.error(step)
+        settled = before - after <= self.config.tolerance * before
+        if settled:
+            self.values = self.values.retract(step)
+        return settled
+
+    def _descend(self, ordering: gtsam.Ordering | None) -> None:
+        """Levenberg-Marquardt."""
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self.config.max_iterations)
         # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
         parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
-        if len(self.coupled) == 0:
-            # Joint by joint, each from frame to frame: what is eliminated so fills nothing in.
-            by_joint = self.states.swapaxes(0, 1)
-            parameters.setOrdering(gtsam.Ordering(by_joint[self._there.swapaxes(0, 1)].tolist()))
-        try:
-            optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, parameters)
-            self.values = optimizer.optimize()
-        except RuntimeError:
-            self.failure = "the solver failed: its system is singular"
-            return
+        if ordering is not None:
+            parameters.setOrdering(ordering)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, parameters)
+        self.values = optimizer.optimize()
         if not np.isfinite(optimizer.error()):
             self.failure = "the solver left the finite numbers"
 

@@ -78,20 +78,10 @@ def test_gtsam_ends_where_the_chains_do(five_cameras, two_people, kernel, law):
     motion = MotionModel.load(BODY_25.joints, law=law)
     window = WindowGraph(seen, sigmas, Views.of(five_cameras), config, motion)
     body = Message(truth + rng.normal(0, 0.02, truth.shape), np.tile(np.eye(3) / 0.03**2, (T, 25, 1, 1)))
-    starts, optimizer = list[tuple[float, float]](), gtsam.LevenbergMarquardtOptimizer
-
-    class Told(optimizer):
-        def optimize(self):
-            before = self.error()
-            found = super().optimize()
-            starts.append((before, self.error()))
-            return found
-
+    optimizer = gtsam.LevenbergMarquardtOptimizer
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", Told)
+        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", lambda *_: pytest.fail("the start is far off"))
         found = window.solve(~lost[..., None] & (sigmas > 0), body, body, truth, lost, FEET)
-    ((before, after),) = starts
-    assert 0 <= before - after < 1e-5 * before
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-10)
     away = gtsam.Values()
