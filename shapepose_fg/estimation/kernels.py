@@ -239,9 +239,7 @@ def _step(x, H, Z, g):
 
 @kernel
 def _marginals(H, Z, M, G, S, covariance):
-    """The blocks on the diagonal of the inverse of `_factored` ones, from the end back: `covariance` (T, 2, 3, 3)
-    of the first three and the next three numbers.
-    """
+    """The blocks on the diagonal of the inverse of `_factored` ones, `covariance` (T, d, d), from the end back."""
     T, d = H.shape[:2]
     for t in range(T - 1, -1, -1):
         for k in range(d):  # M = L^-T, upper
@@ -270,17 +268,17 @@ def _marginals(H, Z, M, G, S, covariance):
                     for k in range(d):
                         total += G[1, a, k] * G[0, b, k]
                 S[a, b] = S[b, a] = total
-        for a in range(6):
-            for b in range(3):
-                covariance[t, a // 3, a % 3, b] = S[a, 3 * (a // 3) + b]
+        for a in range(d):
+            for b in range(d):
+                covariance[t, a, b] = S[a, b]
 
 
 @kernel
 def solve_chains(
     states, joints, diagonal, below, right, cameras, xy, weight, robust, width, steps, tolerance, covariance
 ):
-    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, 2, 3, 3), or (0, ...)
-    for none, of positions and velocities where it ends; NaN where a chain is singular, which stays where it is.
+    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, d, d) where it ends,
+    or of the first chains (0, ...): NaN where one is singular, which stays where it is.
 
     A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
     (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
