@@ -207,7 +207,9 @@ def _factored(H, below, Z):
 
 @kernel
 def _step(x, H, Z, g):
-    """Take the step of `_factored` blocks and minus the gradient `g` (T, d), which is lost; how far, metres."""
+    """Take the step of `_factored` blocks and minus the gradient `g` (T, d), which is lost, if it is a number; how
+    far, metres.
+    """
     T, d = x.shape
     for t in range(T):
         for k in range(d):
@@ -230,10 +232,11 @@ def _step(x, H, Z, g):
             g[t, k] = total / H[t, k, k]
             if k < 3 and not abs(g[t, k]) <= farthest:
                 farthest = abs(g[t, k])
-    if farthest < _FARTHEST_M:
-        for t in range(T):
-            for k in range(d):
-                x[t, k] += g[t, k]
+    if not farthest < _FARTHEST_M:
+        return 0.0
+    for t in range(T):
+        for k in range(d):
+            x[t, k] += g[t, k]
     return farthest
 
 
@@ -283,24 +286,21 @@ def solve_chains(
     A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
     (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
     1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
-    `steps`, until one moves no position by `tolerance` metres. Robust weights are those of the step before, which
-    no step makes worse but for the curvature of the projection.
+    `steps`, until one moves no position by more than `tolerance` metres; without any there are covariances only.
+    Robust weights are those of the step before, which no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
     H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
     M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.empty((d, d))
     for c in range(C):
         x, fixed, linked = states[c], diagonal[c], below[c]
-        moved, n, regular = np.inf, 0, True
-        while regular and n <= steps:
+        moved, n, regular = 0.0, 0, True
+        while regular and n <= steps and (n == 0 or moved > tolerance):
             _normal(x, joints[c], fixed, linked, right[c], cameras, xy, weight, robust, width, H, g)
             regular = _factored(H, linked, Z)
-            if not regular or moved < tolerance or n == steps:
-                break
-            moved = _step(x, H, Z, g)
+            if regular and n < steps:
+                moved = _step(x, H, Z, g)
             n += 1
-            if not moved < _FARTHEST_M:
-                break
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):

@@ -46,7 +46,7 @@ def smoothed(
         states, spread = np.zeros((3 * C, T, n)), np.empty((C, T, n, n))
         solve_chains(
             states, np.zeros(3 * C, dtype=np.intp), np.tile(diagonal, (3, 1, 1, 1)), np.tile(below, (3, 1, 1, 1)),
-            right.reshape(states.shape), *unseen, 1, 0.0, spread,
+            right.reshape(states.shape), *unseen, 1, np.inf, spread,
         )  # fmt: skip
         mean, of_mean = np.moveaxis(states.reshape(right.shape)[..., 0], 0, -1), spread[..., 0, 0]
         apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)

@@ -296,6 +296,8 @@ class WindowGraph:
 
     def _lasting(self, said: Said, source: int) -> list[gtsam.NonlinearFactor]:
         """What is said of joints with an offset each that decays slowly."""
+        if not said.where.any():
+            return []
         known, keys = said.message.known & said.where, self._offset_keys[source]
         roots = symmetric_roots(said.message.information[known] / said.scale)
         xyz, share = said.message.xyz[known], said.errors.white_share
