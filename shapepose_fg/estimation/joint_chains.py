@@ -18,7 +18,7 @@ from shapepose_fg.estimation.kernels import ROBUST, ready, solve_chains
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting
 
-_SETTLED_M = 1e-4
+_SETTLED_M = 5e-4
 """Chains are solved until no joint moves by more, metres."""
 _STEPS = 20
 """Or for so many steps: under a robust kernel the last ones halve what is left."""
