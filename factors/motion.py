@@ -130,7 +130,12 @@ MOTIONS: dict[str, Motion] = {
 
 def matrices(rows: Sequence[Sequence[Array]]) -> Array:
     """Matrices (..., n, n) from their entries (...), row by row."""
-    return np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)
+    shape = np.broadcast_shapes(*(np.shape(entry) for row in rows for entry in row))
+    found = np.empty((*shape, len(rows), len(rows)))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            found[..., i, j] = entry
+    return found
 
 
 def motion_factors(

@@ -4,7 +4,6 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +12,17 @@ import typer
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.export import export
-from shapepose_fg.cli.options import INPUT, REQUIRED, RESULT, argument, grouped, json_option, option
+from shapepose_fg.cli.options import (
+    INPUT,
+    REQUIRED,
+    RESULT,
+    Preset,
+    argument,
+    grouped,
+    json_option,
+    option,
+    preset_option,
+)
 from shapepose_fg.cli.overlay import overlay
 from shapepose_fg.cli.reconstruct.command import reconstruct
 from shapepose_fg.cli.report import report
@@ -131,21 +140,13 @@ def demo(
 app.command(rich_help_panel=_TRY)(simulate)
 
 
-class Preset(StrEnum):
-    """Settings that hang together."""
-
-    DEFAULT = "default"
-    PAPER = "paper"
-
-
 @app.command("config", rich_help_panel=_RECORDING)
 @grouped
-def config(preset: Preset = option(RESULT, "paper: the method as the paper has it.", Preset.DEFAULT)) -> None:
+def config(preset: Preset = preset_option(Preset.ACCURATE)) -> None:
     """Print every setting with its value, as TOML."""
     from shapepose_fg.io.config import toml_text
-    from shapepose_fg.pipeline.pipeline import PipelineConfig
 
-    print(toml_text(PipelineConfig.paper() if preset is Preset.PAPER else PipelineConfig()), end="")
+    print(toml_text(preset.settings()), end="")
 
 
 @app.command(rich_help_panel=_TRY)

@@ -4,6 +4,7 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from enum import StrEnum
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
@@ -15,6 +16,7 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Axis, Rig
     from shapepose_fg.io.calibration import Unit
+    from shapepose_fg.pipeline.config import PipelineConfig
 
 INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
 """Headings under which `--help` lists options."""
@@ -32,6 +34,25 @@ def option(group: str, text: str, default: Any = None, *names: str, **more: Any)
 def argument(metavar: str, text: str) -> Any:
     """The same, given by its place in the line."""
     return field(metadata={"typer": typer.Argument(metavar=metavar, help=text)})
+
+
+class Preset(StrEnum):
+    """Settings that hang together."""
+
+    FAST = "fast"
+    ACCURATE = "accurate"
+    PAPER = "paper"
+
+    def settings(self) -> "PipelineConfig":
+        """All of them."""
+        from shapepose_fg.pipeline.config import PipelineConfig
+
+        return {"fast": PipelineConfig.fast, "accurate": PipelineConfig, "paper": PipelineConfig.paper}[self]()
+
+
+def preset_option(default: Preset | None) -> Any:
+    """Which of them."""
+    return option(RESULT, "fast; accurate (default); paper: the method as the paper has it.", default)
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:

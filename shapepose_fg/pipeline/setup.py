@@ -98,7 +98,7 @@ class Setup:
         config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
         sure = StageOne(skeleton, config.candidates, config.proposals, book)
         # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
-        hips = replace(sure.by_hips(), candidates=replace(sure.candidates, min_votes=1))
+        hips = sure.of_the_rest()
         if sure.proposals.evidence and not config.temporal:
             # In frames that stand alone evidence decides, when the detections are reassociated.
             likely = replace(sure.proposals, min_probability=_ON_TRIAL * sure.proposals.min_probability)

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Metres, Settings
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 
 _ANYWHERE_M = 10.0
@@ -108,17 +109,8 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
     The linear system is written in normalised image coordinates and solved for the inhomogeneous point. Points
     behind a camera, with a reprojection error above `gate_m` or with almost parallel rays are dropped.
     """
-    first, second = _same_joint_pairs(detections)
     normalised = rig.normalise(detections.view, detections.xy)
-    rays = np.einsum(
-        "dji,dj->di",
-        rig.cTw[detections.view, :, :3],
-        np.concatenate([normalised, np.ones((len(detections), 1))], axis=1),
-    )
-    rays, origins = np.ascontiguousarray(rays.T), np.ascontiguousarray(rig.centres[detections.view].T)
-    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, max(len(first), 1), _PAIRS_AT_ONCE)]
-    near = np.concatenate([_rays_meet(rays, origins, first[part], second[part], config) for part in parts])
-    first, second = first[near], second[near]
+    first, second = _meeting(detections, rig, normalised, config)
     xyz = _linear_points(rig, detections.view, normalised, first, second)
     error_m = np.maximum(
         _reprojection_error(rig, detections.view[first], normalised[first], xyz),
@@ -186,33 +178,44 @@ def _support(cluster: Index, detection: Index, detections: Detections) -> Index:
     return np.stack([cluster[first], detection[first]], axis=1)
 
 
-def _same_joint_pairs(detections: Detections) -> tuple[Index, Index]:
-    """Indices of all unordered pairs of detections of the same joint in different views."""
-    order = np.argsort(detections.joint, kind="stable")
-    joint = detections.joint[order]
-    # With the detections sorted by joint, detection k pairs with all that follow it in its joint's block.
-    follow = np.searchsorted(joint, joint, side="right") - np.arange(len(joint)) - 1
-    first = np.repeat(np.arange(len(joint)), follow)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)
-    first, second = order[first], order[first + 1 + step]
-    differ = detections.view[first] != detections.view[second]
-    return first[differ], second[differ]
+def _meeting(detections: Detections, rig: Rig, normalised: Array, config: CandidateConfig) -> tuple[Index, Index]:
+    """The pairs of detections of a joint in two views whose rays pass each other at less than twice the gate."""
+    view, joint, *_ = detections.columns
+    order = np.argsort(joint, kind="stable")
+    stop = np.searchsorted(joint[order], joint[order], side="right")
+    ahead = np.concatenate([normalised, np.ones((len(view), 1))], axis=1)
+    rays = np.einsum("dji,dj->di", rig.cTw[view, :, :3], ahead)
+    lengths, origins = np.linalg.norm(rays, axis=1), rig.centres[view]
+    pairs, count = np.empty((0, 2), dtype=np.intp), 4 * len(view)
+    while count > len(pairs):
+        pairs = np.empty((count, 2), dtype=np.intp)
+        limits = 2.0 * config.gate_m, float(np.sin(np.deg2rad(config.min_angle_deg)))
+        count = _pair_up(order, stop, view, rays, lengths, origins, *limits, pairs)
+    return pairs[:count, 0], pairs[:count, 1]
 
 
-_PAIRS_AT_ONCE = 2**19
-"""Pairs of rays that are looked at together: more take more memory, not less time."""
+@kernel
+def _pair_up(order, stop, view, rays, lengths, origins, gap_m, least_sine, pairs):
+    """Fill in `pairs`, as far as there is room; `order` (D,) is by joint, and each one's stops at `stop` (D,).
 
-
-def _rays_meet(rays: Array, origins: Array, first: Index, second: Index, config: CandidateConfig) -> Mask:
-    """Cheap test before triangulation: do two of the `rays` (3, D) pass each other at less than twice the gate?"""
-    (ax, ay, az), (bx, by, bz) = rays[:, first], rays[:, second]
-    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
-    sine = np.sqrt(np.einsum("mi,mi->m", normal, normal))
-    between = (origins[:, second] - origins[:, first]).T
-    gap = np.abs(np.einsum("mi,mi->m", normal, between))
-    lengths = np.sqrt(np.einsum("id,id->d", rays, rays))
-    parallel = np.sin(np.deg2rad(config.min_angle_deg)) * lengths[first] * lengths[second]
-    return (gap < 2.0 * config.gate_m * sine) & (sine > parallel)
+    Returns how many there are.
+    """
+    count = 0
+    for n in range(len(order)):
+        for m in range(n + 1, stop[n]):
+            i, j = order[n], order[m]
+            if view[i] == view[j]:
+                continue
+            x = rays[i, 1] * rays[j, 2] - rays[i, 2] * rays[j, 1]
+            y = rays[i, 2] * rays[j, 0] - rays[i, 0] * rays[j, 2]
+            z = rays[i, 0] * rays[j, 1] - rays[i, 1] * rays[j, 0]
+            sine, gap = np.sqrt(x * x + y * y + z * z), x * (origins[j, 0] - origins[i, 0])
+            gap += y * (origins[j, 1] - origins[i, 1]) + z * (origins[j, 2] - origins[i, 2])
+            if abs(gap) < gap_m * sine and sine > least_sine * lengths[i] * lengths[j]:
+                if count < len(pairs):
+                    pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+    return count
 
 
 def _linear_points(rig: Rig, view: Index, normalised: Array, first: Index, second: Index) -> Array:

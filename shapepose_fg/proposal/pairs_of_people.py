@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.proposal.candidates import PairPoints
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.proposal.possible_people import Array, Frame, PossiblePeople, connected, settled, sizes
@@ -84,11 +85,30 @@ def _different(places: Array, weight: Array) -> Index:
     """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
     # Equal weights are told apart by place: the order of cameras and detections must not decide.
     order = np.lexsort((*np.nansum(places, axis=1).T, -np.round(weight, 9)))
-    count = np.isfinite(places[..., 0]).sum(axis=1)
-    stays = list[int]()
-    while len(order) > 0 and len(stays) < _MOST:
-        best, order = order[0], order[1:]
-        stays.append(best)
-        near = np.linalg.norm(places[order] - places[best], axis=-1) < _SAME_M
-        order = order[near.sum(axis=1) < _SAME_SHARE * count[order]]
-    return np.array(stays, dtype=np.intp)
+    stays = np.empty(_MOST, dtype=np.intp)
+    return stays[: _sieve(np.ascontiguousarray(places), order, stays)]
+
+
+@kernel
+def _sieve(places, order, stays):
+    """Fill in who `stays`, of all in `order`, as far as there is room; returns how many do."""
+    count, least = 0, _SAME_M * _SAME_M
+    for h in order:
+        alone = True
+        for n in range(count):
+            near, known = 0, 0
+            for j in range(places.shape[1]):
+                squared = 0.0
+                for x in range(3):
+                    squared += (places[h, j, x] - places[stays[n], j, x]) ** 2
+                near += squared < least
+                known += np.isfinite(places[h, j, 0])
+            if not near < _SAME_SHARE * known:
+                alone = False
+                break
+        if alone:
+            stays[count] = h
+            count += 1
+            if count == len(stays):
+                break
+    return count

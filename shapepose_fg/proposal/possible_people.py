@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.claims import Array, Claims, owned, projected_distances
@@ -144,22 +145,61 @@ def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
     Weighted by confidence, under a Cauchy kernel. NaN for joints that fewer than two views see; a ray that meets
     its joint behind the camera is infinitely far.
     """
-    has = chosen >= 0
-    rays = np.where(has[..., None], frame.rays[chosen] if len(frame.rays) > 0 else 0.0, 0.0)
-    across = np.where(has[..., None, None], np.eye(3) - rays[..., :, None] * rays[..., None, :], 0.0)
-    toward = np.einsum("hjvab,vb->hjva", across, frame.rig.centres)
-    confidence = np.where(has, frame.detections.confidence[chosen] if len(frame.rays) > 0 else 0.0, 0.0)
-    known = has.sum(axis=2) >= 2
-    weight, gap_m = confidence, np.full(has.shape, np.nan)
-    places = np.full((*has.shape[:2], 3), np.nan)
-    for _ in range(_ROUNDS):
-        normal = np.einsum("hjv,hjvab->hjab", weight, across) + 1e-9 * np.eye(3)
-        right = np.einsum("hjv,hjva->hja", weight, toward)
-        places = np.linalg.solve(np.where(known[..., None, None], normal, np.eye(3)), right[..., None])[..., 0]
-        places = np.where(known[..., None], places, np.nan)
-        gap_m = gaps(places, chosen, frame)
-        weight = confidence / (1 + (np.nan_to_num(gap_m, posinf=1.0) / _KERNEL_M) ** 2)
+    places, gap_m = np.full((*chosen.shape[:2], 3), np.nan), np.full(chosen.shape, np.nan)
+    confidence = frame.detections.confidence
+    _triangulate(chosen, frame.rays, confidence, frame.rig.centres, np.empty(chosen.shape[2]), places, gap_m)
     return places, gap_m
+
+
+@kernel
+def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
+    """Fill in places and gaps of `triangulated`; `weight` (V,) is room to work in."""
+    people, joints, views = chosen.shape
+    for h in range(people):
+        for j in range(joints):
+            seen = 0
+            for v in range(views):
+                weight[v] = confidence[chosen[h, j, v]] if chosen[h, j, v] >= 0 else 0.0
+                seen += chosen[h, j, v] >= 0
+            for _ in range(_ROUNDS if seen >= 2 else 0):
+                _nearest(chosen[h, j], rays, weight, centres, places[h, j])
+                for v in range(views):
+                    d = chosen[h, j, v]
+                    if d >= 0:
+                        gap_m[h, j, v] = _gap(rays[d], centres[v], places[h, j])
+                        off = (gap_m[h, j, v] if gap_m[h, j, v] < np.inf else 1.0) / _KERNEL_M
+                        weight[v] = confidence[d] / (1 + off * off)
+
+
+@kernel
+def _nearest(chosen, rays, weight, centres, place):
+    """The point that is nearest to weighted rays of views: sum w (1 - r r^T) (x - c) = 0."""
+    xx = yy = zz = 1e-9
+    xy = xz = yz = px = py = pz = 0.0
+    for v in range(len(chosen)):
+        if chosen[v] >= 0:
+            d, w = chosen[v], weight[v]
+            x, y, z = rays[d, 0], rays[d, 1], rays[d, 2]
+            a, b, c = centres[v, 0], centres[v, 1], centres[v, 2]
+            along = x * a + y * b + z * c
+            xx, yy, zz = xx + w * (1 - x * x), yy + w * (1 - y * y), zz + w * (1 - z * z)
+            xy, xz, yz = xy - w * x * y, xz - w * x * z, yz - w * y * z
+            px, py, pz = px + w * (a - along * x), py + w * (b - along * y), pz + w * (c - along * z)
+    # A matrix of three is solved by its cofactors.
+    first, second, third = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    over = 1.0 / (xx * first + xy * second + xz * third)
+    place[0] = (first * px + second * py + third * pz) * over
+    place[1] = (second * px + (xx * zz - xz * xz) * py + (xy * xz - xx * yz) * pz) * over
+    place[2] = (third * px + (xy * xz - xx * yz) * py + (xx * yy - xy * xy) * pz) * over
+
+
+@kernel
+def _gap(ray, centre, place):
+    """How far a ray passes a place, metres; infinite behind the camera."""
+    x, y, z = place[0] - centre[0], place[1] - centre[1], place[2] - centre[2]
+    depth = x * ray[0] + y * ray[1] + z * ray[2]
+    squared = x * x + y * y + z * z - depth * depth
+    return np.inf if depth <= 0 else np.sqrt(squared) if squared > 0 else 0.0
 
 
 def gaps(places: Array, chosen: Index, frame: Frame) -> Array:
@@ -180,20 +220,30 @@ def connected(places: Array, frame: Frame) -> Index:
 
     The number of the part's first joint; -1 where a joint has no place.
     """
-    pairs, most = frame.spans
-    people, joints = places.shape[:2]
-    near = np.linalg.norm(places[:, pairs[:, 0]] - places[:, pairs[:, 1]], axis=-1) < most
-    person, span = np.nonzero(near)
-    joined = np.zeros((people, joints, joints), dtype=bool)
-    joined[person, pairs[span, 0], pairs[span, 1]] = joined[person, pairs[span, 1], pairs[span, 0]] = True
-    joined |= np.eye(joints, dtype=bool)
-    part = np.where(np.isfinite(places[..., 0]), np.arange(joints), joints)
-    while True:
-        least = np.where(joined, part[:, None], joints).min(axis=-1, initial=joints)
-        least = np.where(part < joints, least, joints)
-        if (least == part).all():
-            return np.where(part < joints, part, -1)
-        part = least
+    part = np.where(np.isfinite(places[..., 0]), np.arange(places.shape[1]), -1)
+    _connect(np.ascontiguousarray(places), *frame.spans, part)
+    return part
+
+
+@kernel
+def _connect(places, pairs, most, part):
+    """Give joints that hang together the least number `part` (H, J) of them."""
+    for h in range(len(places)):
+        changed = True
+        while changed:
+            changed = False
+            for n in range(len(pairs)):
+                i, j, squared = pairs[n, 0], pairs[n, 1], 0.0
+                if part[h, i] == part[h, j]:
+                    continue
+                for x in range(3):
+                    squared += (places[h, i, x] - places[h, j, x]) ** 2
+                if np.sqrt(squared) < most[n]:
+                    changed = True
+                    if part[h, i] < part[h, j]:
+                        part[h, j] = part[h, i]
+                    else:
+                        part[h, i] = part[h, j]
 
 
 def sizes(part: Index) -> Index:

@@ -18,6 +18,9 @@ from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
 
+_POINTS_LEFT, _CANDIDATES_LEFT = 1000, 50
+"""Points and candidates of one joint at the most among what evidence leaves over."""
+
 
 @dataclass(frozen=True)
 class StageOne:
@@ -35,6 +38,11 @@ class StageOne:
     def by_hips(self) -> "StageOne":
         """The same with people sought by their hips, as in the paper, and not judged by evidence."""
         return replace(self, proposals=replace(self.proposals, evidence=False))
+
+    def of_the_rest(self) -> "StageOne":
+        """`by_hips` for what evidence leaves over: hips that two views saw, of few people; little is kept."""
+        few = replace(self.candidates, min_votes=1, most_points=_POINTS_LEFT, most_candidates=_CANDIDATES_LEFT)
+        return replace(self.by_hips(), candidates=few)
 
     def __call__(self, detections: Detections, rig: Rig) -> Observations:
         """The people of a frame."""
@@ -59,6 +67,10 @@ class StageOne:
     def _by_hips(self, detections: Detections, rig: Rig) -> Observations:
         """As the paper has it: votes, hips that anchor people, and joints linked to them."""
         points, skeleton, book = self._points(detections, rig), self.skeleton, self.book
+        if not np.isin(points.joint, skeleton.root).any() and not np.isin(skeleton.hips, points.joint).all():
+            return Observations.of(
+                np.full((0, len(skeleton), len(rig)), -1), detections, np.zeros((0, len(skeleton), 3))
+            )
         with book.stage("vote"):
             every = vote(points, detections, len(rig), self.candidates)
             candidates = thinned_candidates(every, detections, self.candidates)

@@ -70,8 +70,12 @@ class JointStates:
         A negative step predicts into the past.
         """
         F, noise = motion.step(step_s, density)
-        mean, covariance = np.empty_like(self.mean), np.empty_like(self.covariance)
-        _predict(self.mean, self.covariance, F, noise, mean, covariance)
+        mean, covariance, half = (
+            np.empty_like(self.mean),
+            np.empty_like(self.covariance),
+            np.empty(self.mean.shape[-1]),
+        )
+        _predict(self.mean, self.covariance, F, noise, half, mean, covariance)
         return JointStates(mean, covariance)
 
     def with_derivatives(self, *derivatives: Array) -> "JointStates":
@@ -80,26 +84,22 @@ class JointStates:
 
 
 @kernel
-def _predict(mean, covariance, F, noise, mean_after, covariance_after):
-    """F m and F P F^T + Q of all joints, with F (n, n) and Q (J, n, n) for each axis."""
+def _predict(mean, covariance, F, noise, half, mean_after, covariance_after):
+    """F m and F P F^T + Q of all joints, with F (n, n) and Q (J, n, n) for each axis; `half` (S,) is for work."""
     people, joints, size = mean.shape
-    order, half = len(F), np.empty((size, size))
     for a in range(people):
         for j in range(joints):
-            for i in range(order):
-                for x in range(3):
-                    row, total = 3 * i + x, 0.0
-                    for k in range(order):
-                        total += F[i, k] * mean[a, j, 3 * k + x]
-                    mean_after[a, j, row] = total
-                    for column in range(size):
-                        half[row, column] = 0.0
-                        for k in range(order):
-                            half[row, column] += F[i, k] * covariance[a, j, 3 * k + x, column]
             for row in range(size):
-                for i in range(order):
-                    for x in range(3):
-                        total = noise[j, row // 3, i] if row % 3 == x else 0.0
-                        for k in range(order):
-                            total += half[row, 3 * k + x] * F[i, k]
-                        covariance_after[a, j, row, 3 * i + x] = total
+                total = 0.0
+                for k in range(row % 3, size, 3):
+                    total += F[row // 3, k // 3] * mean[a, j, k]
+                mean_after[a, j, row] = total
+                for column in range(size):
+                    half[column] = 0.0
+                    for k in range(row % 3, size, 3):
+                        half[column] += F[row // 3, k // 3] * covariance[a, j, k, column]
+                for column in range(size):
+                    total = noise[j, row // 3, column // 3] if row % 3 == column % 3 else 0.0
+                    for k in range(column % 3, size, 3):
+                        total += half[k] * F[column // 3, k // 3]
+                    covariance_after[a, j, row, column] = total

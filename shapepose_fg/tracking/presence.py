@@ -83,103 +83,85 @@ def weighed(
     whose = np.ascontiguousarray(seen[0])
     affinity, neighbours = own_affinity(whose, candidate[seen], candidate, detections, skeleton)
     weight[seen] = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
-    core = set(skeleton.core)
+    known = np.isfinite(places).all(axis=-1)
+    centre = np.where(known[..., None], places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
+    at, P, core = np.where(known[..., None], places, centre[:, None]), rig.K @ rig.cTw, set(skeleton.core)
     limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
-    _weigh(places, world, rig.K @ rig.cTw, rig.focal_px, rig.image_sizes, limbs, weight, price)
+    room = np.empty((3, *known.shape)), np.empty((len(at), 3)), np.zeros(len(at))
+    _weigh(at, known, world, P, rig.focal_px, rig.image_sizes, limbs, *room, weight, price)
     return weight, price
 
 
 @kernel
-def _weigh(places, world, P, focal, sizes, limbs, weight, price):
-    """Make what detections count, `weight` (A, J, V), a share of the places; fill in `price` (A,)."""
+def _weigh(places, known, world, P, focal, sizes, limbs, seen, box, expected, weight, price):
+    """Make what detections count, `weight` (A, J, V), a share of the places; fill in `price` (A,).
+
+    For one view after the other: `seen` (3, A, J) x, y and depth of all joints, and between what they are, `box`
+    (A, 3): left, right and the nearest.
+    """
     people, joints, views = weight.shape
-    x, y, depth = np.empty((people, joints)), np.empty((people, joints)), np.empty((people, joints))
-    expected, box, hidden = np.zeros(people), np.empty((people, 6)), np.zeros((people, joints))
     for v in range(views):
         for a in range(people):
-            _pictured(places[a], P[v], focal[v], x[a], y[a], depth[a], hidden[a], box[a])
+            _picture(places[a], known[a], P[v], focal[v], a, seen, box[a])
         for a in range(people):
-            for b in range(people):
-                if a != b and world[a] == world[b]:
-                    _hide(x, y, depth, box, a, b, focal[v], limbs, places[b], hidden[a])
             for j in range(joints):
-                if depth[a, j] > 0 and 0 <= x[a, j] < sizes[v, 0] and 0 <= y[a, j] < sizes[v, 1]:
-                    cost = _PRICE_HIDDEN if hidden[a, j] > 0 else _PRICE
-                    weight[a, j, v] *= 1 + cost
-                    price[a] += cost
-                    expected[a] += 1.0
+                x, y, depth = seen[0, a, j], seen[1, a, j], seen[2, a, j]
+                if not (depth > 0 and 0 <= x < sizes[v, 0] and 0 <= y < sizes[v, 1]):
+                    continue
+                place = a, x, y, depth - _IN_FRONT_M
+                hidden = not known[a, j] or _behind(place, known, world, limbs, seen, box, focal[v])
+                cost = _PRICE_HIDDEN if hidden else _PRICE
+                weight[a, j, v] *= 1 + cost
+                price[a] += cost
+                expected[a] += 1
     for a in range(people):
-        over = 1.0 / expected[a] if expected[a] > 0 else 1.0
-        price[a] *= over
+        price[a] /= max(expected[a], 1.0)
         for j in range(joints):
             for v in range(views):
-                weight[a, j, v] *= over
+                weight[a, j, v] /= max(expected[a], 1.0)
 
 
 @kernel
-def _pictured(places, P, focal, x, y, depth, hidden, box):
-    """Pixels and depths of joints in a view, NaN pixels behind it; unknown joints are amidst others, and hidden.
+def _picture(places, known, P, focal, a, seen, box):
+    """Put a person's joints in a view, in `seen` and in `box`, which has a limb's width more on both sides."""
+    box[0], box[1], box[2] = np.inf, -np.inf, np.inf
+    for j in range(len(places)):
+        X, Y, Z = places[j, 0], places[j, 1], places[j, 2]
+        depth = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        over = 1.0 / depth if depth > 0 else np.nan
+        seen[2, a, j] = depth
+        for n in range(2):
+            seen[n, a, j] = (P[n, 0] * X + P[n, 1] * Y + P[n, 2] * Z + P[n, 3]) * over
+        if known[j]:
+            box[2] = min(box[2], depth)
+            if depth > 0:
+                box[0], box[1] = min(box[0], seen[0, a, j]), max(box[1], seen[0, a, j])
+    margin = _LIMB_M * focal / max(box[2], _LIMB_M)
+    box[0] -= margin
+    box[1] += margin
 
-    `box` (6,): what known joints are between, left and right, top and bottom, with a limb's width, near and far.
+
+@kernel
+def _behind(place, known, world, limbs, seen, box, focal):
+    """Whether the `place` (whose, x, y, depth) is behind a limb of somebody else of the same world, both of whose
+    ends are known.
     """
-    cx, cy, cz, count = 0.0, 0.0, 0.0, 0.0
-    for side in range(0, 6, 2):
-        box[side], box[side + 1] = np.inf, -np.inf
-    for j in range(len(places)):
-        hidden[j] = 0.0 if np.isfinite(places[j, 0] + places[j, 1] + places[j, 2]) else 1.0
-        if hidden[j] == 0:
-            cx, cy, cz, count = cx + places[j, 0], cy + places[j, 1], cz + places[j, 2], count + 1
-    over = 1.0 / count if count > 0 else 0.0
-    for j in range(len(places)):
-        X, Y, Z = cx * over, cy * over, cz * over
-        if hidden[j] == 0:
-            X, Y, Z = places[j, 0], places[j, 1], places[j, 2]
-        depth[j] = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
-        nearer = 1.0 / depth[j] if depth[j] > 0 else np.nan
-        x[j] = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) * nearer
-        y[j] = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) * nearer
-        if hidden[j] == 0:
-            _widen(box, 0, x[j])
-            _widen(box, 2, y[j])
-            _widen(box, 4, depth[j])
-    margin = _LIMB_M * focal / (box[4] if box[4] > _LIMB_M else _LIMB_M)
-    for low in (0, 2):
-        box[low] -= margin
-        box[low + 1] += margin
-
-
-@kernel
-def _widen(box, side, value):
-    """Make a box reach a value, which may be NaN."""
-    if value < box[side]:
-        box[side] = value
-    if value > box[side + 1]:
-        box[side + 1] = value
-
-
-@kernel
-def _hide(x, y, depth, box, a, b, focal, limbs, places, hidden):
-    """Mark the joints of `a` that are behind a limb of `b`, both of whose ends are in `places`, in a view."""
-    near, far = box[b], box[a]
-    if not (near[0] < far[1] and far[0] < near[1] and near[2] < far[3] and far[2] < near[3]):
-        return
-    for j in range(len(hidden)):
-        behind = depth[a, j] - _IN_FRONT_M
-        if hidden[j] > 0 or not (near[4] < behind and near[0] < x[a, j] < near[1] and near[2] < y[a, j] < near[3]):
+    a, x, y, depth = place
+    for b in range(len(world)):
+        if a == b or world[a] != world[b] or not (box[b, 0] < x < box[b, 1] and box[b, 2] < depth):
             continue
         for n in range(len(limbs)):
             one, two = limbs[n, 0], limbs[n, 1]
-            if not np.isfinite(places[one, 0] + places[two, 0]):
+            if not (known[b, one] and known[b, two]):
                 continue
-            to_x, to_y = x[a, j] - x[b, one], y[a, j] - y[b, one]
-            dx, dy = x[b, two] - x[b, one], y[b, two] - y[b, one]
-            length, along = dx * dx + dy * dy, to_x * dx + to_y * dy
-            along = 0.0 if along <= 0 else 1.0 if along >= length else along / length
+            to_x, to_y = x - seen[0, b, one], y - seen[1, b, one]
+            dx, dy = seen[0, b, two] - seen[0, b, one], seen[1, b, two] - seen[1, b, one]
+            along = min(max((to_x * dx + to_y * dy) / max(dx * dx + dy * dy, 1e-6), 0.0), 1.0)
             to_x, to_y = to_x - along * dx, to_y - along * dy
-            at = depth[b, one] + along * (depth[b, two] - depth[b, one])
-            if (to_x * to_x + to_y * to_y) * at * at < (_LIMB_M * focal) ** 2 and at < behind:
-                hidden[j] = 1.0
-                break
+            at = seen[2, b, one] + along * (seen[2, b, two] - seen[2, b, one])
+            if (to_x * to_x + to_y * to_y) * at * at < (_LIMB_M * focal) ** 2 and at < depth:
+                return True
+    return False
 
 
 def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:

@@ -15,6 +15,7 @@ from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
@@ -205,20 +206,9 @@ class Tracker:
         if not lost.any():
             return joints
         mean, covariance = joints.mean.copy(), joints.covariance.copy()
-        reach = self.scale.longest_m / 1.5  # the sigma of a direction that is not known
-        parent, root = np.array(self.skeleton.parents), self.skeleton.root
-        hips, row = list(self.skeleton.hips), np.flatnonzero(lost[:, root])
-        mean[row, root] = mean[row][:, hips].mean(axis=1)
-        covariance[row, root] = covariance[row][:, hips].mean(axis=1)
-        for level in self.skeleton.tree_levels[1:]:
-            row, column = np.nonzero(lost[:, level])
-            joint = level[column]
-            above = parent[joint]
-            mean[row, joint] = mean[row, above]
-            covariance[row, joint] = covariance[row, above]
-            covariance[row, joint, :3, 3:] = covariance[row, joint, 3:, :3] = 0.0
-            covariance[row, joint, :3, :3] += (reach[joint] ** 2)[:, None, None] * np.eye(3)
-            covariance[row, joint, 3:, 3:] += np.eye(mean.shape[-1] - 3)
+        reach_m = self.scale.longest_m / 1.5  # the sigma of a direction that is not known
+        order, parents = np.concatenate(self.skeleton.tree_levels), np.array(self.skeleton.parents)
+        _put_beside(mean, covariance, lost, order, parents, *self.skeleton.hips, reach_m)
         return JointStates(mean, covariance)
 
     def _measure(
@@ -254,3 +244,24 @@ def standing_apart(places: Array, others: Array) -> Mask:
     known = np.isfinite(distance)
     mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
     return (mean > _APART_M).all(axis=1)
+
+
+@kernel
+def _put_beside(mean, covariance, lost, order, parents, right, left, reach_m):
+    """`Tracker.beside_neighbours` of states (A, J, S), with all joints in `order` (J,), parents first."""
+    people, size = len(mean), mean.shape[2]
+    for a in range(people):
+        for j in order:
+            if not lost[a, j]:
+                continue
+            above = parents[j]
+            for i in range(size):
+                mean[a, j, i] = mean[a, above, i] if above >= 0 else (mean[a, right, i] + mean[a, left, i]) / 2
+                for k in range(size):
+                    if above < 0:
+                        covariance[a, j, i, k] = (covariance[a, right, i, k] + covariance[a, left, i, k]) / 2
+                    else:
+                        apart = (i < 3) != (k < 3)
+                        covariance[a, j, i, k] = 0.0 if apart else covariance[a, above, i, k]
+                if above >= 0:
+                    covariance[a, j, i, i] += reach_m[j] ** 2 if i < 3 else 1.0

@@ -136,11 +136,8 @@ def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: 
     at = person, detections.joint[detection]
     within, lost, sigma_m = distance_m < gate_m[at], predicted.lost[at], predicted.sigma_m[at]
     nearness = np.exp(-0.5 * distance_m**2 / (_NEAR_M**2 + sigma_m**2))
-    # Detections of equal scores are told apart by what they are, not by their order: people whom the detector has
-    # grouped have affinities of exactly 1.
-    rank = np.empty(len(detections))
-    rank[np.lexsort((*detections.xy.T, detections.confidence))] = np.arange(len(detections))
-    apart = 1e-10 * rank[detection] / max(len(detections), 1)
+    # People whom the detector has grouped have affinities of exactly 1: equal scores are told apart.
+    apart = 1e-10 * detections.rank[detection]
     chosen = np.full((len(gate_m), len(skeleton), len(rig)), -1, dtype=np.intp)
     for _ in range(_PASSES + 1):
         before, chosen = chosen, np.full_like(chosen, -1)

@@ -7,8 +7,11 @@ import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.cli.main import main
+from shapepose_fg.cli.options import Preset
+from shapepose_fg.cli.reconstruct.request import Request, prepare
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.body_step import JOINT_SIGMA_M, MODEL_SIGMA_M, BodyStep, joint_targets
@@ -48,7 +51,9 @@ def seen(rig, people, confidence=0.8) -> Observations:
     return Observations(xy, np.full(xy.shape[:3], confidence), people.copy())
 
 
-@pytest.mark.parametrize(("name", "settings"), [("paper", PAPER), ("default", PipelineConfig())])
+@pytest.mark.parametrize(
+    ("name", "settings"), [("paper", PAPER), ("accurate", PipelineConfig()), ("fast", PipelineConfig.fast())]
+)
 def test_presets_read_back(name, settings, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["config", "--preset", name])
@@ -209,3 +214,13 @@ def test_stage_two_s_settings_of_the_paper():
     assert (r.alternations, w.rho_3d, o.confidence_power, o.kernel) == (10, 0.25, 1.0, "none")
     assert (r.complete_start, r.body_from_views, r.settled_m, r.disagreement) == (False, False, 0.0, 0.0)
     assert not PAPER.temporal and PAPER.offsets.source == "none"
+
+
+def test_a_preset_is_one_of_three_and_stands_for_itself(tmp_path):
+    """Beside a file of settings nobody could say which of the two counts."""
+    request = Request(calibration=tmp_path, detections=tmp_path, preset=Preset.FAST)
+    assert prepare(request, tmp_path).settings() == PipelineConfig.fast() != PipelineConfig()
+    assert prepare(replace(request, preset=None), tmp_path).settings() == PipelineConfig()
+    both = prepare(replace(request, config=tmp_path / "mine.toml"), tmp_path)
+    with pytest.raises(InputError, match=r"--preset fast: not beside --config .*mine.toml; `shapepose-fg config"):
+        both.settings()

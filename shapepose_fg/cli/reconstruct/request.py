@@ -11,11 +11,13 @@ from shapepose_fg.cli.options import (
     RUN,
     TIME,
     DetectionOptions,
+    Preset,
     check_fps,
     ends,
     frame_range,
     frames_option,
     option,
+    preset_option,
 )
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
@@ -38,7 +40,8 @@ class Request(DetectionOptions):
 
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections, settings; adds TRC, C3D.")
-    config: Path | None = option(RESULT, "Settings as TOML; `shapepose-fg config` prints all.")
+    preset: Preset | None = preset_option(None)
+    config: Path | None = option(RESULT, "Settings as TOML, all that `shapepose-fg config` prints or some.")
     frames: str | None = frames_option()
     body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
     fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
@@ -73,7 +76,11 @@ class Prepared:
         from shapepose_fg.pipeline.config import PipelineConfig
 
         asked = self.request
-        found = PipelineConfig() if asked.config is None else read_config(asked.config, PipelineConfig)
+        if asked.config is not None and asked.preset is not None:
+            cure = f"`shapepose-fg config --preset {asked.preset}` writes settings to begin with"
+            raise InputError(f"--preset {asked.preset}: not beside --config {asked.config}; {cure}")
+        preset = Preset.ACCURATE if asked.preset is None else asked.preset
+        found = preset.settings() if asked.config is None else read_config(asked.config, PipelineConfig)
         found = found if asked.temporal is None else replace(found, temporal=asked.temporal)
         if asked.shapes is not None and not found.temporal:
             raise InputError("--shapes: a person's shape is known over time only; leave it out")
