@@ -156,7 +156,7 @@ class Problem:
     def chains(self, joints: Iterable[int]) -> list[Chains]:
         """The chains of some `joints`, those with the same parts together."""
         alike: dict[tuple[int, ...], list[int]] = {}
-        offsets = [each.where.any(axis=0) for each in self.said]
+        offsets = [np.asarray(each.where.any(axis=0)) for each in self.said]
         for joint in joints:
             there = (self.law.order + n for n, has in enumerate(offsets) if has[joint])
             alike.setdefault((*range(self.law.order), *there), []).append(joint)

@@ -32,7 +32,7 @@ def smoothed(
     place, variance = np.full((len(people), J, T, 3), np.nan), np.full((len(people), J, T), np.nan)
     place[who, :, at] = joints
     variance[who, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
-    known = np.isfinite(variance) & np.isfinite(place).all(axis=-1)
+    known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
     information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(C, T)
     density = np.tile(motion.density(np.full(J, SPEED_M_S)), (T - 1, len(people)))
@@ -51,7 +51,7 @@ def smoothed(
         mean, of_mean = np.moveaxis(states.reshape(right.shape)[..., 0], 0, -1), spread[..., 0, 0]
         apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
         weight = information / (1 + apart / KERNEL)
-    ever = known.any(axis=2)[who]
+    ever = np.asarray(known.any(axis=2))[who]
     mean, of_mean = (each.reshape(-1, J, *each.shape[1:])[who, :, at] for each in (mean, of_mean))
     isotropic = of_mean[..., None, None] * np.eye(3)
     return np.where(ever[..., None], mean, np.nan), np.where(ever[..., None, None], isotropic, np.nan)

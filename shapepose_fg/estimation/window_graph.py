@@ -5,13 +5,14 @@ more than one frame, joints have velocities too, and motion factors between thei
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import (
+    KernelName,
     body_prior_factors,
     diagonal,
     lasting_prior_factors,
@@ -93,7 +94,7 @@ class WindowGraph:
         self._motion = motion
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
         self._cameras = _cameras(views)
-        self._kernel = config.observations.robust_kernel
+        self._kernel: KernelName | None = config.observations.robust_kernel
         self._offset_keys = np.stack(
             [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
@@ -275,7 +276,7 @@ class WindowGraph:
     def _add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         deque(map(self.graph.add, factors), maxlen=0)
 
-    def _seen(self, seen: Projections) -> list[gtsam.NonlinearFactor]:
+    def _seen(self, seen: Projections) -> Sequence[gtsam.NonlinearFactor]:
         """The observations that count."""
         frame, joint, view = chosen = np.nonzero(seen.used)
         return projection_factors(
