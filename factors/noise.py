@@ -131,7 +131,7 @@ def isotropic_models(dimension: int, sigmas: ArrayLike, kernel: Kernel | None = 
     values = np.asarray(sigmas, dtype=np.float64)
     if values.ndim != 1 or not np.all((values > 0) & np.isfinite(values)):
         raise ValueError("sigmas must be (D,), positive and finite: drop observations of no weight")
-    models = list(map(noiseModel.Isotropic.Sigma, repeat(dimension), values.tolist()))
+    models: list[noiseModel.Base] = list(map(noiseModel.Isotropic.Sigma, repeat(dimension), values.tolist()))
     return models if kernel is None else list(map(noiseModel.Robust.Create, repeat(kernel), models))
 
 

@@ -22,8 +22,6 @@ _SETTLED_M = 5e-4
 """Chains are solved until no joint moves by more, metres."""
 _STEPS = 20
 """Or for so many steps: under a robust kernel the last ones halve what is left."""
-
-
 UNDETERMINED_M = 10.0
 """A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
 determined."""
@@ -90,9 +88,14 @@ class Chains:
     seen: Projections
     """What is not linear."""
 
-    def solved(self, initial: Array, steps: int = _STEPS) -> Array:
-        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself."""
-        return self._solve(initial, steps, np.empty((0, 1, 1, 1)))
+    def solved(self, initial: Array) -> Array:
+        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself.
+
+        One that leads a joint farther away than `UNDETERMINED_M` stays where it is, at rest.
+        """
+        states, start = self._solve(initial, _STEPS, np.empty((0, 1, 1, 1))), self._at(initial)
+        lost = np.abs(states - start)[..., :3].max(axis=(1, 2)) > UNDETERMINED_M
+        return np.where(lost[:, None, None], start, states)
 
     def covariances(self, points: Array) -> Array:
         """(2, T, C, 3, 3) marginal covariances of positions and velocities where joints are at `points` (T, J, 3).
@@ -104,12 +107,17 @@ class Chains:
         return determined(np.stack([found[..., :3, :3], found[..., 3:6, 3:6]]).swapaxes(1, 2))
 
     def _solve(self, initial: Array, steps: int, covariance: Array) -> Array:
-        states, seen = np.zeros(self.right.shape), self.seen
-        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
+        states, seen = self._at(initial), self.seen
         solve_chains(
             states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
             seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
         )  # fmt: skip
+        return states
+
+    def _at(self, points: Array) -> Array:
+        """(C, T, d) states at rest at `points` (T, J, 3)."""
+        states = np.zeros(self.right.shape)
+        states[..., :3] = points[:, self.joints].swapaxes(0, 1)
         return states
 
     def put(self, states: Array, into: Array) -> None:

@@ -17,6 +17,8 @@ _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-17, 1e-6, 1e-10
 """Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
 known less than by the last is not known at all."""
+_SINGULAR = 1e-11
+"""A pivot that is no larger share of what it was is rounding: a state that nothing determines."""
 _FARTHEST_M = 1e6
 """A step that is longer, or not a number, is not taken."""
 
@@ -180,7 +182,7 @@ def _factored(H, below, Z):
             pivot = L[k, k]
             for a in range(k):
                 pivot -= L[k, a] * L[k, a]
-            if not pivot > 0.0:
+            if not pivot > _SINGULAR * L[k, k]:
                 return False
             L[k, k] = math.sqrt(pivot)
             for b in range(k + 1, d):

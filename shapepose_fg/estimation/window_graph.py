@@ -253,7 +253,10 @@ class WindowGraph:
     def _confirmed(self, ordering: gtsam.Ordering) -> bool:
         """Whether the error falls by no more than the tolerance in a step by Gauss and Newton; if so, take it."""
         linear = self.graph.linearize(self.values)
-        step = linear.eliminateSequential(ordering).optimize()
+        try:
+            step = linear.eliminateSequential(ordering).optimize()
+        except RuntimeError:  # a joint is not determined: damped, the others are solved all the same
+            return False
         before, after = linear.error(gtsam.VectorValues.Zero(step)), linear.error(step)
         settled = before - after <= self.config.tolerance * before
         if settled:
