@@ -21,6 +21,13 @@ def kernel(function: F) -> F:
     return cast(F, compiled(function))
 
 
+def part(function: F) -> F:
+    """A piece of one or two kernels, compiled as if it stood there: what is only called need not be compiled
+    alone.
+    """
+    return cast(F, numba.njit(inline="always")(function))
+
+
 @contextmanager
 def told_of_compiling(say: Callable[[], None]) -> Iterator[None]:
     """Call `say` once, when this process first compiles a kernel inside the block."""

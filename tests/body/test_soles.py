@@ -19,8 +19,8 @@ def standing(count: int, lift_m: float = 0.0):
 
 def vertices(bodies):
     with torch.no_grad():
-        parameters = BodyParameters(*(torch.from_numpy(each).to(MODEL.dtype) for each in bodies))
-        return MODEL.vertices(parameters).double().numpy()
+        parameters = BodyParameters(*(each.to(MODEL.dtype) for each in bodies))
+        return MODEL.vertices(parameters)
 
 
 def test_lowest_points_are_those_of_the_mesh():

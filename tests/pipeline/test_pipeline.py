@@ -69,7 +69,7 @@ def test_the_bodies_are_where_the_joints_are(scene, people):
     from shapepose_fg.body.model.body_model import BodyParameters
 
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
-    fitted = body.keypoints(BodyParameters(*(torch.from_numpy(c).to(body.dtype) for c in columns))).numpy()
+    fitted = body.keypoints(BodyParameters(*(c for c in columns)))
     distance = np.linalg.norm(fitted - people.joints, axis=-1)
     assert np.median(distance) < 0.02, "the model error that the fit allows for"
 
