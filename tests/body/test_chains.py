@@ -6,8 +6,8 @@ import pytest
 from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY, Motion, matrices
 from shapepose_fg.body.fitting.chains import Links, cut_segments
 from shapepose_fg.body.fitting.priors import NUM_MOVING, MotionPrior
+from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.body.solving import eliminated, put_back
 
 
 def draw(*shape: int, seed: int = 0) -> np.ndarray:

@@ -5,8 +5,8 @@ import pytest
 
 from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.kernels.solving import LIMB_M
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.solving import LIMB_M
 
 ROWS = 3
 SCALE = 6.0

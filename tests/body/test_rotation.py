@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.rotation import (
@@ -10,7 +9,6 @@ from shapepose_fg.body.model.rotation import (
     from_six_d,
     hat,
     log_so3,
-    right_jacobian,
     right_jacobian_inverse,
     six_d,
 )
@@ -25,7 +23,7 @@ def axis_angles() -> np.ndarray:
 
 
 def test_exp_equals_scipy():
-    vectors = axis_angles() * np.array([1.0, 2.5]).view(2, 1, 1)  # beyond pi, too
+    vectors = axis_angles() * np.array([1.0, 2.5]).reshape(2, 1, 1)  # beyond pi, too
     expected = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(2, -1, 3, 3)
     np.testing.assert_allclose(exp_so3(vectors), expected, atol=1e-14)
 
@@ -39,43 +37,28 @@ def test_log_of_half_a_turn():
     axes = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.6, 0.8, 0]])
     R = 2 * axes[:, :, None] * axes[:, None] - np.eye(3)
     found = log_so3(R)
-    np.testing.assert_allclose(found.norm(dim=-1), np.pi, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), np.pi, atol=1e-15)
     np.testing.assert_allclose(exp_so3(found), R, atol=1e-15)
 
 
 def test_log_norm_is_at_most_pi():
-    R = exp_so3(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)) * 3)
-    assert log_so3(R).norm(dim=-1).max() <= np.pi * (1 + 1e-6)  # float32
+    R = exp_so3(np.random.default_rng(0).normal(0, 3, (1000, 3)))
+    assert np.linalg.norm(log_so3(R), axis=-1).max() <= np.pi * (1 + 1e-15)
 
 
-def test_gradients_at_zero_and_near_pi():
-    for angle in (0.0, 1e-9, 0.3, np.pi - 1e-3):
-        vector = np.array([[0.0, 0.6, 0.8]]) * angle
-        vector.requires_grad_()
-        assert torch.autograd.gradcheck(exp_so3, vector, atol=1e-6)
-        jacobian = torch.autograd.functional.jacobian(lambda a: log_so3(exp_so3(a)), vector.detach())
-        np.testing.assert_allclose(jacobian.squeeze(), np.eye(3), atol=1e-8)
-
-
-def test_right_jacobian_is_the_derivative():
-    vectors = axis_angles()
-    step = 1e-6
-    Jr = right_jacobian(vectors)
+def test_right_jacobian_inverse_is_the_derivative():
+    vectors, step = axis_angles(), 1e-6
+    vectors = vectors[np.linalg.norm(vectors, axis=1) < 3.1]  # farther on, a step may go past pi
+    inverse = right_jacobian_inverse(vectors)
     for c, e in enumerate(np.eye(3) * step):
-        turned = log_so3(exp_so3(vectors - e).swapaxes(-1, -2) @ exp_so3(vectors + e)) / (2 * step)
-        np.testing.assert_allclose(Jr[..., c], turned, atol=1e-8)  # differences: 1e-16 / 1e-6
-
-
-def test_right_jacobian_inverse():
-    vectors = axis_angles()
-    product = right_jacobian(vectors) @ right_jacobian_inverse(vectors)
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-13)
+        ahead, behind = (log_so3(exp_so3(vectors) @ exp_so3(sign * e)) for sign in (1, -1))
+        np.testing.assert_allclose(inverse[..., c], (ahead - behind) / (2 * step), atol=1e-8)
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 4, 3)])
 def test_batch_dimensions(shape):
-    vectors = np.ones((shape,))
-    for function in (hat, exp_so3, right_jacobian, right_jacobian_inverse):
+    vectors = np.ones(shape)
+    for function in (hat, exp_so3, right_jacobian_inverse):
         assert function(vectors).shape == (*shape, 3)
     assert log_so3(exp_so3(vectors)).shape == shape
 
@@ -103,8 +86,3 @@ def test_any_two_columns_become_a_rotation_with_the_first_ones_direction():
 def test_columns_without_a_rotation_are_nan_and_not_some_rotation():
     columns = np.array([[0.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 0], [1.0, 0, 0, 2, 0, 0]])
     assert np.isnan(from_six_d(columns)).any(-1).any(-1).all()
-
-
-def test_six_numbers_are_differentiable():
-    columns = six_d(exp_so3(axis_angles()[:20])).requires_grad_()
-    assert torch.autograd.gradcheck(from_six_d, (columns,))

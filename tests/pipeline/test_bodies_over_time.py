@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.fitting.fitter import Shapes
 from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
@@ -82,8 +81,7 @@ def test_bodies_stand_on_the_floor_that_was_found(scene, fitter):
     for each in (None, floor):
         found = with_bodies_over_time(people, fitter, floor=each)
         columns = (found.betas, found.global_orient, found.body_pose, found.transl)
-        with torch.no_grad():
-            points = fitter.model.vertices(BodyParameters(*(one for one in columns)))
+        points = fitter.model.vertices(BodyParameters(*columns))
         lowest.append(points[..., 2].min().item())
     assert lowest[0] < 0.1 and lowest[1] > 0.17
 
@@ -132,7 +130,7 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
         )  # fmt: skip
         columns = ("betas", "global_orient", "body_pose", "transl")
         parts = [bodies.filled(name, getattr(people, name), people.person, {}) for name in columns]
-        return bodies, BodyParameters(*(part for part in parts))
+        return bodies, BodyParameters(*parts)
 
     whole, expected = fitted(SEGMENT_ROWS)
     assert given == [[range(240)]]
@@ -156,7 +154,7 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     known = Shapes(cut.shapes.betas, cut.shapes.information)
     uncut = replace(person(0, [range(240)]), shapes=known, fixed_shapes=True).fitted(fitter)
     pose = (uncut[name] for name in ("betas", "global_orient", "body_pose", "transl"))
-    same = fitter.model.keypoints(BodyParameters(*(part for part in pose)))
+    same = fitter.model.keypoints(BodyParameters(*pose))
     assert 1e3 * np.linalg.norm(joints - same, axis=-1).max() < 0.3
     apart_mm = 1e3 * np.linalg.norm(np.diff(joints, axis=0) - np.diff(same, axis=0), axis=-1)
     assert apart_mm[[79, 159]].max() < 0.02

@@ -7,8 +7,8 @@ import numpy as np
 from factors import Motion
 from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.priors import MotionPrior
+from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
-from shapepose_fg.body.solving import eliminated, put_back
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 MAX_ITERATIONS = 8
@@ -197,7 +197,7 @@ class _Normal:
     energy: float
     """In squared standard deviations."""
     system: Array
-    """(T, 1 + P, P) of each row (`body/solving.py`)."""
+    """(T, 1 + P, P) of each row (`body/kernels/solving.py`)."""
     pull: Array
     """(T, N) half the gradient of the links."""
     away: Array

@@ -1,4 +1,4 @@
-"""The energy of a body given joint targets: what `body/kernels.py` linearises and minimises, over rows.
+"""The energy of a body given joint targets: what `body/kernels/bodies.py` linearises and minimises, over rows.
 
     E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² - 2 log p(theta) + constant
 
@@ -13,11 +13,11 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.body.fitting.fitter import Rows as FitRows
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
-from shapepose_fg.body.kernels import linearised
+from shapepose_fg.body.kernels.bodies import linearised
+from shapepose_fg.body.kernels.rows import Linear, Priors, Rows, Work
+from shapepose_fg.body.kernels.solving import known, solved
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.body.rows import Linear, Priors, Rows, Work
-from shapepose_fg.body.solving import known, solved
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SETTLED = 1e6
@@ -78,7 +78,7 @@ class Evaluated(FitRows):
     gradient: Array
     """(B, P) half the gradient."""
     system: Array
-    """(B, P + 1 + 3 K + 10, P) as `body/solving.py` has it, Hessian and gradient reduced."""
+    """(B, P + 1 + 3 K + 10, P) as `body/kernels/solving.py` has it, Hessian and gradient reduced."""
     step: Array
     """(B, P) the Newton step."""
     left: Array

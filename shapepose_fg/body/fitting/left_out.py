@@ -15,7 +15,7 @@ from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
 from shapepose_fg.body.fitting.fitter import BodyConfig
 from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt
 from shapepose_fg.body.fitting.priors import PosePrior
-from shapepose_fg.body.solving import lessened, stepped
+from shapepose_fg.body.kernels.solving import lessened, stepped
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SETS = 6

@@ -11,10 +11,10 @@ from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
+from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-from shapepose_fg.body.solving import solved
 from shapepose_fg.core.arrays import Array, Mask
 
 STALE = 0.3

@@ -7,7 +7,7 @@ for each point and bone, one offset that is linear in the shape (and in the pose
 
 with `R_j` the world rotation of bone j and `J_0` the rest position of the root. This is `regressor @ vertices`
 exactly. Turning joint j by `R_j exp(delta)` turns the terms of its subtree, so the derivative is a cross product
-with their sum. `body/kernels.py` is where that is computed.
+with their sum. `body/kernels/bodies.py` is where that is computed.
 """
 
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.body.kernels import placed
+from shapepose_fg.body.kernels.bodies import placed
+from shapepose_fg.body.kernels.rows import Limbs, Work
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
-from shapepose_fg.body.rows import Limbs, Work
 from shapepose_fg.core.arrays import Array, Index
 
 NUM_BONES = 24

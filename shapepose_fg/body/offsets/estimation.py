@@ -22,9 +22,9 @@ from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.sizes import Sizes
+from shapepose_fg.body.kernels.solving import reduce_systems
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
-from shapepose_fg.body.solving import reduce_systems
 from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
 from shapepose_fg.core.skeleton import BODY_25

@@ -1,8 +1,8 @@
 """Normal equations of bodies, row by row, compiled: steps, covariances, and the same with targets left out.
 
-A system (P + 1 + 3 K + 10, P) is as `linearised` (`body/kernels.py`) left it: the lower triangle of a Hessian H,
-below it vectors. It is reduced in place to the factor L, H = L Lᵀ, and L^-1 of the vectors. Everything is scalar
-products of rows.
+A system (P + 1 + 3 K + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
+Hessian H, below it vectors. It is reduced in place to the factor L, H = L Lᵀ, and L^-1 of the vectors. Everything
+is scalar products of rows.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What the kernels of bodies (`body/kernels.py`) are given and fill in: C-contiguous arrays."""
+"""What the kernels of bodies (`body/kernels/bodies.py`) are given and fill in: C-contiguous arrays."""
 
 from typing import NamedTuple
 
