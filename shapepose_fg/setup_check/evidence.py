@@ -103,7 +103,7 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     seen = ~np.isnan(xy[..., 0])
     prior = np.where(seen, confidence, 0.0) / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
-    xy = np.ascontiguousarray(xy)
+    xy, prior = np.ascontiguousarray(xy), np.ascontiguousarray(prior)
     points = np.empty((*prior.shape[:2], 3))
     miss_px, depth, weight, slope = (np.empty(prior.shape) for _ in range(4))
     to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ np.linalg.inv(views.K)
