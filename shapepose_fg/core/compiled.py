@@ -22,6 +22,13 @@ def kernel(function: F) -> F:
     return cast(F, compiled(function))
 
 
+def part(function: F) -> F:
+    """A piece of one or two kernels, compiled as if it stood there: what is only called need not be compiled
+    alone.
+    """
+    return cast(F, numba.njit(inline="always")(function))
+
+
 class _Compiling(event.Listener):
     """Logs once that this process compiles: it takes seconds, and not again."""
 

@@ -15,6 +15,7 @@ _PACKAGES = {
     "scipy": ("scipy",),
     "gtsam": ("gtsam",),
     "torch": ("torch",),
+    "numba": ("numba",),
     "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python"),
 }
 """Name in run.json, and the distributions that provide it."""

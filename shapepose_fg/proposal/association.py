@@ -5,13 +5,13 @@ Stage I (e) of the paper (section 3.1): gives each person *their* 2D observation
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import Candidates
-from shapepose_fg.proposal.claims import LEAST_AFFINITY, Claims, owned, projected_distances
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, nearby
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals
 
 _NEAR_M = 0.08
@@ -35,39 +35,39 @@ def associate(
 ) -> tuple[Observations, int]:
     """Give every person at most one detection per joint and view, and every detection to one person.
 
-    A detection on which two people's joints lie serves both (`Claims`). Proposals that are left with hardly any
+    A detection on which two people's joints lie serves both. Proposals that are left with hardly any
     joint seen by two views are dropped, and what they took is reassigned; the second value is their number.
     """
-    claims = _claims(proposals.places, detections, rig, skeleton)
-    owns = by_support(proposals, candidates, len(detections))
+    own, places = by_support(proposals, candidates, detections, len(rig)), proposals.places
     real = np.ones(len(proposals), dtype=bool)
-    chosen = np.full((*proposals.candidate.shape, len(rig)), -1, dtype=np.intp)
     rounds = 1 + _PASSES
     while rounds > 0:
-        scored = claims.scored(owns)
-        chosen = claims.matched(scored)
-        claims.share(chosen, scored.affinity)
-        keep = seen_twice(chosen >= 0, skeleton).mean(axis=1) >= config.min_observed_parts
+        own = _claimed(places, own, detections, rig, skeleton)
+        keep = seen_twice(own >= 0, skeleton).mean(axis=1) >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
-        claims, chosen = claims.of(keep), chosen[keep]
-        owns = owned(chosen, len(detections))
+        places, own = places[keep], own[keep]
         # What the dropped had is reassigned.
         rounds = rounds - 1 if keep.all() else _PASSES
-    return Observations.of(chosen, detections, proposals.places[real]), int((~real).sum())
+    return Observations.of(own, detections, places), int((~real).sum())
 
 
-def _claims(places: Array, detections: Detections, rig: Rig, skeleton: Skeleton) -> Claims:
-    """What people with joints at `places` (P, J, 3) may claim."""
-    projected = rig.project(places)
-    distance_m = projected_distances(projected, detections.joint, detections, rig)
-    placed = np.isfinite(places[:, detections.joint, 0])
-    reachable = np.zeros(placed.shape, dtype=bool)
-    if not placed.all():
-        for neighbour in skeleton.tree_neighbours.T:  # a joint has few
-            of_each = neighbour[detections.joint]
-            reachable |= (of_each >= 0) & (projected_distances(projected, of_each, detections, rig) < _REACH_M)
-    inside, reachable = distance_m < _FAR_M, reachable & ~placed
-    return Claims(detections, skeleton, len(rig), distance_m, _NEAR_M**2, inside, reachable, LEAST_AFFINITY)
+def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
+    """(P, J, V) what people with joints at `places` (P, J, 3) get, who are thought to have `own` (P, J, V)."""
+    world, unplaced = np.zeros(len(own), dtype=np.intp), np.isnan(places[..., 0])
+    near = nearby(places, np.full(unplaced.shape, _FAR_M), world, rig, skeleton, detections)
+    if unplaced.any():
+        near = near.with_tied(own, unplaced, detections, len(rig))
+    lost, reachable = np.isinf(near.distance_m), np.ones(len(near.person), dtype=bool)
+    (xy, depth), of = rig.project(places), near.detection[lost]
+    beside, view = skeleton.tree_neighbours[detections.joint[of]], detections.view[of]
+    at = view[:, None], near.person[lost][:, None], beside
+    away_m = np.linalg.norm(xy[at] - detections.xy[of][:, None], axis=-1) * depth[at] / rig.focal_px[view][:, None]
+    reachable[lost] = ((beside >= 0) & (away_m < _REACH_M)).any(axis=1)
+    nearness = np.where(reachable, np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2), -np.inf)
+    rule = nearness, lost & reachable, LEAST_AFFINITY
+    chosen, claims = near.claimed(*rule, own, world, detections, skeleton)
+    near.share(claims.tied, chosen, detections)
+    return chosen
 
 
 def seen_twice(seen: Mask, skeleton: Skeleton) -> Mask:
@@ -75,11 +75,15 @@ def seen_twice(seen: Mask, skeleton: Skeleton) -> Mask:
     return (seen.sum(axis=2) >= 2)[:, list(skeleton.core)]
 
 
-def by_support(proposals: Proposals, candidates: Candidates, count: int) -> Mask:
-    """(P, D) whether a detection supports one of the person's candidates."""
-    has = np.zeros((len(proposals), len(candidates) + 1), dtype=bool)
-    np.put_along_axis(has, proposals.candidate, True, axis=1)  # -1 marks the spare last column
-    person, row = np.nonzero(has[:, candidates.support[:, 0]])
-    owns = np.zeros((len(proposals), count), dtype=bool)
-    owns[person, candidates.support[row, 1]] = True
-    return owns
+def by_support(proposals: Proposals, candidates: Candidates, detections: Detections, views: int) -> Index:
+    """(P, J, V) the detections that support each person's candidates, -1 for none."""
+    of = np.full(len(candidates) + 1, -1, dtype=np.intp)
+    own = np.full((*proposals.candidate.shape, views), -1, dtype=np.intp)
+    for person, chosen in enumerate(proposals.candidate):
+        of[chosen] = person
+    of[-1] = -1  # -1 marked the spare last one
+    candidate, detection = candidates.support.T
+    whose = of[candidate]
+    has, detection = whose >= 0, detection[whose >= 0]
+    own[whose[has], detections.joint[detection], detections.view[detection]] = detection
+    return own

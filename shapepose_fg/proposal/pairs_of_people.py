@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.proposal.candidates import PairPoints
 from shapepose_fg.proposal.people_2d import group_people
-from shapepose_fg.proposal.possible_people import Array, Frame, PossiblePeople, connected, settled, sizes
+from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, sizes
 
 _LEAST_JOINTS = 3
 """Joints of two 2D people that meet, and hang together: two hips may meet by chance."""
@@ -49,8 +49,10 @@ def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
         return PossiblePeople.none(frame)
     owners = owners[different]
     owns = (group == owners[:, :1]) | (group == owners[:, 1:])
-    owns &= has[different][:, detections.joint]
-    return settled(places[different], owns, frame, _PASSES)
+    person, detection = np.nonzero(owns & has[different][:, detections.joint])
+    own = np.full((*places[different].shape[:2], len(frame.rig)), -1, dtype=np.intp)
+    own[person, detections.joint[detection], detections.view[detection]] = detection
+    return settled(places[different], own, frame, _PASSES)
 
 
 def _groups(free: Mask, frame: Frame) -> Index:

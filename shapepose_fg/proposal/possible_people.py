@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.claims import Array, Claims, owned, projected_distances
+from shapepose_fg.proposal.nearby import nearby
 
 _NEAR_M = 0.06
 """How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
@@ -105,37 +105,38 @@ class PossiblePeople:
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
 
 
-def settled(places: Array, owns: Mask, frame: Frame, passes: int, *, exclusive: bool = False) -> PossiblePeople:
-    """People at `places` (H, J, 3) who are thought to own `owns` (H, D): detections chosen, joints triangulated.
+def settled(places: Array, own: Index, frame: Frame, passes: int, *, exclusive: bool = False) -> PossiblePeople:
+    """People at `places` (H, J, 3) who are thought to have detections `own` (H, J, V), -1 for none: detections
+    chosen, joints triangulated, several times in turn.
 
-    Several times in turn. With `exclusive` each detection is one person's; without, each takes what it would
-    explain. Joints that no bones connect to most of the others go: they are somebody else's.
+    With `exclusive` each detection is one person's; without, each takes what it would explain. Joints that no
+    bones connect to most of the others go: they are somebody else's.
     """
-    chosen = np.full((*places.shape[:2], len(frame.rig)), -1, dtype=np.intp)
     for _ in range(passes):
-        chosen = _claimed(places, owns, frame, exclusive=exclusive)
+        chosen = _claimed(places, own, frame, exclusive=exclusive)
         places, gap_m = triangulated(chosen, frame)
         chosen = np.where(np.nan_to_num(gap_m) < _FAR_M, chosen, -1)
         part = connected(places, frame)
         astray = (part >= 0) & (part != sizes(part).argmax(axis=1)[:, None])
         places = np.where(astray[..., None], np.nan, places)
-        chosen = np.where(astray[..., None], -1, chosen)
-        owns = owned(chosen, len(frame.detections))
-    places, gap_m = triangulated(chosen, frame)
-    return PossiblePeople(places, chosen, gap_m)
+        own = np.where(astray[..., None], -1, chosen)
+    places, gap_m = triangulated(own, frame)
+    return PossiblePeople(places, own, gap_m)
 
 
-def _claimed(places: Array, owns: Mask, frame: Frame, *, exclusive: bool) -> Index:
-    """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the owned."""
-    found, rig = frame.detections, frame.rig
-    distance_m = projected_distances(rig.project(places), found.joint, found, rig)
-    inside, unplaced = distance_m < _FAR_M, np.isnan(places[:, found.joint, 0])
-    claims = Claims(found, frame.skeleton, len(rig), distance_m, _NEAR_M**2, inside, unplaced, _SURE_AFFINITY)
-    scored = claims.scored(owns)
-    if not exclusive:
-        return claims.matched(scored, world=np.arange(len(places)))
-    chosen = claims.matched(scored)
-    claims.share(chosen, scored.affinity)
+def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Index:
+    """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the own."""
+    found, (H, J, V) = frame.detections, own.shape
+    world = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)
+    near = nearby(places, np.full((H, J), _FAR_M), world, frame.rig, frame.skeleton, found)
+    unplaced = np.isnan(places[..., 0])
+    if unplaced.any():
+        near = near.with_tied(own, unplaced, found, V)
+    nearness = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2)
+    lost = np.isinf(near.distance_m)
+    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, found, frame.skeleton)
+    if exclusive:
+        near.share(claims.tied, chosen, found)
     return chosen
 
 

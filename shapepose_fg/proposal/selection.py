@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.claims import LEAST_AFFINITY, mean_affinity, owned
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, own_affinity
 from shapepose_fg.proposal.pairs_of_people import pooled
-from shapepose_fg.proposal.possible_people import Array, Frame, PossiblePeople, settled
+from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, settled
 
 _ROUNDS = 8
 """How often people are sought at most, among what those who were found leave: 2D people are put together anew."""
@@ -75,19 +75,16 @@ class Evidence:
     def of(cls, people: PossiblePeople, frame: Frame) -> "Evidence":
         """The evidence of a frame."""
         chosen, detections = people.chosen, frame.detections
-        has, rows = chosen >= 0, np.arange(len(people))[:, None, None]
-        affinity, neighbours = mean_affinity(
-            owned(chosen, len(detections)), detections, frame.skeleton, len(frame.rig)
-        )
-        affinity = np.where(neighbours > 0, affinity, LEAST_AFFINITY)
-        near = np.exp(-0.5 * (np.nan_to_num(people.gap_m, posinf=1.0) / _GAP_M) ** 2)
-        some = len(detections) > 0
-        worth = detections.confidence[chosen] * affinity[rows, chosen] * near if some else np.zeros(has.shape)
+        has, worth = chosen >= 0, np.zeros(chosen.shape)
+        whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
+        affinity, neighbours = own_affinity(whose, which, chosen, detections, frame.skeleton)
+        near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / _GAP_M) ** 2)
+        worth[has] = detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
         xy, depth = frame.rig.project(people.places)
         size = frame.rig.image_sizes[:, None, None]
         inside = np.moveaxis((depth > 0) & ((xy >= 0) & (xy < size)).all(axis=-1), 0, 2)
         expected = inside & has.any(axis=2, keepdims=True)
-        return cls(chosen, np.where(has, worth, 0.0), expected, _bones(people, frame))
+        return cls(chosen, worth, expected, _bones(people, frame))
 
     def score(self, taken: Mask) -> Array:
         """(H,) evidence for each person where others explain the detections `taken` (D,)."""
@@ -130,7 +127,8 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
     """The people of a frame who are there with a probability of at least `least`, and these probabilities (P,)."""
     people, sure = PossiblePeople.none(frame), np.zeros(0)
     for _ in range(_ROUNDS):
-        taken = np.asarray(owned(people.chosen, len(frame.detections)).any(axis=0))
+        taken = np.zeros(len(frame.detections), dtype=bool)
+        taken[people.chosen[people.chosen >= 0]] = True
         pool = pooled(points, ~taken, frame)
         more = _greedy(pool, people, taken, frame, least)
         if more is None:
@@ -164,9 +162,7 @@ def _greedy(
 def _given_out(people: PossiblePeople, frame: Frame, least: float) -> tuple[PossiblePeople, Array]:
     """The people with each detection given to one of them; who has too little goes, the least sure first."""
     while True:
-        people = settled(
-            people.places, owned(people.chosen, len(frame.detections)), frame, _PASSES, exclusive=True
-        )
+        people = settled(people.places, people.chosen, frame, _PASSES, exclusive=True)
         sure = existence(people, frame)
         if len(people) == 0 or sure.min() >= least:
             return people, sure

@@ -12,7 +12,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.tracking.view_assignment import own_affinity
+from shapepose_fg.proposal.nearby import own_affinity
 
 _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
@@ -83,7 +83,7 @@ def weighed(
     whose = np.ascontiguousarray(seen[0])
     affinity, neighbours = own_affinity(whose, candidate[seen], candidate, detections, skeleton)
     weight[seen] = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
-    known = np.isfinite(places).all(axis=-1)
+    known = np.asarray(np.isfinite(places).all(axis=-1))
     centre = np.where(known[..., None], places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
     at, P, core = np.where(known[..., None], places, centre[:, None]), rig.K @ rig.cTw, set(skeleton.core)
     limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
@@ -293,7 +293,8 @@ class Account:
         room = np.empty((H, 3), dtype=np.intp), np.empty(H)
         chosen, evidence = np.empty((H * T, 3), dtype=np.intp), np.empty(H * T)
         count = _in_turn(*given, *costs, free, changed, *room, chosen, evidence)
-        return Chosen(*chosen[:count].T.copy(), evidence[:count])
+        hypothesis, start, stop = chosen[:count].T
+        return Chosen(hypothesis, start, stop, evidence[:count])
 
 
 @kernel

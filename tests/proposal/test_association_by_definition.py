@@ -6,7 +6,6 @@ import pytest
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.association import associate, by_support
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs, vote
-from shapepose_fg.proposal.claims import owned
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
 
 CORE = list(BODY_25.core)
@@ -14,6 +13,11 @@ NEIGHBOURS = [{j for limb in BODY_25.limbs if joint in limb for j in limb if j !
 TREE = [
     {BODY_25.parents[joint], *(j for j in range(25) if BODY_25.parents[j] == joint)} - {-1} for joint in range(25)
 ]
+
+
+def owned(chosen: np.ndarray, count: int) -> np.ndarray:
+    """(P, D) whether a detection is one of a person's `chosen` (P, J, V)."""
+    return np.array([np.isin(np.arange(count), each[each >= 0]) for each in chosen]).reshape(len(chosen), count)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +88,7 @@ def test_observations_are_chosen_again_until_nobody_more_is_dropped(least, propo
     for person, joints in enumerate(proposals.candidate.tolist()):
         for candidate, row in candidates.support.tolist():
             owns[person, row] |= candidate in joints
-    np.testing.assert_array_equal(by_support(proposals, candidates, len(crowded)), owns)
+    np.testing.assert_array_equal(owned(by_support(proposals, candidates, crowded, 5), len(crowded)), owns)
     left, rounds, chosen = np.arange(len(proposals)), 3, np.zeros((0, 25, 5), dtype=int)
     while rounds > 0:
         chosen = chosen_for(proposals.places[left], owns, crowded, five_cameras)

@@ -33,8 +33,11 @@ def three(rig: Rig) -> Rig:
     return replace(rig, cameras=rig.cameras[:3])
 
 
-def every_detection(detections: Detections, count: int = 1) -> np.ndarray:
-    return np.ones((count, len(detections)), dtype=bool)
+def every_detection(detections: Detections, views: int) -> np.ndarray:
+    """(1, 25, V) all of them as one person's."""
+    own = np.full((1, 25, views), -1)
+    own[0, detections.joint, detections.view] = np.arange(len(detections))
+    return own
 
 
 @pytest.mark.parametrize("joints", [list(range(25)), UPPER_BODY])
@@ -117,7 +120,7 @@ def test_a_ray_that_misses_hardly_moves_the_joint(five_cameras, two_people, seen
     """One of five views is 30 px off, 10 cm at the joint: half a detector's error is left of it."""
     detections = seen_exactly(five_cameras, two_people[:1])
     frame = frame_of(detections, five_cameras)
-    hypothesis = settled(two_people[:1], every_detection(detections), frame, 1)
+    hypothesis = settled(two_people[:1], every_detection(detections, 5), frame, 1)
     assert (hypothesis.chosen >= 0).all()
     assert np.nanmax(hypothesis.gap_m) < 1e-6
     xy = detections.xy.copy()
@@ -142,7 +145,7 @@ def test_what_others_explain_is_no_evidence(five_cameras, two_people, seen_exact
     """All detections agree: confidence times affinity each, and what bones count. A double has nothing."""
     detections = seen_exactly(five_cameras, two_people[:1])
     frame = frame_of(detections, five_cameras)
-    one = settled(two_people[:1], every_detection(detections), frame, 1)
+    one = settled(two_people[:1], every_detection(detections, 5), frame, 1)
     evidence = Evidence.of(one, frame)
     nobody_else = np.zeros(len(detections), dtype=bool)
     expected = (detections.confidence * detections.affinity[0]).sum() + evidence.bones[0]
@@ -161,7 +164,7 @@ def test_bones_of_usual_length_speak_for_a_person(five_cameras, two_people, seen
         detections = seen_exactly(five_cameras, places)
         detections = detections.only(keep(detections))
         frame = frame_of(detections, five_cameras)
-        return Evidence.of(settled(places, every_detection(detections), frame, 1), frame).bones[0]
+        return Evidence.of(settled(places, every_detection(detections, 5), frame, 1), frame).bones[0]
 
     assert bones(1.0) - bones(1.5) > 2
     assert bones(1.0) - bones(2 / 3) > 1
@@ -177,7 +180,7 @@ def test_a_view_that_misses_a_joint_and_sees_the_rest_speaks_against_it(five_cam
     def score(keep):
         detections = every.only(keep)
         frame = frame_of(detections, five_cameras)
-        people = settled(two_people[:1], every_detection(detections), frame, 1)
+        people = settled(two_people[:1], every_detection(detections, 5), frame, 1)
         return Evidence.of(people, frame).score(np.zeros(len(detections), dtype=bool))[0]
 
     arms = np.isin(every.joint, [2, 3, 4, 5, 6, 7]) & (every.view == 0)

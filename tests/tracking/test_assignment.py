@@ -9,10 +9,11 @@ import pytest
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.proposal.nearby import Nearby
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.plausibility import torn_joints
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
-from shapepose_fg.tracking.view_assignment import Near, Predicted, assign, assign_with_probability
+from shapepose_fg.tracking.view_assignment import Predicted, Scored, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 
@@ -187,10 +188,8 @@ def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
         by_view = np.lexsort((person, view[order[place]]))
         person, detection = person[by_view], order[place[by_view]]
         first = np.searchsorted(view[detection], np.arange(3))
-        inside = possible[person, detection]
-        given = Near(
-            first, person, detection, np.zeros(len(person)), inside, score[person, detection], ~inside & False
-        )
+        near = Nearby(first, person, detection, np.zeros(len(person)))
+        given = Scored(near, score[person, detection], possible[person, detection])
         probable = np.zeros(score.shape)
         probable[person, detection] = view_assignment.probabilities(given, len(view))
         return probable

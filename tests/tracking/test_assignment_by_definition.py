@@ -9,7 +9,7 @@ import pytest
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal import claims
+from shapepose_fg.proposal import nearby
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, probabilities_of, reassociate, who_goes
 from shapepose_fg.tracking.view_assignment import Predicted, assign
@@ -50,7 +50,7 @@ def settle(monkeypatch):
 
     def settle(**settings):
         for name, value in settings.items():
-            for module in (view_assignment, claims):
+            for module in (view_assignment, nearby):
                 for constant in (name.upper(), f"_{name.upper()}"):
                     if hasattr(module, constant):
                         monkeypatch.setattr(module, constant, value)
@@ -132,7 +132,7 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
     predicted, crowded, five_cameras, monkeypatch, settle
 ):
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
-    monkeypatch.setattr(view_assignment, "probabilities", lambda near, _: np.full(len(near.score), 0.6))
+    monkeypatch.setattr(view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6))
     settle(passes=1, overlap_m=0.3, farthest_m=0.2)
     chosen, probability = view_assignment.assign_with_probability(predicted, crowded, five_cameras, BODY_25)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
