@@ -14,7 +14,7 @@ from shapepose_fg.core.compiled import kernel
 ROBUST = {None: 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 """Robust kernels by their number in kernels."""
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
-_ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-17, 1e-6, 1e-10
+_ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-13, 1e-6, 1e-10
 """Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
 known less than by the last is not known at all."""
 _SINGULAR = 1e-11
