@@ -14,7 +14,7 @@ from shapepose_fg.core.compiled import kernel
 ROBUST = {None: 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 """Robust kernels by their number in kernels."""
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
-_ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-17, 1e-6, 1e-10
+_ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-13, 1e-6, 1e-10
 """Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
 known less than by the last is not known at all."""
 _SINGULAR = 1e-11
@@ -43,23 +43,23 @@ def _weight(robust, ratio):
 
 
 @kernel
-def _add_view(x, camera, u, v, weight, robust, width, information, gradient):
-    """Add J^T w J and J^T w r of a pixel (u, v), `weight` 1/sigma², of a point `x` that is before the camera."""
+def _project(camera, x):
+    """Pixel and depth of a point."""
     depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
-    if not depth > 0.0:
-        return
-    at_u = (camera[0, 0] * x[0] + camera[0, 1] * x[1] + camera[0, 2] * x[2] + camera[0, 3]) / depth
-    at_v = (camera[1, 0] * x[0] + camera[1, 1] * x[1] + camera[1, 2] * x[2] + camera[1, 3]) / depth
-    du, dv = at_u - u, at_v - v
-    w = weight * _weight(robust, (du * du + dv * dv) * weight / (width * width))
+    u = camera[0, 0] * x[0] + camera[0, 1] * x[1] + camera[0, 2] * x[2] + camera[0, 3]
+    v = camera[1, 0] * x[0] + camera[1, 1] * x[1] + camera[1, 2] * x[2] + camera[1, 3]
+    return u / depth, v / depth, depth
+
+
+@kernel
+def _add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
+    """Add J^T w J and J^T w r, with J the derivative of the pixel (u, v) and r = (to_u, to_v)."""
     for a in range(3):
-        ua = (camera[0, a] - at_u * camera[2, a]) / depth
-        va = (camera[1, a] - at_v * camera[2, a]) / depth
-        gradient[a] += w * (ua * du + va * dv)
+        ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
+        gradient[a] += weight * (ua * to_u + va * to_v)
         for b in range(3):
-            ub = (camera[0, b] - at_u * camera[2, b]) / depth
-            vb = (camera[1, b] - at_v * camera[2, b]) / depth
-            information[a, b] += w * (ua * ub + va * vb)
+            ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
+            information[a, b] += weight * (ua * ub + va * vb) / depth
 
 
 @kernel
@@ -116,23 +116,22 @@ def look(
                 if not sigmas[n, j, v] > 0.0:
                     continue
                 camera = cameras[n if cameras.shape[0] > 1 else 0, v]
-                depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
+                at_u, at_v, depth = _project(camera, x)
                 if not depth >= least_depth:
                     continue
-                far = 0.0
-                for a in range(2):
-                    at = camera[a, 0] * x[0] + camera[a, 1] * x[1] + camera[a, 2] * x[2] + camera[a, 3]
-                    residual[n, j, v, a] = at / depth - xy[n, j, v, a]
-                    far += residual[n, j, v, a] ** 2
+                to_u, to_v = at_u - xy[n, j, v, 0], at_v - xy[n, j, v, 1]
+                residual[n, j, v, 0], residual[n, j, v, 1] = to_u, to_v
+                far = to_u * to_u + to_v * to_v
                 reach_px = reach * focal[n if focal.shape[0] > 1 else 0, v]
                 reach_px /= fixed_depth if fixed_depth > 0.0 else depth
                 inlier[n, j, v] = by_reach or math.sqrt(far) < reach_px
                 if inlier[n, j, v]:
-                    kind, wide = robust, width
-                    if by_reach:
-                        kind, wide = _GEMAN_MCCLURE, reach_px / sigmas[n, j, v]
                     weight = 1.0 / (sigmas[n, j, v] * sigmas[n, j, v])
-                    _add_view(x, camera, xy[n, j, v, 0], xy[n, j, v, 1], weight, kind, wide, H, g)
+                    if by_reach:
+                        weight *= _weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
+                    else:
+                        weight *= _weight(robust, far * weight / (width * width))
+                    _add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
             for a in range(3):
                 target[n, j, a] = x[a]
                 for b in range(3):
@@ -149,27 +148,24 @@ def look(
 
 
 @kernel
-def _normal(state, joint, diagonal, below, right, cameras, xy, weight, robust, width, H, g):
-    """Information H (T, d, d) and minus the gradient g (T, d) of one chain at `state` (T, d)."""
+def _normal(state, joint, diagonal, right, cameras, xy, weight, robust, width, H, g):
+    """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g."""
     T, d = state.shape
     for t in range(T):
         for a in range(d):
-            total = right[t, a]
+            g[t, a] = right[t, a]
             for b in range(d):
                 H[t, a, b] = diagonal[t, a, b]
-                total -= diagonal[t, a, b] * state[t, b]
-                if t > 0:
-                    total -= below[t - 1, a, b] * state[t - 1, b]
-                if t + 1 < T:
-                    total -= below[t, b, a] * state[t + 1, b]
-            g[t, a] = -total
-        for v in range(weight.shape[2]):
-            if weight[t, joint, v] > 0.0:
-                camera = cameras[t if cameras.shape[0] > 1 else 0, v]
-                u, w = xy[t, joint, v, 0], xy[t, joint, v, 1]
-                _add_view(state[t], camera, u, w, weight[t, joint, v], robust, width, H[t], g[t])
-        for a in range(d):
-            g[t, a] = -g[t, a]
+        for n in range(weight.shape[2]):
+            camera, w = cameras[t if cameras.shape[0] > 1 else 0, n], weight[t, joint, n]
+            if w > 0.0:
+                u, v, depth = _project(camera, state[t])
+                if depth > 0.0:
+                    off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
+                    w *= _weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
+                    # J x, without the product: the derivative of a quotient.
+                    at_u, at_v = u * camera[2, 3] - camera[0, 3], v * camera[2, 3] - camera[1, 3]
+                    _add_view(camera, u, v, depth, at_u / depth - off_u, at_v / depth - off_v, w, H[t], g[t])
 
 
 @kernel
@@ -208,17 +204,16 @@ def _factored(H, below, Z):
 
 
 @kernel
-def _step(x, H, Z, g):
-    """Take the step of `_factored` blocks and minus the gradient `g` (T, d), which is lost, if it is a number; how
-    far, metres.
+def _solve(H, Z, g, x):
+    """Put the solution of `_factored` blocks and the right side `g` (T + 1, d), which is lost, into `x` (T, d) if
+    it is near; how far positions move, metres.
     """
     T, d = x.shape
     for t in range(T):
         for k in range(d):
             total = g[t, k]
-            if t > 0:
-                for a in range(d):
-                    total -= Z[t - 1, a, k] * g[t - 1, a]
+            for a in range(d):
+                total -= Z[t - 1, a, k] * g[t - 1, a]
             for a in range(k):
                 total -= H[t, k, a] * g[t, a]
             g[t, k] = total / H[t, k, k]
@@ -226,19 +221,18 @@ def _step(x, H, Z, g):
     for t in range(T - 1, -1, -1):
         for k in range(d - 1, -1, -1):
             total = g[t, k]
-            if t + 1 < T:
-                for a in range(d):
-                    total -= Z[t, k, a] * g[t + 1, a]
+            for a in range(d):
+                total -= Z[t, k, a] * g[t + 1, a]
             for a in range(k + 1, d):
                 total -= H[t, a, k] * g[t, a]
             g[t, k] = total / H[t, k, k]
-            if k < 3 and not abs(g[t, k]) <= farthest:
-                farthest = abs(g[t, k])
+            if k < 3 and not abs(g[t, k] - x[t, k]) <= farthest:
+                farthest = abs(g[t, k] - x[t, k])
     if not farthest < _FARTHEST_M:
         return 0.0
     for t in range(T):
         for k in range(d):
-            x[t, k] += g[t, k]
+            x[t, k] = g[t, k]
     return farthest
 
 
@@ -253,25 +247,22 @@ def _marginals(H, Z, M, G, S, covariance):
                 for a in range(k, b):
                     total -= H[t, b, a] * M[k, a]
                 M[k, b] = total / H[t, b, b]
-        if t + 1 < T:
-            for a in range(d):
-                for b in range(d):
-                    G[0, a, b] = 0.0
-                    for k in range(a, d):
-                        G[0, a, b] += M[a, k] * Z[t, k, b]
-            for a in range(d):
-                for b in range(d):
-                    G[1, a, b] = 0.0
-                    for k in range(d):
-                        G[1, a, b] += G[0, a, k] * S[k, b]
+        for a in range(d):
+            for b in range(d):
+                G[0, a, b] = 0.0
+                for k in range(a, d):
+                    G[0, a, b] += M[a, k] * Z[t, k, b]
+            for b in range(d):
+                G[1, a, b] = 0.0
+                for k in range(d):
+                    G[1, a, b] += G[0, a, k] * S[k, b]
         for a in range(d):
             for b in range(a + 1):
                 total = 0.0
+                for k in range(d):
+                    total += G[1, a, k] * G[0, b, k]
                 for k in range(a, d):
                     total += M[a, k] * M[b, k]
-                if t + 1 < T:
-                    for k in range(d):
-                        total += G[1, a, k] * G[0, b, k]
                 S[a, b] = S[b, a] = total
         for a in range(d):
             for b in range(d):
@@ -292,16 +283,17 @@ def solve_chains(
     Robust weights are those of the step before, which no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
-    H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
-    M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.empty((d, d))
+    # Zero at the end of Z and g, where nothing comes after the last state, nor before the first.
+    H, Z, g = np.empty((T, d, d)), np.zeros((T, d, d)), np.zeros((T + 1, d))
+    M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d))
     for c in range(C):
-        x, fixed, linked = states[c], diagonal[c], below[c]
+        x, linked = states[c], below[c]
         moved, n, regular = 0.0, 0, True
         while regular and n <= steps and (n == 0 or moved > tolerance):
-            _normal(x, joints[c], fixed, linked, right[c], cameras, xy, weight, robust, width, H, g)
+            _normal(x, joints[c], diagonal[c], right[c], cameras, xy, weight, robust, width, H, g)
             regular = _factored(H, linked, Z)
             if regular and n < steps:
-                moved = _step(x, H, Z, g)
+                moved = _solve(H, Z, g, x)
             n += 1
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
