@@ -73,9 +73,10 @@ def test_without_hips_nobody_is_sought_by_hips(five_cameras, two_people, seen_ex
 
 
 def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_people, seen_exactly, monkeypatch):
-    """Two people on whom no affinities speak are nobody by evidence; of their points three a joint are kept."""
-    monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_LEFT", 3)
-    seen = seen_exactly(five_cameras, two_people)
+    """Of 14 people on whom no affinities speak, nobody by evidence, there are over 100 points of a joint."""
+    monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_LEFT", 100)
+    beside = np.array([[0.0, 0.3 * n, 0.0] for n in range(7)])
+    seen = seen_exactly(five_cameras, (two_people[:, None] + beside[:, None]).reshape(-1, 25, 3))
     seen = replace(seen, pairs=np.zeros((0, 2), dtype=np.intp), affinity=np.zeros(0))
     config, book = PipelineConfig(), Notebook()
     fitter = make_fitter(config.body, BodyModel.default().with_keypoints(BODY_25.joints))
