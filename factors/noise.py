@@ -4,6 +4,7 @@ Every factor here keeps its residual raw (pixels, metres) and its weight in the 
 robust kernel to the *whitened* residual, so a kernel's width counts standard deviations, whatever the unit.
 """
 
+from itertools import repeat
 from typing import Literal
 
 import numpy as np
@@ -130,11 +131,8 @@ def isotropic_models(dimension: int, sigmas: ArrayLike, kernel: Kernel | None = 
     values = np.asarray(sigmas, dtype=np.float64)
     if values.ndim != 1 or not np.all((values > 0) & np.isfinite(values)):
         raise ValueError("sigmas must be (D,), positive and finite: drop observations of no weight")
-    make = noiseModel.Isotropic.Sigma
-    if kernel is None:
-        return [make(dimension, sigma) for sigma in values.tolist()]
-    wrap = noiseModel.Robust.Create
-    return [wrap(kernel, make(dimension, sigma)) for sigma in values.tolist()]
+    models: list[noiseModel.Base] = list(map(noiseModel.Isotropic.Sigma, repeat(dimension), values.tolist()))
+    return models if kernel is None else list(map(noiseModel.Robust.Create, repeat(kernel), models))
 
 
 def check_covariances(covariances: NDArray[np.float64]) -> None:

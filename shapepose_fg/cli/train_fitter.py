@@ -27,9 +27,10 @@ def train_fitter(
 
     It begins with the weights that ship with the package, and is compared with the plain optimiser at the end.
     """
+    import torch
+
     from shapepose_fg.body.fitting.weights import FitterWeights, adapted_file, fingerprint
     from shapepose_fg.body.model.body_model import BodyModel
-    from shapepose_fg.body.threads import torch_threads
     from shapepose_fg.simulation.training.adaptation import PLAIN, TRAINED, adapted
     from shapepose_fg.simulation.training.motions import drawn_motions, load_motions
     from shapepose_fg.simulation.training.train import TrainingConfig
@@ -49,7 +50,8 @@ def train_fitter(
     config = TrainingConfig(iterations=iterations, batch=batch, seed=seed)
     card = {"data": "poses drawn from the prior" if motions is None else f"{len(learnt)} frames of {motions.name}"}
     start = time.perf_counter()
-    with torch_threads(1), progress("training", "batches") as shown:
+    torch.set_num_threads(1)
+    with progress("training", "batches") as shown:
         weights, scores = adapted(model, learnt, unseen, config, card, shown)
     rows = [(name, f"{score.joints_mm:.1f}", f"{score.ms:.1f}") for name, score in scores.items()]
     minutes = (time.perf_counter() - start) / 60

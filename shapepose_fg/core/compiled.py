@@ -17,8 +17,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def kernel(function: F) -> F:
     """The function, compiled at its first call. Sums may be taken in another order, NaN and infinity are kept."""
-    compiled = numba.njit(cache=True, error_model="numpy", nogil=True, fastmath={"contract", "reassoc"})
+    fast = {"contract", "reassoc"}
+    compiled = numba.njit(cache=True, error_model="numpy", nogil=True, fastmath=fast, no_cfunc_wrapper=True)
     return cast(F, compiled(function))
+
+
+def part(function: F) -> F:
+    """A piece of one or two kernels, compiled as if it stood there: what is only called need not be compiled
+    alone.
+    """
+    return cast(F, numba.njit(inline="always")(function))
 
 
 class _Compiling(event.Listener):

@@ -103,6 +103,6 @@ def lasting_mean(values: Array, times_s: Array, where: Mask | None = None) -> Ar
     """
     where = np.ones(values.shape[:2], dtype=bool) if where is None else where
     near = np.exp(-0.5 * ((times_s[:, None] - times_s) / LASTS_S) ** 2) + 1e-9
-    flat = values.reshape(*values.shape[:2], -1)
-    total = np.maximum(near @ where, 1e-9)
-    return (np.einsum("ts,sjk->tjk", near, flat * where[..., None]) / total[..., None]).reshape(values.shape)
+    total, flat = np.maximum(near @ where, 1e-9), values.reshape(*where.shape, -1) * where[..., None]
+    whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
+    return (whole / total[..., None]).reshape(values.shape)

@@ -59,4 +59,4 @@ def smoothed_in_time(values: Array, times_s: Array, width_s: float) -> Array:
     """Values (T, ...) averaged over time with a Gaussian of `width_s`, one sigma."""
     weight = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("ts,s...->t...", weight, values)
+    return np.asarray(np.tensordot(weight, values, axes=1), dtype=np.float64)

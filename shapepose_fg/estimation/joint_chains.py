@@ -18,12 +18,10 @@ from shapepose_fg.estimation.kernels import ROBUST, ready, solve_chains
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting
 
-_SETTLED_M = 1e-4
+_SETTLED_M = 5e-4
 """Chains are solved until no joint moves by more, metres."""
 _STEPS = 20
 """Or for so many steps: under a robust kernel the last ones halve what is left."""
-
-
 UNDETERMINED_M = 10.0
 """A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
 determined."""
@@ -90,26 +88,36 @@ class Chains:
     seen: Projections
     """What is not linear."""
 
-    def solved(self, initial: Array, steps: int = _STEPS) -> Array:
-        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself."""
-        return self._solve(initial, steps, np.empty((0, 1, 2, 3, 3)))
+    def solved(self, initial: Array) -> Array:
+        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself.
+
+        One that leads a joint farther away than `UNDETERMINED_M` stays where it is, at rest.
+        """
+        states, start = self._solve(initial, _STEPS, np.empty((0, 1, 1, 1))), self._at(initial)
+        lost = np.abs(states - start)[..., :3].max(axis=(1, 2)) > UNDETERMINED_M
+        return np.where(lost[:, None, None], start, states)
 
     def covariances(self, points: Array) -> Array:
         """(2, T, C, 3, 3) marginal covariances of positions and velocities where joints are at `points` (T, J, 3).
 
         NaN in all of a chain that is singular, and where one is not determined.
         """
-        found = np.empty((*self.right.shape[:2], 2, 3, 3))
+        found = np.empty(self.diagonal.shape)
         self._solve(points, 0, found)
-        return determined(np.ascontiguousarray(found.transpose(2, 1, 0, 3, 4)))
+        return determined(np.stack([found[..., :3, :3], found[..., 3:6, 3:6]]).swapaxes(1, 2))
 
     def _solve(self, initial: Array, steps: int, covariance: Array) -> Array:
-        states, seen = np.zeros(self.right.shape), self.seen
-        states[..., :3] = initial[:, self.joints].swapaxes(0, 1)
+        states, seen = self._at(initial), self.seen
         solve_chains(
             states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
             seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
         )  # fmt: skip
+        return states
+
+    def _at(self, points: Array) -> Array:
+        """(C, T, d) states at rest at `points` (T, J, 3)."""
+        states = np.zeros(self.right.shape)
+        states[..., :3] = points[:, self.joints].swapaxes(0, 1)
         return states
 
     def put(self, states: Array, into: Array) -> None:
@@ -117,6 +125,21 @@ class Chains:
         parts = states.reshape(*states.shape[:2], -1, 3).swapaxes(0, 1)
         for n, part in enumerate(self.parts):
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
+
+
+def motion_information(law: Motion, dt_s: Array, density: Array) -> tuple[Array, Array]:
+    """What a law of motion says of C chains of T states, along one axis: information of each with itself
+    (C, T, n, n), and with the one before it (C, T - 1, n, n).
+
+    Steps `dt_s` (T - 1,), densities (T - 1, C). The start says how wide derivatives are, and nothing of positions.
+    """
+    F = law.transition(dt_s)
+    noise = np.linalg.inv(law.noise(dt_s)) / density.T[..., None, None]
+    own = np.zeros((noise.shape[0], len(dt_s) + 1, *F.shape[1:]))
+    own[:, 0] = np.diag([0.0, *np.power(law.start, -2.0)])
+    own[:, 1:] += noise
+    own[:, :-1] += F.mT @ noise @ F
+    return own, -noise @ F
 
 
 @dataclass(frozen=True)
@@ -141,7 +164,7 @@ class Problem:
     def chains(self, joints: Iterable[int]) -> list[Chains]:
         """The chains of some `joints`, those with the same parts together."""
         alike: dict[tuple[int, ...], list[int]] = {}
-        offsets = [each.where.any(axis=0) for each in self.said]
+        offsets = [np.asarray(each.where.any(axis=0)) for each in self.said]
         for joint in joints:
             there = (self.law.order + n for n, has in enumerate(offsets) if has[joint])
             alike.setdefault((*range(self.law.order), *there), []).append(joint)
@@ -151,15 +174,10 @@ class Problem:
         C, T, p, n = len(joints), len(self.times_s), len(parts), self.law.order
         diagonal, below = np.zeros((C, T, p, 3, p, 3)), np.zeros((C, T - 1, p, 3, p, 3))
         right, dt = np.zeros((C, T, p, 3)), np.diff(self.times_s)
-        F = self.law.transition(dt)
-        noise = np.linalg.inv(self.law.noise(dt)) / self.density[:, joints].T[..., None, None]
-        into = noise @ F
+        moving, linked = motion_information(self.law, dt, self.density[:, joints])
         for axis in range(3):
-            diagonal[:, 1:, :n, axis, :n, axis] += noise
-            diagonal[:, :-1, :n, axis, :n, axis] += F.mT @ into
-            below[:, :, :n, axis, :n, axis] -= into
-            for part, sigma in enumerate(self.law.start, 1):
-                diagonal[:, 0, part, axis, part, axis] += sigma**-2
+            diagonal[:, :, :n, axis, :n, axis] += moving
+            below[:, :, :n, axis, :n, axis] += linked
         xyz, information = (each[:, joints].swapaxes(0, 1) for each in (self.pulls.xyz, self.pulls.information))
         diagonal[:, :, 0, :, 0] += information
         right[:, :, 0] += (information @ xyz[..., None])[..., 0]

@@ -17,6 +17,8 @@ _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-17, 1e-6, 1e-10
 """Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
 known less than by the last is not known at all."""
+_SINGULAR = 1e-11
+"""A pivot that is no larger share of what it was is rounding: a state that nothing determines."""
 _FARTHEST_M = 1e6
 """A step that is longer, or not a number, is not taken."""
 
@@ -180,7 +182,7 @@ def _factored(H, below, Z):
             pivot = L[k, k]
             for a in range(k):
                 pivot -= L[k, a] * L[k, a]
-            if not pivot > 0.0:
+            if not pivot > _SINGULAR * L[k, k]:
                 return False
             L[k, k] = math.sqrt(pivot)
             for b in range(k + 1, d):
@@ -207,7 +209,9 @@ def _factored(H, below, Z):
 
 @kernel
 def _step(x, H, Z, g):
-    """Take the step of `_factored` blocks and minus the gradient `g` (T, d), which is lost; how far, metres."""
+    """Take the step of `_factored` blocks and minus the gradient `g` (T, d), which is lost, if it is a number; how
+    far, metres.
+    """
     T, d = x.shape
     for t in range(T):
         for k in range(d):
@@ -230,18 +234,17 @@ def _step(x, H, Z, g):
             g[t, k] = total / H[t, k, k]
             if k < 3 and not abs(g[t, k]) <= farthest:
                 farthest = abs(g[t, k])
-    if farthest < _FARTHEST_M:
-        for t in range(T):
-            for k in range(d):
-                x[t, k] += g[t, k]
+    if not farthest < _FARTHEST_M:
+        return 0.0
+    for t in range(T):
+        for k in range(d):
+            x[t, k] += g[t, k]
     return farthest
 
 
 @kernel
 def _marginals(H, Z, M, G, S, covariance):
-    """The blocks on the diagonal of the inverse of `_factored` ones, from the end back: `covariance` (T, 2, 3, 3)
-    of the first three and the next three numbers.
-    """
+    """The blocks on the diagonal of the inverse of `_factored` ones, `covariance` (T, d, d), from the end back."""
     T, d = H.shape[:2]
     for t in range(T - 1, -1, -1):
         for k in range(d):  # M = L^-T, upper
@@ -270,39 +273,36 @@ def _marginals(H, Z, M, G, S, covariance):
                     for k in range(d):
                         total += G[1, a, k] * G[0, b, k]
                 S[a, b] = S[b, a] = total
-        for a in range(6):
-            for b in range(3):
-                covariance[t, a // 3, a % 3, b] = S[a, 3 * (a // 3) + b]
+        for a in range(d):
+            for b in range(d):
+                covariance[t, a, b] = S[a, b]
 
 
 @kernel
 def solve_chains(
     states, joints, diagonal, below, right, cameras, xy, weight, robust, width, steps, tolerance, covariance
 ):
-    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, 2, 3, 3), or (0, ...)
-    for none, of positions and velocities where it ends; NaN where a chain is singular, which stays where it is.
+    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, d, d) where it ends,
+    or of the first chains (0, ...): NaN where one is singular, which stays where it is.
 
     A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
     (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
     1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
-    `steps`, until one moves no position by `tolerance` metres. Robust weights are those of the step before, which
-    no step makes worse but for the curvature of the projection.
+    `steps`, until one moves no position by more than `tolerance` metres; without any there are covariances only.
+    Robust weights are those of the step before, which no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
     H, Z, g = np.empty((T, d, d)), np.empty((T, d, d)), np.empty((T, d))
     M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.empty((d, d))
     for c in range(C):
         x, fixed, linked = states[c], diagonal[c], below[c]
-        moved, n, regular = np.inf, 0, True
-        while regular and n <= steps:
+        moved, n, regular = 0.0, 0, True
+        while regular and n <= steps and (n == 0 or moved > tolerance):
             _normal(x, joints[c], fixed, linked, right[c], cameras, xy, weight, robust, width, H, g)
             regular = _factored(H, linked, Z)
-            if not regular or moved < tolerance or n == steps:
-                break
-            moved = _step(x, H, Z, g)
+            if regular and n < steps:
+                moved = _step(x, H, Z, g)
             n += 1
-            if not moved < _FARTHEST_M:
-                break
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):

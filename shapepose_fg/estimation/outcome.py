@@ -11,7 +11,14 @@ from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, l
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.in_time import carried, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence, linearise, mean_confidence, weakest_sigma
+from shapepose_fg.estimation.linearisation import (
+    Message,
+    ViewEvidence,
+    inverses,
+    linearise,
+    mean_confidence,
+    weakest_sigma,
+)
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import SEEN_M, State
 from shapepose_fg.estimation.state_covariances import state_covariances
@@ -142,7 +149,7 @@ def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
     seen = (weakest_sigma(said) <= SEEN_M) & simple
     f, kept = state.motion.views.white_share, state.motion.views.kept
     left = np.zeros(information.shape)
-    left[seen] = np.linalg.inv(information[seen])
+    left[seen] = inverses(information[seen])
     left = carried(left, seen, person.times_s)
     own = (1 - f) / f**2 * marginal @ said @ marginal
     total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
@@ -164,7 +171,7 @@ def how_known(state: State, covariance: Array) -> NDArray[np.uint8]:
     """
     pulled = state.of_body.known
     information = np.where(pulled[..., None, None], state.of_body.information, np.eye(3))
-    said = np.trace(np.linalg.inv(information), axis1=2, axis2=3)
+    said = np.trace(inverses(information), axis1=2, axis2=3)
     moved = ~pulled | (np.trace(covariance, axis1=2, axis2=3) < 0.5 * said)
     code = np.where(moved, Known.MOTION, Known.BODY)
     code = np.where(state.inlier.any(axis=-1), Known.WEAK, code)

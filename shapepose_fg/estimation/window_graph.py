@@ -5,13 +5,14 @@ more than one frame, joints have velocities too, and motion factors between thei
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import (
+    KernelName,
     body_prior_factors,
     diagonal,
     lasting_prior_factors,
@@ -93,7 +94,7 @@ class WindowGraph:
         self._motion = motion
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
         self._cameras = _cameras(views)
-        self._kernel = config.observations.robust_kernel
+        self._kernel: KernelName | None = config.observations.robust_kernel
         self._offset_keys = np.stack(
             [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
@@ -252,7 +253,10 @@ class WindowGraph:
     def _confirmed(self, ordering: gtsam.Ordering) -> bool:
         """Whether the error falls by no more than the tolerance in a step by Gauss and Newton; if so, take it."""
         linear = self.graph.linearize(self.values)
-        step = linear.eliminateSequential(ordering).optimize()
+        try:
+            step = linear.eliminateSequential(ordering).optimize()
+        except RuntimeError:  # a joint is not determined: damped, the others are solved all the same
+            return False
         before, after = linear.error(gtsam.VectorValues.Zero(step)), linear.error(step)
         settled = before - after <= self.config.tolerance * before
         if settled:
@@ -275,7 +279,7 @@ class WindowGraph:
     def _add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         deque(map(self.graph.add, factors), maxlen=0)
 
-    def _seen(self, seen: Projections) -> list[gtsam.NonlinearFactor]:
+    def _seen(self, seen: Projections) -> Sequence[gtsam.NonlinearFactor]:
         """The observations that count."""
         frame, joint, view = chosen = np.nonzero(seen.used)
         return projection_factors(
@@ -296,6 +300,8 @@ class WindowGraph:
 
     def _lasting(self, said: Said, source: int) -> list[gtsam.NonlinearFactor]:
         """What is said of joints with an offset each that decays slowly."""
+        if not said.where.any():
+            return []
         known, keys = said.message.known & said.where, self._offset_keys[source]
         roots = symmetric_roots(said.message.information[known] / said.scale)
         xyz, share = said.message.xyz[known], said.errors.white_share

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -198,9 +197,7 @@ def body_joints(people: Reconstruction) -> Array:
     """(N, J, 3) joints of the fitted bodies, with the offsets that the run learnt; NaN where there is no body."""
     model = detector_s_body(people)
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
-    with torch.no_grad():
-        bodies = BodyParameters(*(torch.from_numpy(column).to(model.dtype) for column in columns))
-        return model.keypoints(bodies).double().numpy()
+    return model.keypoints(BodyParameters(*columns))
 
 
 def detector_s_body(people: Reconstruction) -> BodyModel:

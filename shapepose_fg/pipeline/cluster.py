@@ -216,9 +216,5 @@ def one_item(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], An
 
     Processes may come at any time, after the others were looked at.
     """
-    import torch
-
     _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), this_program())
-    if torch.get_num_threads() != 1:
-        torch.set_num_threads(1)
     return work(shared, item)

@@ -114,9 +114,6 @@ class PipelineConfig(Settings):
     batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
     """Frames that are solved together and returned: bodies are fitted fastest by the hundred. Fewer need less
     memory."""
-    threads: Annotated[int, Interval(ge=1, le=256)] = 1
-    """Threads of torch while bodies are fitted: the matrices are small, and where cores are busy a second thread
-    costs more than it brings."""
 
     replaced: ClassVar[dict[str, str]] = {
         "candidates": f"{_CONSTANT}; gate_m and most_pairs are in [people]",

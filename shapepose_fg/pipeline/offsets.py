@@ -6,7 +6,6 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
-from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import naming
@@ -39,9 +38,8 @@ def estimate_offsets(
     config = config or PipelineConfig()
     fitter = fitter or make_fitter(config.body)
     config = replace(config, offsets=replace(config.offsets, source="recording"))
-    with torch_threads(config.threads):
-        thinned = ThinnedFrames(detections, len(rig), config.candidates)
-        offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
+    thinned = ThinnedFrames(detections, len(rig), config.candidates)
+    offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
     if offsets is None:
         raise ValueError(f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}")
     return offsets

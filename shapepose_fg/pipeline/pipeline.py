@@ -10,7 +10,6 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
@@ -131,47 +130,46 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
         check_fitter(fitter)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
-    with torch_threads(config.threads):
-        offsets = kept_offsets(kept, setup, detections, book)
-        if offsets is not None:
-            setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
-        parts = Parts(kept)
-        parts.check(skeleton.joints, rig.names, frames, times.frame_s)
-        done = parts.notes().frames
-        windows = SolvedWindows(setup, detections, times, frames, cuts, book)
-        with execution.pool(setup, len(frames)) as pool:
-            beginning = book.torn_off()
-            nobody = setup.engine(book).tracker.nobody()
-            for part in windows.after(parts.checkpoint(windows.read, frames, nobody), pool, chunk):
-                parts.append(part)
-                done += part.notes.frames
-                if execution.progress is not None:
-                    execution.progress(done, len(frames))
-            result = Assembly(parts, skeleton.joints, rig.names)
-            if config.temporal and len(parts) > 0:
-                with book.stage("follow"):
-                    # Between two frames, where no rounding matters.
-                    cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
-                    result = replace(result, names=_names(result, setup, cuts_s.tolist()))
-            floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
-            model = setup.fitter.model
-            if config.temporal and model is not None and len(result) > 0:
-                with book.stage("bodies over time"):
-                    if config.motion.floor:
-                        floor = result.floor(model, rig.up_vector)
-                    known = SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
-                    ground = floor if isinstance(floor, Floor) else None
-                    bodies = fit_everybody(
-                        result.rows_of,
-                        lambda number, rows: replace(result.person(number, rows), floor=ground),
-                        lambda jobs: pool.map(_fit_person, jobs),
-                        kept,
-                        known,
-                    )
-                    result = replace(result, bodies=bodies)
-        notes = beginning
-        for each in (parts.notes(), book.torn_off()):
-            notes.add(each)
+    offsets = kept_offsets(kept, setup, detections, book)
+    if offsets is not None:
+        setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
+    parts = Parts(kept)
+    parts.check(skeleton.joints, rig.names, frames, times.frame_s)
+    done = parts.notes().frames
+    windows = SolvedWindows(setup, detections, times, frames, cuts, book)
+    with execution.pool(setup, len(frames)) as pool:
+        beginning = book.torn_off()
+        nobody = setup.engine(book).tracker.nobody()
+        for part in windows.after(parts.checkpoint(windows.read, frames, nobody), pool, chunk):
+            parts.append(part)
+            done += part.notes.frames
+            if execution.progress is not None:
+                execution.progress(done, len(frames))
+        result = Assembly(parts, skeleton.joints, rig.names)
+        if config.temporal and len(parts) > 0:
+            with book.stage("follow"):
+                # Between two frames, where no rounding matters.
+                cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
+                result = replace(result, names=_names(result, setup, cuts_s.tolist()))
+        floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
+        model = setup.fitter.model
+        if config.temporal and model is not None and len(result) > 0:
+            with book.stage("bodies over time"):
+                if config.motion.floor:
+                    floor = result.floor(model, rig.up_vector)
+                known = SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
+                ground = floor if isinstance(floor, Floor) else None
+                bodies = fit_everybody(
+                    result.rows_of,
+                    lambda number, rows: replace(result.person(number, rows), floor=ground),
+                    lambda jobs: pool.map(_fit_person, jobs),
+                    kept,
+                    known,
+                )
+                result = replace(result, bodies=bodies)
+    notes = beginning
+    for each in (parts.notes(), book.torn_off()):
+        notes.add(each)
     more = {"time": times.as_dict(), "cuts": cuts}
     more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}
     more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}

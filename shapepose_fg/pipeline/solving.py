@@ -10,7 +10,6 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import InputError
@@ -105,14 +104,13 @@ def _solved(
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
     config, views = solver.config, Views.of(solver.rig)
     settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
-    with torch_threads(config.threads):
-        for own, segment in _windows(rows, config):
-            part = rows.rows(_rows_of(rows, own, segment, config.windows.overlap_s))
-            assert part.observations is not None
-            # From the views: the joints as they are may be somebody else's.
-            observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
-            found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
-            yield own, part, found
+    for own, segment in _windows(rows, config):
+        part = rows.rows(_rows_of(rows, own, segment, config.windows.overlap_s))
+        assert part.observations is not None
+        # From the views: the joints as they are may be somebody else's.
+        observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
+        found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
+        yield own, part, found
 
 
 def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> Index:

@@ -181,9 +181,8 @@ def _begin(content: bytes, lifeline: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
     _shared = pickle.loads(content)  # made by this program a moment ago
-    for name, setting in (("cv2", "setNumThreads"), ("torch", "set_num_threads")):
-        if name in sys.modules:
-            getattr(sys.modules[name], setting)(1)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
 
 
 def end_with(lifeline: Any) -> None:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.threads import torch_threads
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
@@ -126,7 +125,7 @@ def simulate(
     found = []
     worker = VisibilityWorker(scene.rig, skin, config.visibility)
     watched = worker.all(people, min(workers, max(len(frames), 1)))
-    with torch_threads(1), closing(watched):
+    with closing(watched):
         for frame, seen in zip(frames, watched, strict=True):
             detector.skip_to(frame)
             found.append(detector.detect(scene.truth_at(frame), seen))

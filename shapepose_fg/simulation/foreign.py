@@ -104,7 +104,7 @@ def reshaped(body: BodyModel, betas: Array, proportions: Sequence[Proportions]) 
         adult = arrays.template + arrays.shapes @ own
         shapes[..., person] = _stretched(adult, arrays.joint_regressor @ adult, arrays.weights, share)
         shapes[..., person] -= arrays.template
-    model = BodyModel(replace(arrays, shapes=shapes), body.dtype, body.keypoint_offsets, body.keypoint_names)
+    model = BodyModel(replace(arrays, shapes=shapes), body.keypoint_offsets, body.keypoint_names)
     return model, np.eye(len(betas), NUM_BETAS)
 
 

@@ -70,11 +70,8 @@ class Scene:
 
     def vertices_at(self, frame: int, only: Index | None = None) -> NDArray[np.float32]:
         """(P, Nv, 3) the true surfaces of one frame; or (P, M, 3), the vertices `only` (M,) of them."""
-        import torch
-
-        parameters = parameters_of(self.body, self.motion[frame : frame + 1])
-        with torch.no_grad():
-            return self.body.vertices(parameters, only).numpy()
+        parameters = parameters_of(self.motion[frame : frame + 1])
+        return self.body.vertices(parameters, only).astype(np.float32)
 
 
 def built_in_scene(
@@ -133,22 +130,15 @@ def ring_of_cameras(
 
 def builds_of(body: "BodyModel", betas: Array) -> list[Build]:
     """The measures of P shapes `betas` (P, 10) that motions are made to."""
-    import torch
-
-    parameters = parameters_of(body, Motion.still(betas))
-    with torch.no_grad():
-        joints = body.joints(parameters).numpy().astype(np.float64)
-        floors = body.vertices(parameters).numpy()[..., 1].min(axis=1)
+    parameters = parameters_of(Motion.still(betas))
+    joints, floors = body.joints(parameters), body.vertices(parameters)[..., 1].min(axis=1)
     return [Build(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
 
 
 def keypoints_of(body: "BodyModel", motion: Motion) -> Array:
     """BODY_25 keypoints (T, P, 25, 3) of a motion."""
-    import torch
-
-    with torch.no_grad():
-        points = body.keypoints(parameters_of(body, motion)).numpy()
-    return points.astype(np.float64).reshape(*motion.transl.shape[:2], *points.shape[1:])
+    points = body.keypoints(parameters_of(motion))
+    return points.reshape(*motion.transl.shape[:2], *points.shape[1:])
 
 
 def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Motion:
@@ -160,16 +150,13 @@ def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Mot
     return replace(motion, transl=transl)
 
 
-def parameters_of(body: "BodyModel", motion: Motion) -> "BodyParameters":
+def parameters_of(motion: Motion) -> "BodyParameters":
     """The bodies of all frames, frame by frame, as one batch."""
-    import torch
-
     from shapepose_fg.body.model.body_model import BodyParameters
 
-    tensors = {
-        "betas": np.tile(motion.betas, (len(motion.transl), 1)),
-        "global_orient": motion.global_orient.reshape(-1, 3),
-        "body_pose": motion.body_pose.reshape(-1, 23, 3),
-        "transl": motion.transl.reshape(-1, 3),
-    }
-    return BodyParameters(**{name: torch.from_numpy(value).to(body.dtype) for name, value in tensors.items()})
+    return BodyParameters(
+        np.tile(motion.betas, (len(motion.transl), 1)),
+        motion.global_orient.reshape(-1, 3),
+        motion.body_pose.reshape(-1, 23, 3),
+        motion.transl.reshape(-1, 3),
+    )

@@ -13,17 +13,13 @@ if TYPE_CHECKING:
 
 def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
     """Vertices (P, Nv, 3), metres, of the rows that have a body, and which rows these are (P,)."""
-    import torch
-
     from shapepose_fg.body.model.body_model import BodyParameters
 
     columns = [getattr(people, name) for name in BODY]
     rows = np.flatnonzero((people.status == str(Status.OK)) & with_body(*columns))
     if len(rows) == 0:
         return np.zeros((0, body.num_vertices, 3)), rows
-    parts = (torch.from_numpy(column[rows]).to(body.dtype) for column in columns)
-    with torch.no_grad():
-        return body.vertices(BodyParameters(*parts)).numpy().astype(np.float64), rows
+    return body.vertices(BodyParameters(*(column[rows] for column in columns))), rows
 
 
 def joined(vertices: Real, faces: Whole) -> tuple[Array, Index]:

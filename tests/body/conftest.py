@@ -4,7 +4,6 @@ symmetry hides a mistake.
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -36,13 +35,9 @@ def make_smpl_arrays(num_betas: int = 10, num_vertices: int = NUM_VERTICES) -> d
     }
 
 
-def random_parameters(batch: int = 5, dtype: torch.dtype = torch.float64) -> BodyParameters:
-    generator = torch.Generator().manual_seed(0)
-
-    def draw(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
-
-    return BodyParameters(draw(batch, 10), draw(batch, 3), draw(batch, 23, 3), draw(batch, 3))
+def random_parameters(batch: int = 5) -> BodyParameters:
+    rng = np.random.default_rng(0)
+    return BodyParameters(*(rng.normal(size=(batch, *shape)) for shape in ((10,), (3,), (23, 3), (3,))))
 
 
 @pytest.fixture(name="make_smpl_arrays")
@@ -67,18 +62,18 @@ def tiny_file(request, tmp_path):
 
 @pytest.fixture
 def tiny_model(tiny_file) -> BodyModel:
-    return BodyModel.load(tiny_file).to(torch.float64)
+    return BodyModel.load(tiny_file)
 
 
 @pytest.fixture(params=["the shipped body", "tiny with pose blend shapes", "tiny without"])
 def any_body(request, tmp_path) -> BodyModel:
-    """A body in double precision."""
+    """A body."""
     if request.param == "the shipped body":
-        return BodyModel.default().to(torch.float64)
+        return BodyModel.default()
     arrays = make_smpl_arrays()
     arrays["posedirs"] *= request.param == "tiny with pose blend shapes"
     np.savez(tmp_path / "tiny.npz", **arrays)
-    return BodyModel.load(tmp_path / "tiny.npz").to(torch.float64)
+    return BodyModel.load(tmp_path / "tiny.npz")
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -23,15 +22,6 @@ FITTERS = {"plain": SmplFitter, "learned": make_fitter}
 ARM = [BODY_25.index("RElbow"), BODY_25.index("RWrist")]
 HIDDEN = slice(20, 35)
 """Frames in which the first person's right forearm is not seen: half a second."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Small matrices in several threads wait for each other where other work runs on the same cores."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def smooth(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -53,12 +43,12 @@ def bodies() -> BodyParameters:
     betas = np.repeat(np.clip(rng.normal(size=(PEOPLE, 10)), -2, 2), FRAMES, axis=0)
     place = (0.3 * smooth(3, rng) + 2 * np.arange(PEOPLE)[:, None, None]).reshape(-1, 3)
     parts = (betas, (turn * upright).as_rotvec(), poses.reshape(-1, 23, 3), place)
-    return BodyParameters(*map(torch.from_numpy, parts))
+    return BodyParameters(*(parts))
 
 
 @pytest.fixture(scope="module")
 def truth(bodies) -> np.ndarray:
-    return BodyModel.default().to(torch.float64).keypoints(bodies).numpy()
+    return BodyModel.default().keypoints(bodies)
 
 
 GROUP = np.repeat([9, -2, 5], FRAMES)
@@ -101,8 +91,8 @@ def turns_deg(poses: np.ndarray) -> np.ndarray:
 def stature_m(betas: np.ndarray) -> np.ndarray:
     """(G,) from the soles to the top of the head, T-pose."""
     model, rest = BodyModel.default(), BodyParameters.zeros(len(betas))
-    height = model.vertices(replace(rest, betas=torch.from_numpy(betas).float()))[..., 1]
-    return (height.amax(1) - height.amin(1)).numpy()
+    height = model.vertices(replace(rest, betas=betas))[..., 1]
+    return np.ptp(height, axis=1)
 
 
 def test_joints_are_where_they_are(found, truth):
@@ -136,7 +126,7 @@ def test_bodies_move_as_the_truth_does(fitter, found, truth, targets):
 
 def test_no_limb_twists_where_the_truth_does_not(found, bodies):
     visible = [SMPL_24.index(name) - 1 for name in SMPL_24[1:] if "hand" not in name]
-    extra = (turns_deg(found.fit.body_pose) - turns_deg(bodies.body_pose.numpy()))[..., visible]
+    extra = (turns_deg(found.fit.body_pose) - turns_deg(bodies.body_pose))[..., visible]
     assert extra.max() < 20
 
 
@@ -145,7 +135,7 @@ def test_one_person_has_one_shape_and_two_halves_agree(fitter, found, targets, b
     for place, number in enumerate(found.groups):
         betas = found.fit.betas[number == GROUP]
         np.testing.assert_allclose(betas, np.tile(found.shapes.mean[place], (FRAMES, 1)), atol=1e-5)
-    true = stature_m(np.stack([bodies.betas.numpy()[number == GROUP][0] for number in found.groups]))
+    true = stature_m(np.stack([bodies.betas[number == GROUP][0] for number in found.groups]))
     assert np.abs(stature_m(found.shapes.mean) - true).max() < 0.03
     first = TIME_S < FRAMES / 2 / FPS
     halves = [
@@ -155,7 +145,7 @@ def test_one_person_has_one_shape_and_two_halves_agree(fitter, found, targets, b
 
 
 def test_what_is_known_of_a_shape_holds_the_true_one(found, bodies):
-    apart = found.shapes.mean - np.stack([bodies.betas.numpy()[number == GROUP][0] for number in found.groups])
+    apart = found.shapes.mean - np.stack([bodies.betas[number == GROUP][0] for number in found.groups])
     squared = np.einsum("gi,gij,gj->g", apart, found.shapes.information, apart)
     assert (squared < 23.2).all()  # 99 % of a chi-squared of 10
     assert (np.linalg.eigvalsh(found.shapes.information) > 0.99).all()  # never less than about anybody

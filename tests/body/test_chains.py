@@ -2,38 +2,52 @@
 
 import numpy as np
 import pytest
-import torch
 
 from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY, Motion, matrices
-from shapepose_fg.body.fitting.chains import Links, cut_segments, solve_banded
+from shapepose_fg.body.fitting.chains import Links, cut_segments
 from shapepose_fg.body.fitting.priors import NUM_MOVING, MotionPrior
+from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3
 
 
-def draw(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
+def draw(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape)
 
 
 @pytest.mark.parametrize("bands", [2, 3])
 @pytest.mark.parametrize("length", [2, 3, 7])
-def test_a_banded_system_is_solved(length, bands):
-    G, N, K = 3, 5, 2
-    A = draw(length, G, N, N)
-    diagonal = A @ A.mT + 4 * torch.eye(N)
-    scales = (0.5, 0.3, 0.2)[:bands]
-    beyond = torch.stack([scale * draw(length, G, N, seed=1 + b) for b, scale in enumerate(scales)], -1)
-    right = draw(length, G, N, K, seed=4)
-    found = solve_banded(diagonal.clone(), beyond, right.clone())
-    for chain in range(G):
-        H = torch.zeros(length * N, length * N, dtype=torch.float64)
+def test_poses_are_eliminated_from_a_chain(length, bands):
+    """Against the whole of the system at once; a few unknowns a row and as many as bodies have."""
+    for N in (5, 69):
+        A = draw(length, N + 10, N + 10)
+        hessian, gradient = A @ A.swapaxes(1, 2) + 2 * N * np.eye(N + 10), draw(length, N + 10, seed=1)
+        diagonal, pull = np.abs(draw(length, N, seed=2)), draw(length, N, seed=3)
+        beyond, turn = 0.2 * draw(length, N, bands, seed=4), exp_so3(draw(length, 3, seed=5))
+        M = (bands + 1) * N + 11
+        kept, front = np.zeros((length, M, -(-N // 16) * 16)), np.zeros((M, M))
+        system = np.concatenate([np.tril(hessian), gradient[:, None]], 1)
+        eliminated(system, turn, diagonal, beyond, pull, 0.1, kept, front)
+        Q = np.tile(np.eye(N), (length, 1, 1))
+        Q[:, :3, :3] = turn  # the root's tangents become the world's
+        own = Q @ hessian[:, 10:, 10:] @ Q.swapaxes(1, 2)
+        across = (Q @ hessian[:, 10:, :10]).reshape(-1, 10)
+        right = ((Q @ gradient[:, 10:, None])[..., 0] + pull).ravel()
+        H = np.zeros((length * N, length * N))
         for t in range(length):
             rows = slice(t * N, t * N + N)
-            H[rows, rows] = diagonal[t, chain]
+            H[rows, rows] = own[t] + np.diag(diagonal[t])
+            H[rows, rows] += 0.1 * np.diag(np.diag(H[rows, rows]))
             for s in range(t + 1, min(t + 1 + bands, length)):
-                coupling = torch.diag(beyond[t, chain, :, s - t - 1])
+                coupling = np.diag(beyond[t, :, s - t - 1])
                 H[rows, s * N : s * N + N] = H[s * N : s * N + N, rows] = coupling
-        expected = torch.linalg.solve(H, right[:, chain].flatten(0, 1)).unflatten(0, (length, N))
-        torch.testing.assert_close(found[:, chain], expected)
+        said = hessian[:, :10, :10].sum(0) - across.T @ np.linalg.solve(H, across)
+        np.testing.assert_allclose(np.tril(front[-10:, -10:]), np.tril(said), rtol=1e-8, atol=1e-8)
+        left = gradient[:, :10].sum(0) - across.T @ np.linalg.solve(H, right)
+        np.testing.assert_allclose(front[-10:, -11], left, rtol=1e-8, atol=1e-8)
+        shape, step = draw(10, seed=6), np.zeros((length, N))
+        put_back(kept, np.append(1.0, shape), step)
+        expected = -np.linalg.solve(H, right + across @ shape)
+        np.testing.assert_allclose(step.ravel(), expected, rtol=1e-8, atol=1e-10)
 
 
 class Damped(Motion):
@@ -48,45 +62,46 @@ LAWS = {"constant velocity": CONSTANT_VELOCITY, "constant acceleration": CONSTAN
 
 
 @pytest.fixture(params=LAWS.values(), ids=LAWS)
-def chain(request) -> tuple[Links, torch.Tensor, torch.Tensor]:
-    """Two chains of uneven steps, the second one two rows shorter, turning a few degrees a step."""
+def chain(request) -> tuple[Links, np.ndarray, np.ndarray]:
+    """Six rows of uneven steps, turning a few degrees a step; the last two are past the end."""
     T, N = 6, 8
     rng = np.random.default_rng(0)
-    step = torch.from_numpy(rng.uniform(0.02, 0.1, (T - 1, 2)))
-    step[3:, 1] = torch.inf
+    step = rng.uniform(0.02, 0.1, T - 1)
+    step[3:] = np.inf
     motion = Links(request.param, rng.uniform(0.5, 1.5, N), rng.uniform(0.1, 1.1, N), step)
-    root = exp_so3(0.05 * draw(T, 2, 3).cumsum(0))
-    return motion, root, 0.3 * draw(T, 2, N - 3, seed=1)
+    return motion, exp_so3(0.05 * draw(T, 3).cumsum(0)), 0.3 * draw(T, N - 3, seed=1)
 
 
 def test_motion_s_gradient_and_couplings_are_those_of_its_energy(chain):
     motion, root, others = chain
-    _, found = motion.at(root, others)
+    T, N, h = 6, 8, 1e-5
 
-    def energy(step: torch.Tensor) -> torch.Tensor:
-        return motion.at(exp_so3(step[..., :3]) @ root, others + step[..., 3:])[0].sum()
+    def at(step: np.ndarray) -> tuple[float, np.ndarray]:
+        return motion.at(exp_so3(step[:, :3]) @ root, others + step[:, 3:])
 
-    still = torch.zeros(6, 2, 8, dtype=torch.float64, requires_grad=True)
-    gradient = torch.autograd.grad(energy(still), still)[0] / 2
-    torch.testing.assert_close(found, gradient, atol=1e-9, rtol=1e-9)
-    assert not found[4:, 1].any()  # past the end
-    H = torch.autograd.functional.hessian(energy, still.detach()) / 2
-    for chain_, number in ((0, 3), (1, 6)):
-        whole = H[:, chain_, number][:, :, chain_, number]
-        ours = torch.diag(motion.diagonal[:, chain_, number])
-        for offset, coupling in enumerate(motion.beyond.unbind(-1), start=1):
-            values = coupling[:-offset, chain_, number]
-            ours = ours + torch.diag(values, offset) + torch.diag(values, -offset)
-        torch.testing.assert_close(ours, whole, atol=1e-8, rtol=1e-9)
+    _, found = at(np.zeros((T, N)))
+    numeric, H = np.zeros((T, N)), np.zeros((T, N, T, N))
+    for t in range(T):
+        for i in range(N):
+            nudge = np.zeros((T, N))
+            nudge[t, i] = h
+            (ahead, slope), (behind, other) = at(nudge), at(-nudge)
+            numeric[t, i], H[t, i] = (ahead - behind) / (4 * h), (slope - other) / (2 * h)
+    np.testing.assert_allclose(found, numeric, atol=1e-3, rtol=1e-6)
+    assert not found[4:].any()  # past the end
+    for number in (3, 6):
+        ours = np.diag(motion.diagonal[:, number])
+        for offset, coupling in enumerate(np.moveaxis(motion.beyond, -1, 0), start=1):
+            values = coupling[:-offset, number]
+            ours = ours + np.diag(values, offset) + np.diag(values, -offset)
+        np.testing.assert_allclose(ours, H[:, number, :, number], atol=1e-4 * np.abs(ours).max())
 
 
 def test_even_motion_costs_its_speed_alone():
-    step = torch.full((9, 1), 0.1, dtype=torch.float64)
-    motion = Links(CONSTANT_VELOCITY, np.full(6, 2.0), np.full(6, 0.5), step)
-    time = 0.1 * torch.arange(10, dtype=torch.float64)[:, None, None]
-    root = exp_so3(time * torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64))
-    energy, _ = motion.at(root, time * torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64))
-    assert float(energy) == pytest.approx((0.7**2 + 0.3**2) / 0.5 * 0.9)  # v² h / density, 9 steps of 0.1 s
+    motion = Links(CONSTANT_VELOCITY, np.full(6, 2.0), np.full(6, 0.5), np.full(9, 0.1))
+    time = 0.1 * np.arange(10)[:, None]
+    energy, _ = motion.at(exp_so3(time * [0.0, 0.0, 0.7]), time * [0.3, 0.0, 0.0])
+    assert energy == pytest.approx((0.7**2 + 0.3**2) / 0.5 * 0.9)  # v² h / density, 9 steps of 0.1 s
 
 
 def test_chains_end_at_gaps_and_long_ones_are_cut_with_overlap():

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import RIDES_ON, KeypointOffsets
@@ -21,26 +20,26 @@ def random_offsets() -> KeypointOffsets:
 def test_a_keypoint_moves_with_its_bone(tiny_model, random_parameters):
     offsets, parameters = random_offsets(), random_parameters()
     moved = tiny_model.with_keypoint_offsets(offsets)
-    turned = tiny_model.bone_rotations(parameters)[:, torch.from_numpy(RIDES_ON)]
-    shift = (turned @ torch.from_numpy(offsets.xyz_m)[..., None]).squeeze(-1)
+    turned = tiny_model.bone_rotations(parameters)[:, RIDES_ON]
+    shift = (turned @ offsets.xyz_m[..., None]).squeeze(-1)
     expected = tiny_model.keypoints(parameters) + shift
-    np.testing.assert_allclose(moved.keypoints(parameters).numpy(), expected.numpy(), atol=1e-12)
+    np.testing.assert_allclose(moved.keypoints(parameters), expected, atol=1e-12)
     # The body itself stays as it is.
-    np.testing.assert_array_equal(moved.vertices(parameters).numpy(), tiny_model.vertices(parameters).numpy())
-    np.testing.assert_array_equal(moved.joints(parameters).numpy(), tiny_model.joints(parameters).numpy())
+    np.testing.assert_array_equal(moved.vertices(parameters), tiny_model.vertices(parameters))
+    np.testing.assert_array_equal(moved.joints(parameters), tiny_model.joints(parameters))
 
 
 def nudged(parameters: BodyParameters, column: int, step: float) -> BodyParameters:
     """The parameters with one column of the Jacobian's tangent stepped."""
-    betas, transl = parameters.betas.clone(), parameters.transl.clone()
-    rotations = torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1)
+    betas, transl = parameters.betas.copy(), parameters.transl.copy()
+    rotations = np.concatenate((parameters.global_orient[:, None], parameters.body_pose), 1)
     if column < 10:
         betas[:, column] += step
     elif column >= 82:
         transl[:, column - 82] += step
     else:
         joint, axis = divmod(column - 10, 3)
-        turn = torch.zeros(3, dtype=torch.float64)
+        turn = np.zeros((3,))
         turn[axis] = step
         rotations[:, joint] = log_so3(exp_so3(rotations[:, joint]) @ exp_so3(turn))
     return BodyParameters(betas, rotations[:, 0], rotations[:, 1:], transl)
@@ -49,32 +48,32 @@ def nudged(parameters: BodyParameters, column: int, step: float) -> BodyParamete
 def test_the_jacobian_knows_of_the_offsets(tiny_model, random_parameters):
     moved, parameters = tiny_model.with_keypoint_offsets(random_offsets()), random_parameters()
     keypoints, jacobian = moved.keypoints_with_jacobian(parameters)
-    np.testing.assert_allclose(keypoints.numpy(), moved.keypoints(parameters).numpy(), atol=1e-12)
+    np.testing.assert_allclose(keypoints, moved.keypoints(parameters), atol=1e-12)
     step = 1e-6
     for column in range(85):
         ahead, behind = (moved.keypoints(nudged(parameters, column, sign * step)) for sign in (1, -1))
         numeric = (ahead - behind) / (2 * step)
         # Central differences in double precision: truncation 1e-12, rounding 1e-16 / 1e-6.
-        np.testing.assert_allclose(jacobian[..., column].numpy(), numeric.numpy(), atol=1e-7)
+        np.testing.assert_allclose(jacobian[..., column], numeric, atol=1e-7)
 
 
 def test_offsets_outlast_a_change_of_type_and_replace_each_other(tiny_model, random_parameters):
-    parameters = random_parameters(dtype=torch.float32)
-    single = tiny_model.with_keypoint_offsets(random_offsets()).to(torch.float32)
+    parameters = random_parameters()
+    single = tiny_model.with_keypoint_offsets(random_offsets())
     double = tiny_model.with_keypoint_offsets(random_offsets())
     # Single precision, some metres from the origin and through a chain of eight turns: some micrometres.
-    expected = double.keypoints(random_parameters()).numpy()
-    np.testing.assert_allclose(single.keypoints(parameters).numpy(), expected, atol=2e-5)
+    expected = double.keypoints(random_parameters())
+    np.testing.assert_allclose(single.keypoints(parameters), expected, atol=2e-5)
     back = double.with_keypoint_offsets(KeypointOffsets.identity())
-    expected = tiny_model.keypoints(random_parameters()).numpy()
-    np.testing.assert_array_equal(back.keypoints(random_parameters()).numpy(), expected)
+    expected = tiny_model.keypoints(random_parameters())
+    np.testing.assert_array_equal(back.keypoints(random_parameters()), expected)
 
 
 def test_every_joint_rides_on_a_bone_that_the_keypoints_show():
-    model = BodyModel.default().to(torch.float64)
-    _, jacobian = model.keypoints_with_jacobian(BodyParameters.zeros(1, torch.float64))
-    speed = jacobian[0, ..., 10:-3].unflatten(-1, (24, 3)).abs().amax(dim=(0, 1, 3))
-    assert (speed[torch.from_numpy(np.unique(RIDES_ON))] > 0.01).all()  # metres a radian
+    model = BodyModel.default()
+    _, jacobian = model.keypoints_with_jacobian(BodyParameters.zeros(1))
+    speed = np.abs(jacobian[0, ..., 10:-3]).reshape(25, 3, 24, 3).max(axis=(0, 1, 3))
+    assert (speed[np.unique(RIDES_ON)] > 0.01).all()  # metres a radian
 
 
 def test_mirrored_joints_ride_on_mirrored_bones():

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import shapepose_fg.body.model.body_model
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -13,26 +12,26 @@ from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 @pytest.fixture(scope="module")
 def body() -> BodyModel:
-    return BodyModel.default().to(torch.float64)
+    return BodyModel.default()
 
 
 def zeros(batch: int = 1) -> BodyParameters:
-    return BodyParameters.zeros(batch, torch.float64)
+    return BodyParameters.zeros(batch)
 
 
 def posed(**degrees: tuple[float, float, float]) -> BodyParameters:
     parameters = zeros()
     for name, angles in degrees.items():
-        parameters.body_pose[0, SMPL_24.index(name) - 1] = torch.deg2rad(torch.tensor(angles, dtype=torch.float64))
+        parameters.body_pose[0, SMPL_24.index(name) - 1] = np.deg2rad(np.array(angles))
     return parameters
 
 
 def joints_by_name(body: BodyModel, parameters: BodyParameters) -> dict[str, np.ndarray]:
-    return dict(zip(SMPL_24, body.joints(parameters)[0].numpy(), strict=True))
+    return dict(zip(SMPL_24, body.joints(parameters)[0], strict=True))
 
 
 def volume(body: BodyModel, parameters: BodyParameters) -> float:
-    a, b, c = body.vertices(parameters)[0].numpy()[body.faces].transpose(1, 0, 2)
+    a, b, c = body.vertices(parameters)[0][body.faces].transpose(1, 0, 2)
     return float(np.einsum("fx,fx->", a, np.cross(b, c)) / 6)
 
 
@@ -48,7 +47,6 @@ def winding(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 def test_it_is_read_once_and_small():
     assert BodyModel.default() is BodyModel.default()
-    assert BodyModel.default().dtype == torch.float32
     data = Path(shapepose_fg.body.model.body_model.__file__).parents[1] / "data"
     assert (data / "open_body.npz").stat().st_size < 4e6
     assert BodyModel.default().num_vertices < 14000
@@ -56,26 +54,26 @@ def test_it_is_read_once_and_small():
 
 def test_heights_are_those_of_adults(body):
     parameters = zeros(5)
-    parameters.betas[:, 0] = torch.arange(-2, 3)
-    heights = np.ptp(body.vertices(parameters)[..., 1].numpy(), axis=1)
+    parameters.betas[:, 0] = np.arange(-2, 3)
+    heights = np.ptp(body.vertices(parameters)[..., 1], axis=1)
     assert 1.66 < heights[2] < 1.74
     np.testing.assert_allclose(np.diff(heights), 0.1, atol=0.02)  # a standard deviation over women and men
 
 
 def test_betas_are_standard_deviations_of_many_lengths(body):
     """Limbs vary by some 3 % about what stature foretells, as people's do."""
-    betas = torch.from_numpy(np.random.default_rng(0).normal(size=(2000, 10)))
+    betas = np.random.default_rng(0).normal(size=(2000, 10))
     parameters = zeros(2000)
     joints = body.joints(BodyParameters(betas, parameters.global_orient, parameters.body_pose, parameters.transl))
     for first, second in (("left_hip", "left_knee"), ("left_knee", "left_ankle"), ("left_elbow", "left_wrist")):
-        length = (joints[:, SMPL_24.index(first)] - joints[:, SMPL_24.index(second)]).norm(dim=-1).numpy()
+        length = np.linalg.norm(joints[:, SMPL_24.index(first)] - joints[:, SMPL_24.index(second)], axis=-1)
         beside_stature = length - np.polyval(np.polyfit(betas[:, 0], length, 1), betas[:, 0])
         assert 0.02 < beside_stature.std() / length.mean() < 0.05
 
 
 def test_t_pose(body):
     at = joints_by_name(body, zeros())
-    keypoints = dict(zip(BODY_25.joints, body.keypoints(zeros())[0].numpy(), strict=True))
+    keypoints = dict(zip(BODY_25.joints, body.keypoints(zeros())[0], strict=True))
     assert np.linalg.norm(at["pelvis"]) < 2e-3
     for side, sign in (("left", 1), ("right", -1)):
         arm = at[f"{side}_wrist"] - at[f"{side}_shoulder"]
@@ -91,22 +89,21 @@ def test_t_pose(body):
 def test_it_is_symmetric(body):
     flip = [1 if n.startswith("left") else -1 if n.startswith("right") else 0 for n in SMPL_24]
     assert sum(flip) == 0
-    generator = torch.Generator().manual_seed(0)
     parameters = zeros(20)
-    parameters.betas.normal_(generator=generator)
-    keypoints = body.keypoints(parameters).numpy()
+    parameters.betas[:] = np.random.default_rng(0).normal(size=(20, 10))
+    keypoints = body.keypoints(parameters)
     mirrored = keypoints[:, list(BODY_25.mirror)] * [-1, 1, 1]
-    np.testing.assert_allclose(keypoints, mirrored, atol=1e-4)  # metres; betas are symmetric, floats are float32
+    np.testing.assert_allclose(keypoints, mirrored, atol=1e-4)  # metres; the file has four digits
 
 
 def test_joints_and_keypoints_lie_within(body):
-    triangles = body.vertices(zeros())[0].numpy()[body.faces]
-    assert (winding(body.joints(zeros())[0].numpy(), triangles) > 0.5).all()
+    triangles = body.vertices(zeros())[0][body.faces]
+    assert (winding(body.joints(zeros())[0], triangles) > 0.5).all()
     skin = [BODY_25.index(name) for name in "Nose REye LEye REar LEar LBigToe LSmallToe RBigToe RSmallToe".split()]
-    inside = winding(np.delete(body.keypoints(zeros())[0].numpy(), skin, axis=0), triangles)
+    inside = winding(np.delete(body.keypoints(zeros())[0], skin, axis=0), triangles)
     assert (inside > 0.5).all()
-    face = body.keypoints(zeros())[0].numpy()[skin]
-    distance = np.linalg.norm(face[:, None] - body.vertices(zeros())[0].numpy(), axis=-1).min(1)
+    face = body.keypoints(zeros())[0][skin]
+    distance = np.linalg.norm(face[:, None] - body.vertices(zeros())[0], axis=-1).min(1)
     assert distance.max() < 0.02
 
 
@@ -136,13 +133,13 @@ def test_turning_a_joint_turns_what_hangs_on_it(body):
 
 def test_keypoints_are_the_regressor_on_the_mesh(body, random_parameters):
     parameters = random_parameters(4)
-    regressor = torch.from_numpy(body.arrays.keypoint_regressor)
+    regressor = body.arrays.keypoint_regressor
     expected = regressor @ body.vertices(parameters)
-    np.testing.assert_allclose(body.keypoints(parameters).numpy(), expected.numpy(), atol=1e-12)
+    np.testing.assert_allclose(body.keypoints(parameters), expected, atol=1e-12)
 
 
 def test_neck_and_midhip_are_the_middles_that_openpose_learned(body, random_parameters):
-    keypoints = body.keypoints(random_parameters(4)).numpy()
+    keypoints = body.keypoints(random_parameters(4))
     for middle, part in (("Neck", "Shoulder"), ("MidHip", "Hip")):
         sides = [BODY_25.index(side + part) for side in "RL"]
         np.testing.assert_allclose(keypoints[:, BODY_25.index(middle)], keypoints[:, sides].mean(1), atol=1e-6)

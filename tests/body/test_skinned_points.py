@@ -1,67 +1,68 @@
-"""Points on a skinned body: gradients without a Jacobian against the Jacobian, parts against the whole."""
+"""Points on a skinned body: gradients against the Jacobian, that against differences, parts against the whole."""
 
 import numpy as np
-import torch
 
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters, accumulate
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.body.model.skinned_points import SkinnedPoints
-
-Posed = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None]
 
 
-def posed(points: SkinnedPoints, parameters: BodyParameters) -> Posed:
-    """Local and world rotations, betas, transl and pose feature."""
-    local = exp_so3(torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1))
-    feature = (local[:, 1:] - torch.eye(3, dtype=local.dtype)).flatten(1)
-    feature = None if points.offsets_pose is None else feature
-    return local, accumulate(local), parameters.betas, parameters.transl, feature
+def test_gradients_are_the_jacobians_transpose_times_the_forces(any_body, random_parameters):
+    points, rng, body = any_body.points, np.random.default_rng(0), random_parameters(7)
+    given = body.local, body.betas, body.transl
+    xyz, jacobian = points.positions_with_jacobian(*given)
+    root = rng.normal(size=(*xyz.shape, 3))
+    target, information = xyz + rng.normal(size=xyz.shape), root @ root.swapaxes(-1, -2)
+    again, _, gradient = points.pulled(*given, target, information, 2.0)
+    np.testing.assert_array_equal(again, xyz)
+    force = (information @ (xyz - target)[..., None])[..., 0]
+    squared = ((xyz - target) * force).sum(-1)
+    force *= ((4.0 / (4.0 + squared)) ** 2)[..., None]
+    expected = np.einsum("bkxp,bkx->bp", jacobian, force)
+    np.testing.assert_allclose(gradient, expected, atol=1e-10)
 
 
-def test_forces_pulled_back_are_the_jacobians_transpose_times_them(any_body, random_parameters):
-    points = any_body.points
-    local, rotations, betas, transl, feature = posed(points, random_parameters(70))  # more than a chunk
-    _, jacobian = points.positions_with_jacobian(rotations, betas, transl, local, feature)
-    _, arms = points.positions_with_arms(rotations, betas, transl, feature)
-    forces = torch.from_numpy(np.random.default_rng(0).normal(size=(70, len(points.root), 3)))
-    expected = torch.einsum("bkxp,bkx->bp", jacobian, forces)
-    pulled = points.pull_back(forces, arms, rotations, local)
-    # Sums of 150 products of numbers about 1, in double precision.
-    np.testing.assert_allclose(pulled.numpy(), expected.numpy(), atol=1e-11)
+def test_the_jacobian_is_that_of_the_positions(any_body, random_parameters):
+    points, body, step = any_body.points, random_parameters(3), 1e-6
+    xyz, jacobian = points.positions_with_jacobian(body.local, body.betas, body.transl)
+    np.testing.assert_allclose(points.positions(body.local, body.betas, body.transl), xyz, atol=1e-12)
+    for column in range(0, 85, 4):
 
+        def moved(by: float, column: int = column) -> np.ndarray:
+            local, betas, transl = body.local, body.betas.copy(), body.transl.copy()
+            if column < 10:
+                betas[:, column] += by
+            elif column >= 82:
+                transl[:, column - 82] += by
+            else:
+                joint, axis = divmod(column - 10, 3)
+                local[:, joint] = local[:, joint] @ exp_so3(by * np.eye(3)[axis])
+            return points.positions(local, betas, transl)
 
-def test_positions_are_the_same_by_each_way(any_body, random_parameters):
-    points = any_body.points
-    local, rotations, betas, transl, feature = posed(points, random_parameters())
-    xyz = points.positions(rotations, betas, transl, feature)
-    by_arms, _ = points.positions_with_arms(rotations, betas, transl, feature)
-    by_jacobian, _ = points.positions_with_jacobian(rotations, betas, transl, local, feature)
-    np.testing.assert_allclose(by_arms.numpy(), xyz.numpy(), atol=1e-12)
-    np.testing.assert_allclose(by_jacobian.numpy(), xyz.numpy(), atol=1e-12)
+        numeric = (moved(step) - moved(-step)) / (2 * step)
+        np.testing.assert_allclose(jacobian[..., column], numeric, atol=1e-8)
 
 
 def test_parts_are_rows_of_the_whole_and_join_to_it_again(any_body, random_parameters):
     points = any_body.points
-    local, rotations, betas, transl, feature = posed(points, random_parameters())
-    xyz, jacobian = points.positions_with_jacobian(rotations, betas, transl, local, feature)
+    body = random_parameters()
+    given = body.local, body.betas, body.transl
+    xyz, jacobian = points.positions_with_jacobian(*given)
     rows = [30, 2, 25, 7]
-    part_xyz, part_jacobian = points.part(rows).positions_with_jacobian(rotations, betas, transl, local, feature)
-    np.testing.assert_allclose(part_xyz.numpy(), xyz[:, rows].numpy(), atol=1e-13)
-    np.testing.assert_allclose(part_jacobian.numpy(), jacobian[:, rows].numpy(), atol=1e-13)
+    part_xyz, part_jacobian = points.part(rows).positions_with_jacobian(*given)
+    np.testing.assert_allclose(part_xyz, xyz[:, rows], atol=1e-13)
+    np.testing.assert_allclose(part_jacobian, jacobian[:, rows], atol=1e-13)
     joined = points.part(list(range(20))).joined(points.part(list(range(20, 50))))
-    again = joined.positions(rotations, betas, transl, feature)
-    np.testing.assert_allclose(again.numpy(), xyz.numpy(), atol=1e-13)
+    np.testing.assert_allclose(joined.positions(*given), xyz, atol=1e-13)
 
 
 def test_points_with_pose_blend_shapes_join_points_without(make_smpl_arrays, tmp_path, random_parameters):
     np.savez(tmp_path / "tiny.npz", **make_smpl_arrays())
-    model = BodyModel.load(tmp_path / "tiny.npz").to(torch.float64)
+    model = BodyModel.load(tmp_path / "tiny.npz")
     assert model.points.offsets_pose is not None
-    joints = torch.arange(26, 50)
+    joints = np.arange(26, 50)
     assert not model.points.offsets_pose[:, joints].any()  # joints do not blend
-    assert bool(model.points.offsets_pose[:, :26].any())
+    assert model.points.offsets_pose[:, :26].any()
     parameters = random_parameters()
-    _, rotations, betas, transl, feature = posed(model.points, parameters)
-    xyz = model.points.positions(rotations, betas, transl, feature)
-    np.testing.assert_allclose(xyz[:, 26:].numpy(), model.joints(parameters).numpy(), atol=1e-12)
-    np.testing.assert_allclose(xyz[:, :25].numpy(), model.keypoints(parameters).numpy(), atol=1e-12)
+    xyz = model.points.positions(parameters.local, parameters.betas, parameters.transl)
+    np.testing.assert_allclose(xyz[:, 26:], model.joints(parameters), atol=1e-12)
+    np.testing.assert_allclose(xyz[:, :25], model.keypoints(parameters), atol=1e-12)

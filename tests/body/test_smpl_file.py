@@ -105,8 +105,8 @@ def test_keypoints_of_smpls_own_mesh(save, make_smpl_arrays):
     del arrays["keypoint_regressor"], arrays["posedirs"]
     arrays["v_template"][:, 1] = np.clip(arrays["v_template"][:, 1], -1.2, 0.6)  # a person's height
     model = BodyModel.load(save(arrays))
-    keypoints = dict(zip(BODY_25.joints, model.keypoints(BodyParameters.zeros(1))[0].numpy(), strict=True))
-    joints = dict(zip(SMPL_24, model.joints(BodyParameters.zeros(1))[0].numpy(), strict=True))
+    keypoints = dict(zip(BODY_25.joints, model.keypoints(BodyParameters.zeros(1))[0], strict=True))
+    joints = dict(zip(SMPL_24, model.joints(BodyParameters.zeros(1))[0], strict=True))
     tolerance = {"atol": 1e-6}  # float32
     # Vertices as the community's SMPL tools have them (smplx, `vertex_ids`).
     vertices = {"Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216}

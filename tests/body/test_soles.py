@@ -1,7 +1,6 @@
 """Bodies and a floor: where their lowest points are, and how they get out of it."""
 
 import numpy as np
-import torch
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.soles import SINK_M, above_floor, lowest_of_feet
@@ -18,9 +17,7 @@ def standing(count: int, lift_m: float = 0.0):
 
 
 def vertices(bodies):
-    with torch.no_grad():
-        parameters = BodyParameters(*(torch.from_numpy(each).to(MODEL.dtype) for each in bodies))
-        return MODEL.vertices(parameters).double().numpy()
+    return MODEL.vertices(BodyParameters(*bodies))
 
 
 def test_lowest_points_are_those_of_the_mesh():

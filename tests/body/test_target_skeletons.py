@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import RIDES_ON, KeypointOffsets
@@ -12,7 +11,7 @@ from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
 def points_of_the_mesh(model: BodyModel, parameters: BodyParameters) -> dict[str, np.ndarray]:
     """Every body point (B, 3) from vertices and joints."""
-    vertices, joints = model.vertices(parameters).numpy(), model.joints(parameters).numpy()
+    vertices, joints = model.vertices(parameters), model.joints(parameters)
     keypoints = model.arrays.keypoint_regressor @ vertices
     top = vertices[:, np.argmax(model.arrays.template[:, 1])]
     points = {name: keypoints[:, row] for row, name in enumerate(BODY_25.joints)} | {"Head": top}
@@ -27,8 +26,8 @@ def test_keypoints_of_each_skeleton_are_those_of_the_mesh(any_body, random_param
     assert chosen.keypoint_names == names
     xyz, jacobian = chosen.keypoints_with_jacobian(parameters)
     expected = np.stack([expected[joint] for joint in names], axis=1)
-    np.testing.assert_allclose(chosen.keypoints(parameters).numpy(), expected, atol=1e-12)
-    np.testing.assert_allclose(xyz.numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(chosen.keypoints(parameters), expected, atol=1e-12)
+    np.testing.assert_allclose(xyz, expected, atol=1e-12)
     assert jacobian.shape == (5, len(names), 3, 85)
 
 
@@ -53,8 +52,8 @@ def test_the_mirror_swaps_sides_and_comes_back():
 
 
 def test_a_mirrored_point_is_where_the_mirror_shows_it():
-    model = BodyModel.default().to(torch.float64).with_keypoints(BODY_POINTS)
-    xyz = model.keypoints(BodyParameters.zeros(1, torch.float64))[0].numpy()
+    model = BodyModel.default().with_keypoints(BODY_POINTS)
+    xyz = model.keypoints(BodyParameters.zeros(1))[0]
     # The shipped body's two sides are alike to some millimetres; neighbouring joints are centimetres apart.
     np.testing.assert_allclose(xyz[list(MIRROR)] * [-1, 1, 1], xyz, atol=0.01)
 
@@ -69,9 +68,9 @@ def test_unknown_points_are_named():
 def test_bodies_turn_about_the_pelvis_of_the_rest_pose(any_body, random_parameters):
     parameters = random_parameters()
     pelvis = any_body.rest_pelvis(parameters.betas)
-    zero = torch.zeros(5, 3, dtype=torch.float64)
+    zero = np.zeros((5, 3))
     posed = BodyParameters(parameters.betas, parameters.global_orient, parameters.body_pose, zero)
-    np.testing.assert_allclose(any_body.joints(posed)[:, 0].numpy(), pelvis.numpy(), atol=1e-12)
+    np.testing.assert_allclose(any_body.joints(posed)[:, 0], pelvis, atol=1e-12)
 
 
 def test_offsets_go_with_the_keypoints_that_are_chosen(any_body, random_parameters):
@@ -85,9 +84,9 @@ def test_offsets_go_with_the_keypoints_that_are_chosen(any_body, random_paramete
     xyz, bones = moved.offsets_of_keypoints
     shift = (any_body.bone_rotations(parameters)[:, bones] @ xyz[..., None]).squeeze(-1)
     expected = plain.keypoints(parameters) + shift
-    np.testing.assert_allclose(moved.keypoints(parameters).numpy(), expected.numpy(), atol=1e-12)
+    np.testing.assert_allclose(moved.keypoints(parameters), expected, atol=1e-12)
     for row, name in enumerate(moved.keypoint_names):
         own = offsets.xyz_m[BODY_25.index(name)] if name in BODY_25.joints else np.zeros(3)
-        np.testing.assert_array_equal(xyz[row].numpy(), own)
+        np.testing.assert_array_equal(xyz[row], own)
     smpl = any_body.with_keypoints(SMPL_24).with_keypoint_offsets(offsets)
-    np.testing.assert_allclose(smpl.keypoints(parameters).numpy(), any_body.joints(parameters).numpy(), atol=1e-12)
+    np.testing.assert_allclose(smpl.keypoints(parameters), any_body.joints(parameters), atol=1e-12)

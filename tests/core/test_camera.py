@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig, Views
 
 K = np.array([[1000.0, 2.0, 500.0], [0.0, 1010.0, 400.0], [0.0, 0.0, 1.0]])
 LENS = np.array([-0.3, 0.1, 0.001, -0.002, 0.02])
@@ -140,3 +140,14 @@ def test_refuses_coefficients_of_another_lens():
         Camera("a", K, np.eye(4), (10, 10), np.zeros(5), "mirror")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at most 4"):
         Camera.from_camera_from_world("a", K, np.eye(4), (10, 10), [0.1] * 5, "fisheye")
+
+
+def test_pixels_are_those_of_the_projection_with_derivatives_moving_cameras_too(five_cameras, two_people):
+    still = Views.of(five_cameras)
+    for views in (still, Views(still.K, np.tile(still.cTw, (2, 1, 1, 1)))):
+        points = two_people.copy()
+        points[1, 3] = 100.0  # behind some
+        xy, depth, _ = views.project(points)
+        np.testing.assert_allclose(views.pixels(points)[0], xy, atol=1e-8)
+        np.testing.assert_allclose(views.pixels(points)[1], depth, atol=1e-12)
+        assert np.isnan(xy).any()

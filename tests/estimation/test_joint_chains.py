@@ -12,6 +12,7 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGrap
 from shapepose_fg.estimation.joint_chains import Chains, Projections
 from shapepose_fg.estimation.linearisation import Message, ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 LOST, FEET = 4, np.array([11, 22])
@@ -57,31 +58,60 @@ def test_what_nothing_determines_is_nan_and_other_chains_are_not():
     np.testing.assert_allclose(states[[0, 2]], 1.0)
 
 
+def window_of(rig, truth, kernel="cauchy", law=CONSTANT_VELOCITY, moving=False):
+    """A person's window of `truth` (T, 25, 3), seen with 3 px of noise, 25 frames a second; (T, 25, V) sigmas."""
+    rng, T, V = np.random.default_rng(0), len(truth), len(rig)
+    xy = np.moveaxis(rig.project(truth)[0], 0, 2) + rng.normal(0, 3, (T, 25, V, 2))
+    xy[:, 7, 1] += 40.0
+    sigmas = rng.uniform(3.0, 8.0, xy.shape[:3])
+    seen = Observations(
+        xy, np.full(sigmas.shape, 0.8), np.full((T, 25, 3), np.nan), np.zeros(T, dtype=int), np.arange(T),
+        np.repeat(np.arange(T)[:, None] / 25, V, axis=1),
+    )  # fmt: skip
+    views = Views.of(rig)
+    if moving:
+        views = Views(views.K, np.tile(views.cTw, (T, 1, 1, 1)), views.image_sizes)
+    config = EstimatorConfig(ObservationConfig(kernel=kernel), WindowGraphConfig())
+    return WindowGraph(seen, sigmas, views, config, MotionModel.load(BODY_25.joints, law=law)), sigmas
+
+
+def test_a_joint_that_one_view_saw_takes_nothing_from_the_others(five_cameras, two_people):
+    """The system is singular: its depth is not known in any frame, all else is."""
+    truth = np.tile(two_people[0], (6, 1, 1))
+    window, sigmas = window_of(five_cameras, truth)
+    inlier = sigmas > 0
+    inlier[:, LOST, 1:] = False
+    nothing = Message(np.zeros(truth.shape), np.zeros((*truth.shape, 3)))
+    found = window.solve(inlier, nothing, nothing, truth)
+    positions, velocities = state_covariances([window])[0]
+    assert window.failure == "" and np.linalg.norm(np.delete(found - truth, LOST, axis=1), axis=2).max() < 0.1
+    for covariance in (positions, velocities):
+        known = np.isfinite(covariance).all(axis=(2, 3))
+        assert known[:, np.arange(25) != LOST].all()
+    assert np.isnan(positions[:, LOST]).all() and np.abs(found[:, LOST] - truth[:, LOST]).max() < 1.0
+
+
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
 @pytest.mark.parametrize("law", [CONSTANT_VELOCITY, CONSTANT_ACCELERATION], ids=["velocity", "acceleration"])
 def test_gtsam_ends_where_the_chains_do(five_cameras, two_people, kernel, law):
-    """One of six views 40 px off, a joint that is lost, feet that stand: nothing is left for GTSAM to gain, and
+    """One of five views 40 px off, a joint that is lost, feet that stand: nothing is left for GTSAM to gain, and
     from elsewhere it comes back to the same joints."""
     rng, T = np.random.default_rng(0), 12
     truth = two_people[0] + 0.3 * np.linspace(0, 1, T)[:, None, None] * np.array([1.0, 0.0, 0.0])
     truth[:, FEET] = truth[:1, FEET]
-    xy = np.moveaxis(five_cameras.project(truth)[0], 0, 2) + rng.normal(0, 3, (T, 25, 5, 2))
-    xy[:, 7, 1] += 40.0
-    sigmas = rng.uniform(3.0, 8.0, xy.shape[:3])
     lost = np.zeros((T, 25), dtype=bool)
     lost[4:8, LOST] = True
-    seen = Observations(
-        xy, np.full(sigmas.shape, 0.8), np.full((T, 25, 3), np.nan), np.zeros(T, dtype=int), np.arange(T),
-        np.repeat(np.arange(T)[:, None] / 25, 5, axis=1),
-    )  # fmt: skip
-    config = EstimatorConfig(ObservationConfig(kernel=kernel), WindowGraphConfig())
-    motion = MotionModel.load(BODY_25.joints, law=law)
-    window = WindowGraph(seen, sigmas, Views.of(five_cameras), config, motion)
+    (window, sigmas), (other, _) = (
+        window_of(five_cameras, truth, kernel, law, moving) for moving in (False, True)
+    )
     body = Message(truth + rng.normal(0, 0.02, truth.shape), np.tile(np.eye(3) / 0.03**2, (T, 25, 1, 1)))
-    optimizer = gtsam.LevenbergMarquardtOptimizer
+    asked, optimizer = (
+        (~lost[..., None] & (sigmas > 0), body, body, truth, lost, FEET),
+        gtsam.LevenbergMarquardtOptimizer,
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gtsam, "LevenbergMarquardtOptimizer", lambda *_: pytest.fail("the start is far off"))
-        found = window.solve(~lost[..., None] & (sigmas > 0), body, body, truth, lost, FEET)
+        found = window.solve(*asked)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-10)
     away = gtsam.Values()
@@ -90,5 +120,6 @@ def test_gtsam_ends_where_the_chains_do(five_cameras, two_people, kernel, law):
     whole = optimizer(window.graph, away, parameters).optimize()
     again = np.array([[whole.atPoint3(key) for key in row] for row in window.keys.tolist()])
     np.testing.assert_allclose(again, found, atol=1e-4)
+    np.testing.assert_allclose(other.solve(*asked), found, atol=1e-9)
     assert len({chains.parts for chains in window.chains}) == 2, "the lost joint has an offset"
     assert np.ptp(found[:, FEET], axis=0).max() < 0.02

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.fitting.fitter import Shapes
 from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
@@ -82,8 +81,7 @@ def test_bodies_stand_on_the_floor_that_was_found(scene, fitter):
     for each in (None, floor):
         found = with_bodies_over_time(people, fitter, floor=each)
         columns = (found.betas, found.global_orient, found.body_pose, found.transl)
-        with torch.no_grad():
-            points = fitter.model.vertices(BodyParameters(*(torch.from_numpy(one).float() for one in columns)))
+        points = fitter.model.vertices(BodyParameters(*columns))
         lowest.append(points[..., 2].min().item())
     assert lowest[0] < 0.1 and lowest[1] > 0.17
 
@@ -132,7 +130,7 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
         )  # fmt: skip
         columns = ("betas", "global_orient", "body_pose", "transl")
         parts = [bodies.filled(name, getattr(people, name), people.person, {}) for name in columns]
-        return bodies, BodyParameters(*(torch.from_numpy(part).float() for part in parts))
+        return bodies, BodyParameters(*parts)
 
     whole, expected = fitted(SEGMENT_ROWS)
     assert given == [[range(240)]]
@@ -143,20 +141,20 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     assert given[0] == [range(0, 20), range(73, 93), range(147, 167), range(220, 240)]
     assert given[1:] == [[range(0, 112)], [range(48, 192)], [range(128, 240)]]
     # One shape, and that of the whole track as far as it is known: ten numbers, one each by chance.
-    assert np.ptp(found.betas.numpy(), axis=0).max() == 0
+    assert np.ptp(found.betas, axis=0).max() == 0
     apart = (cut.shapes.betas - whole.shapes.betas)[0]
     assert apart @ cut.shapes.information[0] @ apart < 10
     # A third of the rows know less, and say so.
     gain = np.linalg.slogdet(whole.shapes.information[0])[1] - np.linalg.slogdet(cut.shapes.information[0])[1]
     assert gain > 1
     # What 80 rows, three looks, leave open of the shape.
-    joints, usual = (fitter.model.keypoints(each).numpy() for each in (found, expected))
+    joints, usual = (fitter.model.keypoints(each) for each in (found, expected))
     assert 1e3 * np.linalg.norm(joints - usual, axis=-1).max() < 4
     # With that shape it is the uncut track's bodies, and nothing jumps at a border.
     known = Shapes(cut.shapes.betas, cut.shapes.information)
     uncut = replace(person(0, [range(240)]), shapes=known, fixed_shapes=True).fitted(fitter)
     pose = (uncut[name] for name in ("betas", "global_orient", "body_pose", "transl"))
-    same = fitter.model.keypoints(BodyParameters(*(torch.from_numpy(part).float() for part in pose))).numpy()
+    same = fitter.model.keypoints(BodyParameters(*pose))
     assert 1e3 * np.linalg.norm(joints - same, axis=-1).max() < 0.3
     apart_mm = 1e3 * np.linalg.norm(np.diff(joints, axis=0) - np.diff(same, axis=0), axis=-1)
     assert apart_mm[[79, 159]].max() < 0.02

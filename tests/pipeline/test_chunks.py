@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyParameters
@@ -89,7 +88,7 @@ def test_every_row_is_of_its_frame_and_its_person(scene, whole):
     squared = np.einsum("nji,njik,njk->nj", error, np.linalg.inv(whole.covariance), error)
     assert 0.85 < (squared[seen] < 7.81).mean() <= 1  # of a Gaussian 95 %
     columns = (whole.betas, whole.global_orient, whole.body_pose, whole.transl)
-    body = scene.body.keypoints(BodyParameters(*(torch.from_numpy(each).float() for each in columns))).numpy()
+    body = scene.body.keypoints(BodyParameters(*columns))
     moving = seen & (np.linalg.norm(speed, axis=-1) > 0.5)
     for track in np.unique(whole.person):
         mine = np.flatnonzero(whole.person == track)

@@ -19,8 +19,9 @@ LEVELS = (
     "core.storage.npz",
     "core.storage.schema",
     "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
-    " core.run_summary viz.rendering pipeline.workers body.threads cli.terminal cli.stopping",
+    " core.run_summary viz.rendering pipeline.workers cli.terminal cli.stopping",
     "core.result_files",
+    "body.kernels",
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
@@ -147,13 +148,10 @@ def test_factors_know_gtsam_and_numpy_only():
         assert not foreign, f"{module} imports {foreign}"
 
 
-def test_torch_is_imported_for_bodies_only():
-    users = {room(name) for name, tree in LIBRARY.items() if "torch" in imported_on_import(tree)}
-    # The scene's people are bodies; everybody else imports torch in the function that needs it, or not at all.
-    assert users <= {f"body.{name}" for name in ("model", "fitting", "offsets", "threads")} | {
-        "evaluation",
-        "simulation",
-    }
+def test_torch_is_imported_for_training_only():
+    users = {name for name, tree in LIBRARY.items() if "torch" in imports(tree)}
+    training = {name for name in users if "simulation.training" in name}
+    assert users - training <= {"shapepose_fg.cli.train_fitter", "cli.train_fitter"} and training
 
 
 LIGHT = {
@@ -161,6 +159,7 @@ LIGHT = {
     "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
     "stage I": "import shapepose_fg.proposal.association",
     "stage II": "import shapepose_fg.pipeline.solve_window",
+    "fits": "from shapepose_fg.body.fitting.fitters import make_fitter; make_fitter()",
     "processes that look": "import shapepose_fg.simulation.visibility",
     "help": (
         "from shapepose_fg.cli.main import main\n"

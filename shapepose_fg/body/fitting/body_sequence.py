@@ -4,12 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from factors import Motion
 from shapepose_fg.body.fitting.chains import ChainRows, Segment, cut_segments
-from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets, factored
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
     BodyConfig,
@@ -20,14 +18,13 @@ from shapepose_fg.body.fitting.fitter import (
     Shapes,
     check_groups,
 )
-from shapepose_fg.body.fitting.posterior import joint_covariance
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SEGMENT_ROWS = 320
 """Longer chains are cut, so that memory does not grow with them."""
 OVERLAP_ROWS = 16
 """Rows that a cut-off segment has of its neighbours, on either side."""
-_CHUNK = 128
+_CHUNK = 64
 """Rows whose covariances are computed at a time."""
 
 
@@ -37,7 +34,7 @@ class SequenceFitter:
 
     energy: BodyEnergy
     """Of a row."""
-    starts: Callable[[Evidence], tuple[Tensor, Tensor | None, Mask]]
+    starts: Callable[[Evidence], tuple[Array, Array, Mask]]
     """Bodies of rows (R) by themselves: parameters (R, P) around their centres, around which angles (R, A) they
     are held, which are good."""
     law: Motion
@@ -82,44 +79,39 @@ class SequenceFitter:
             done = np.sort(np.concatenate([segment.rows[segment.kept] for segment in segments]))
             for at in range(0, len(done), _CHUNK):
                 part = done[at : at + _CHUNK]
-                self._fill(fit, part, free[torch.from_numpy(part)], origin[part], rows, evidence)
+                self._fill(fit, part, free[part], origin[part], rows, evidence)
         return SequenceFit(fit, numbers, known)
 
-    def _start(self, evidence: Evidence, group: Index, time_s: Array) -> tuple[Tensor, Array, ChainRows, Mask]:
+    def _start(self, evidence: Evidence, group: Index, time_s: Array) -> tuple[Array, Array, ChainRows, Mask]:
         """Where B rows start: bodies row by row; who has none starts as the nearest of the group in time.
 
         Returns parameters (B, P), around which origins (B, 3), one for all rows of a group, what is minimised, and
         which rows have a body of their own.
         """
         ok, B = np.flatnonzero(evidence.status == FitStatus.OK), len(group)
-        free, angles, found = torch.zeros(B, self.energy.num_free), None, np.zeros(B, dtype=bool)
-        origin = np.zeros((B, 3))
+        free, angles = np.zeros((B, self.energy.num_free)), np.zeros((B, self.energy.num_angles))
+        origin, found = np.zeros((B, 3)), np.zeros(B, dtype=bool)
         if len(ok) > 0:
             single, held, done = self.starts(evidence.rows(ok))
-            ok, chosen = ok[done], torch.from_numpy(np.flatnonzero(done))
-            free[ok], found[ok] = single[chosen], True
-            angles = None if held is None else torch.zeros(B, self.energy.num_angles)
+            ok, held = ok[done], held[done]
+            free[ok], found[ok] = single[done], True
             for number in np.unique(group[ok]):
                 mine, theirs = np.flatnonzero(group == number), ok[group[ok] == number]
                 origin[mine] = middle = evidence.centre[theirs].mean(axis=0)
-                free[theirs, -3:] += torch.from_numpy(evidence.centre[theirs] - middle).float()
+                free[theirs, -3:] += evidence.centre[theirs] - middle
                 order = theirs[np.argsort(time_s[theirs])]
                 nearest = order[_nearest(time_s[order], time_s[mine])]
-                place = [
-                    np.interp(time_s[mine], time_s[order], free[order, axis].numpy()) for axis in (-3, -2, -1)
-                ]
+                place = [np.interp(time_s[mine], time_s[order], free[order, axis]) for axis in (-3, -2, -1)]
                 free[mine] = free[nearest]
-                free[mine, -3:] = torch.from_numpy(np.stack(place, axis=1)).float()
-                if angles is not None and held is not None:
-                    angles[mine] = held[chosen[np.searchsorted(ok, nearest)]]
-        xyz = torch.from_numpy(evidence.xyz - origin[:, None]).float()
-        targets = WhitenedTargets(xyz, torch.from_numpy(evidence.root).float())
+                free[mine, -3:] = np.stack(place, axis=1)
+                angles[mine] = held[np.searchsorted(ok, nearest)]
+        targets = WhitenedTargets(evidence.xyz - origin[:, None], evidence.root)
         rows = ChainRows(self.energy, self.config.kernel_scale, targets, angles, time_s, self.law)
         return free, origin, rows, found
 
     def _solved(
-        self, rows: ChainRows, free: Tensor, segments: list[Segment], known: Shapes, fixed: bool
-    ) -> tuple[Tensor, Shapes]:
+        self, rows: ChainRows, free: Array, segments: list[Segment], known: Shapes, fixed: bool
+    ) -> tuple[Array, Shapes]:
         """Parameters (B, P), and the shapes (G) given everything."""
         owner = np.array([segment.group for segment in segments])
         if fixed:
@@ -130,10 +122,9 @@ class SequenceFitter:
         free, betas, said = rows.solved(free, segments, held, firm, fixed=False)
         # Each segment's Gaussian without the prior: information S, and S times its mean. Overlaps count once.
         kept = np.array([segment.kept.mean() for segment in segments])[:, None, None]
-        firm = torch.from_numpy(firm)
-        pull = kept * ((said + firm) @ betas[..., None] - firm @ torch.from_numpy(held)[..., None]).numpy()
+        pull = kept * ((said + firm) @ betas[..., None] - firm @ held[..., None])
         total, right = prior.copy(), prior @ known.mean[..., None]
-        np.add.at(total, owner, kept * said.numpy())
+        np.add.at(total, owner, kept * said)
         np.add.at(right, owner, pull)
         mean = np.asarray(np.linalg.solve(total, right)[..., 0], dtype=np.float64)
         shapes = Shapes(mean, known.information + (total - prior) / share[:, None, None])
@@ -148,24 +139,22 @@ class SequenceFitter:
         self,
         fit: BodyFit,
         part: Index,
-        body: Tensor,
+        body: Array,
         origin: Array,
         rows: ChainRows,
         evidence: Evidence,
     ) -> None:
         """Fill the rows `part` (R,) of `fit` with the bodies `body` (R, P) around `origin` (R, 3)."""
-        index, scale = torch.from_numpy(part), torch.tensor(self.config.kernel_scale)
-        held = Held(body[:, :10], torch.tensor([SETTLED]), None if rows.angles is None else rows.angles[index])
-        found = self.energy.evaluate(body, rows.targets.rows(index), scale, held)
-        by_joint = found.jacobian.unflatten(1, (-1, 3)).double()
-        known = joint_covariance(factored(found.here.hessian.double()), by_joint).numpy()
-        xyz, squared = found.here.xyz.double().numpy(), found.here.squared.double().sum(-1).numpy()
+        held = Held(body[:, :10], np.full(len(part), SETTLED), rows.angles[part])
+        found = self.energy.evaluate(body, rows.targets.rows(part), self.config.kernel_scale, held)
+        known, _ = found.covariances()
+        xyz, squared = found.xyz, found.squared.sum(-1)
         ok = np.isfinite(xyz).all(axis=(1, 2))
         with np.errstate(divide="ignore", invalid="ignore"):
             residual_m = np.sqrt(squared / evidence.total_information[part])
         fit.status[part] = np.where(ok, FitStatus.OK, FitStatus.NOT_CONVERGED)
         part, origin = part[ok], origin[ok]
-        fit.put_bodies(part, self.energy.complete(body[torch.from_numpy(ok)]), origin)
+        fit.put_bodies(part, self.energy.complete(body[ok]), origin)
         fit.joints[part] = xyz[ok] + origin[:, None]
         fit.covariance[part], fit.residual_m[part] = known[ok], residual_m[ok]
 

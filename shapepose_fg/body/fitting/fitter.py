@@ -82,14 +82,14 @@ STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
 
 
 class Rows:
-    """Arrays or tensors of one length; None stays None."""
+    """Arrays of one length."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
     def rows(self, index: Any) -> Self:
         """The rows `index` (R,)."""
-        return type(self)(*(None if value is None else value[index] for value in vars(self).values()))
+        return type(self)(*(value[index] for value in vars(self).values()))
 
     def put(self, index: Any, other: Self) -> None:
         """Write the rows of `other` over the rows `index` (R,)."""
@@ -174,8 +174,8 @@ class BodyFit(Rows):
     def put_bodies(self, index: Index, body: "BodyParameters", origin: Array) -> None:
         """Write bodies (R) that were found around `origin` (R, 3), metres, over the rows `index` (R,)."""
         for name in ("betas", "global_orient", "body_pose"):
-            getattr(self, name)[index] = getattr(body, name).double().numpy()
-        self.transl[index] = body.transl.double().numpy() + origin
+            getattr(self, name)[index] = getattr(body, name)
+        self.transl[index] = body.transl + origin
 
 
 @dataclass(frozen=True)

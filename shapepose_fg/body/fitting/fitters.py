@@ -1,15 +1,12 @@
 """The body fitter: judge targets, plan passes, fit them, share shapes, fit again; with the network on or off."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.body.fitting.body_sequence import SequenceFitter
-from shapepose_fg.body.fitting.energy import BodyEnergy, Held
+from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
     BodyConfig,
@@ -21,15 +18,9 @@ from shapepose_fg.body.fitting.fitter import (
     Shapes,
     check_groups,
 )
-from shapepose_fg.body.fitting.left_out import Passes, left_out_sets, plan_passes
+from shapepose_fg.body.fitting.left_out import Pairs, fitted_without, left_out_sets
 from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt, NetworkDescent
-from shapepose_fg.body.fitting.posterior import (
-    JointPosterior,
-    left_out_places,
-    pooled_betas,
-    shape_precision,
-    shared,
-)
+from shapepose_fg.body.fitting.posterior import pooled_betas, shared
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
@@ -37,8 +28,10 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array, Index, Mask
 
-_CHUNK = 128
-"""Passes that are fitted at a time: their Hessians stay in the cache, and memory does not grow with the batch."""
+_CHUNK = 64
+"""Rows that are fitted at a time: their Hessians stay in the cache, and memory does not grow with the batch."""
+_ARRIVE = 128
+"""Rows that the network sees at a time."""
 _VOTERS = 24
 """Rows of a group that agree upon its shape. In a window of some seconds errors are correlated: more tell no
 more."""
@@ -73,9 +66,8 @@ class SmplFitter(BodyFitter):
     """Fits a body to 3D joints by learned gradient descent, or without `weights` by Levenberg-Marquardt.
 
     Rows are independent, but for the shape of rows in one group; one that the network and a short polish do not
-    settle is fitted by Levenberg-Marquardt instead, with a shape of its own. The body and its derivatives are
-    computed in single precision around each row's centre, covariances in double: within 1e-4 of all-double ones,
-    at half the cost.
+    settle is fitted by Levenberg-Marquardt instead, with a shape of its own. Everything but the network's layers
+    is computed in double precision.
     """
 
     model: BodyModel
@@ -95,10 +87,10 @@ class SmplFitter(BodyFitter):
         """How bodies of a person move from row to row."""
         self.weights = weights
         """Of the network; None: it is off."""
-        self.energy = BodyEnergy(self.model.to(torch.float32), self.prior)
+        self.energy = BodyEnergy(self.model, self.prior)
         self.sets = left_out_sets(self.energy, self.prior)
         """(J,) which joints are left out together."""
-        plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
+        self._plain = plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
         names = self.model.keypoint_names
         if weights is None:
             self.optimiser, self._fallback, self._unfinished = plain, None, _CONVERGED
@@ -113,23 +105,20 @@ class SmplFitter(BodyFitter):
         model = self.model.with_keypoint_offsets(offsets)
         return SmplFitter(model, self.prior, self.config, self.weights, self.law)
 
-    @torch.inference_mode()
     def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
 
-        OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing; passes that
-        leave targets out start cold. The network needs none: two fits to the same targets are the same fit.
+        OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing. The network
+        needs none: two fits to the same targets are the same fit.
         """
         return self._fit(targets, initial, groups, leave_out=True)
 
-    @torch.inference_mode()
     def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
         """The same bodies in a fraction of the time, without `prior_xyz` and `prior_covariance`, which are NaN."""
         fit = self._fit(targets, initial, None, leave_out=False)
         fit.prior_xyz[:], fit.prior_covariance[:] = np.nan, np.nan
         return fit
 
-    @torch.inference_mode()
     def fit_sequence(
         self,
         targets: JointTargets,
@@ -170,108 +159,152 @@ class SmplFitter(BodyFitter):
         evidence = weigh(targets, self.config.model_sigma_m)
         fit = BodyFit.failed(evidence.status, count)
         rows = np.flatnonzero(evidence.status == FitStatus.OK)
-        if len(rows) > 0:
-            evidence, groups = evidence.rows(rows), groups[rows]
-            start = None if initial is None else self._start(initial.rows(rows), evidence.centre)
-            passes = plan_passes(evidence, self.sets, groups) if leave_out else Passes.whole(evidence, groups)
-            passes = replace(passes, votes=passes.votes & evenly(groups, _VOTERS)[passes.row])
-            self._fill(fit, rows, passes, self._posteriors(passes, start))
+        if len(rows) == 0:
+            return fit
+        evidence, groups = evidence.rows(rows), groups[rows]
+        start = None if initial is None else self._start(initial.rows(rows), evidence.centre)
+        free, held = self._arrive(evidence, start)
+        pairs, votes = Pairs.of(evidence, self.sets, groups) if leave_out else None, evenly(groups, _VOTERS)
+        fitted = self.optimiser.evaluated
+        if shared(groups, votes).any():
+            fitted = self.optimiser.again
+            free, held, pairs = self._one_shape(evidence, groups, votes, free, held, pairs)
+        unsettled = np.zeros(len(rows), dtype=bool)
+        for part in _parts(np.arange(len(rows)), _CHUNK):
+            body = fitted(free[part], _centred(evidence, part), held.rows(part))
+            if self._fallback is not None:
+                unsettled[part] = ~(body.left < self._unfinished)  # NaN is unsettled
+                if unsettled[part].any():
+                    body, part = body.rows(~unsettled[part]), part[~unsettled[part]]
+            self._fill(fit, rows, evidence, part, body, held.rows(part), pairs)
+        for part in _parts(np.flatnonzero(unsettled), _CHUNK):
+            targets = _centred(evidence, part)
+            arrived, held = self._plain.arrive(targets, evidence.variance_m2[part])
+            body = self._plain.evaluated(arrived, targets, held)
+            self._fill(fit, rows, evidence, part, body, held, pairs)
         return fit
 
-    def _posteriors(self, passes: Passes, start: Tensor | None) -> list[JointPosterior]:
-        """What all passes say: those with all targets, then those without some, if any."""
-        together = bool(shared(passes.pool, passes.votes).any())
-        shaped = self._shapes(passes, start) if together else None
-        parts: list[JointPosterior] = []
-        for chunks in passes.chunks(_CHUNK):
-            found: list[JointPosterior] = []
-            for chunk in chunks:
-                targets, variance = passes.given(chunk)
-                if shaped is None:
-                    body, _ = self.optimiser.first(targets, variance, _part(start, chunk))
-                else:
-                    rows = torch.from_numpy(chunk)
-                    body = self.optimiser.again(shaped[0][rows], targets, shaped[1].rows(rows))
-                found.append(JointPosterior.of(body, passes.asked(chunk)))
-            part = JointPosterior.concatenated(found)
-            # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
-            unsettled = np.flatnonzero(~(part.left < self._unfinished))  # NaN is unsettled
-            if self._fallback is not None and len(unsettled) > 0:
-                chunk = np.concatenate(chunks)[unsettled]
-                body, _ = self._fallback.first(*passes.given(chunk), None)
-                part.put(unsettled, JointPosterior.of(body, passes.asked(chunk)))
-            parts.append(part)
-        return parts
+    def _arrive(self, evidence: Evidence, start: Array | None) -> tuple[Array, Held]:
+        """Where fits with all targets start, (R, P) around `evidence.centre`, and what holds them."""
+        found = [
+            self.optimiser.arrive(
+                _centred(evidence, part), evidence.variance_m2[part], None if start is None else start[part]
+            )
+            for part in _parts(np.arange(len(evidence.xyz)), _ARRIVE)
+        ]
+        held = zip(*(vars(each).values() for _, each in found), strict=True)
+        return np.concatenate([free for free, _ in found]), Held(*map(np.concatenate, held))
 
-    def _shapes(self, passes: Passes, start: Tensor | None) -> tuple[Tensor, Held]:
-        """Where all passes start with the shapes at which those of each pool agree: (M, P), and what holds them.
+    def _one_shape(
+        self, evidence: Evidence, groups: Index, votes: Mask, free: Array, held: Held, pairs: Pairs | None
+    ) -> tuple[Array, Held, Pairs | None]:
+        """The same starts, and what holds rows and pairs, at the shapes upon which the rows of each group agree.
 
-        The shapes are agreed upon by the passes that vote, each of which is fitted by itself first.
+        Rows that vote are fitted by themselves first; without a set of targets, they vote as they are without it.
         """
-        bodies, holds, places, precisions, settled = [], [], [], [], []
-        for chunk in (chunk for chunks in passes.chunks(_CHUNK) for chunk in chunks):
-            targets, variance = passes.given(chunk)
-            free, held = self.optimiser.arrive(targets, variance, _part(start, chunk))
-            voting = np.flatnonzero(passes.votes[chunk])
-            if len(voting) > 0:
-                rows = torch.from_numpy(voting)
-                body = self.optimiser.again(free[rows], targets.rows(rows), held.rows(rows))
-                free[rows] = body.free
-                places.append(chunk[voting])
-                precisions.append(shape_precision(body.factor))
-                settled.append(body.left < self._unfinished)
-            bodies.append(free)
-            holds.append(held)
-        free, held, place = torch.cat(bodies), Held.concatenated(holds), np.concatenate(places)
-        precision, votes = free.new_zeros(len(free), 10, 10), np.zeros(len(free), dtype=bool)
-        precision[torch.from_numpy(place)], votes[place] = torch.cat(precisions), torch.cat(settled).numpy()
-        betas = pooled_betas(free[:, :10], precision, passes.pool, votes, held)
-        return torch.cat((betas, free[:, 10:]), 1), held.at_shape(betas, shared(passes.pool, votes))
+        S, scale = 1 + self.sets.max(), self.config.kernel_scale
+        alone, precision = np.zeros((len(groups), S + 1, 10)), np.zeros((len(groups), S + 1, 10, 10))
+        voting = np.zeros((len(groups), S + 1), dtype=bool)  # all targets come last
+        free, by_priors = free.copy(), self.energy.held_by_priors(len(groups))
+        for part in _parts(np.flatnonzero(votes), _CHUNK):
+            targets, own = _centred(evidence, part), held.rows(part)
+            body = self.optimiser.evaluated(free[part], targets, own)
+            if pairs is not None:
+                body = self.energy.evaluate(body.free, targets, scale, own)
+            _, covariance = body.covariances()
+            free[part], alone[part, S], precision[part, S] = (
+                body.free,
+                body.free[:, :10],
+                np.linalg.inv(covariance),
+            )
+            voting[part, S] = body.left < self._unfinished
+            if pairs is not None:
+                mine = pairs.of_rows(part)
+                mine = mine.part(mine.together)
+                found = fitted_without(self.energy, body, targets, scale, mine, self._plain)
+                place = part[mine.row], mine.group
+                alone[place], precision[place] = found.betas, np.linalg.inv(found.betas_covariance)
+                voting[place] = voting[place[0], S]
+        for number in range(S if pairs is not None else 0):
+            betas = pooled_betas(alone[:, number], precision[:, number], groups, voting[:, number], by_priors)
+            pairs = pairs.at_shape(number, betas, shared(groups, voting[:, number]))
+        settled = shared(groups, voting[:, S])
+        betas = pooled_betas(alone[:, S], precision[:, S], groups, voting[:, S], held)
+        free[settled, :10] = betas[settled]
+        return free, held.at_shape(betas, settled), pairs
 
-    def _fill(self, fit: BodyFit, rows: Index, passes: Passes, parts: list[JointPosterior]) -> None:
-        """Fill `fit`'s `rows` (R,) with what the passes found.
+    def _fill(
+        self,
+        fit: BodyFit,
+        rows: Index,
+        evidence: Evidence,
+        part: Index,
+        body: Evaluated,
+        held: Held,
+        pairs: Pairs | None,
+    ) -> None:
+        """Fill `fit`'s `rows` (R,) of a `part` of the evidence with its bodies, and what they say without some
+        targets.
 
         Rows whose energy a Newton step would still lower, or that are not finite, become NOT_CONVERGED.
         """
-        wider, found, evidence = self._spread[:, None, None], parts[0], passes.evidence
-        unseen = np.all(evidence.root == 0, axis=(-1, -2))[..., None, None]
-        prior_xyz, prior_covariance = left_out_places(passes, *parts)
-        done = found.left < self._unfinished  # NaN is not
+        scale, done = self.config.kernel_scale, body.left < self._unfinished  # NaN is not
+        if pairs is not None:
+            body = self.energy.evaluate(body.free, _centred(evidence, part), scale, held)
+        covariance, _ = body.covariances()
+        prior_xyz, prior_covariance = body.xyz.copy(), covariance.copy()
+        if pairs is not None:
+            mine = pairs.of_rows(part)
+            found = fitted_without(self.energy, body, _centred(evidence, part), scale, mine, self._plain)
+            left_out = mine.without >= 0
+            place = np.broadcast_to(mine.row[:, None], left_out.shape)[left_out], mine.without[left_out]
+            prior_xyz[place], prior_covariance[place] = found.xyz[left_out], found.covariance[left_out]
         done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
-        fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
-        rows, origin = rows[done], evidence.centre[done]
-        fit.put_bodies(
-            rows, self.energy.complete(torch.from_numpy(found.free[done]).to(self.energy.dtype)), origin
-        )
-        fit.joints[rows] = found.xyz[done] + origin[:, None]
-        fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
-        fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
-        fit.prior_covariance[rows] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
-        fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)[done]
+        fit.status[rows[part[~done]]] = FitStatus.NOT_CONVERGED
+        into, part, wider = rows[part[done]], part[done], self._spread[:, None, None]
+        origin, unseen = evidence.centre[part], np.all(evidence.root[part] == 0, axis=(-1, -2))[..., None, None]
+        fit.put_bodies(into, self.energy.complete(body.free[done]), origin)
+        fit.joints[into] = body.xyz[done] + origin[:, None]
+        fit.covariance[into] = np.where(unseen, wider * covariance[done], covariance[done])
+        fit.prior_xyz[into] = prior_xyz[done] + origin[:, None]
+        fit.prior_covariance[into] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
+        fit.residual_m[into] = np.sqrt(body.squared[done].sum(axis=1) / evidence.total_information[part])
 
-    def _starts(self, evidence: Evidence) -> tuple[Tensor, Tensor | None, Mask]:
+    def _starts(self, evidence: Evidence) -> tuple[Array, Array, Mask]:
         """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
 
-        Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held (None:
-        those that the prior expects), and which (R,) are finished.
+        Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held, and
+        which (R,) are finished.
         """
-        passes = Passes.whole(evidence, np.arange(len(evidence.xyz)))
-        found = [self.optimiser.first(*passes.given(chunk), None) for chunk in passes.chunks(_CHUNK)[0]]
-        free, held = torch.cat([body.free for body, _ in found]), Held.concatenated([held for _, held in found])
-        done = torch.cat([body.left < self._unfinished for body, _ in found]).numpy()
+        free, held = self._arrive(evidence, None)
+        done = np.zeros(len(free), dtype=bool)
+        for part in _parts(np.arange(len(free)), _CHUNK):
+            body = self.optimiser.evaluated(free[part], _centred(evidence, part), held.rows(part))
+            free[part], done[part] = body.free, body.left < self._unfinished
         unsettled = np.flatnonzero(~done)
         if self._fallback is not None and len(unsettled) > 0:
-            body, _ = self._fallback.first(*passes.given(unsettled), None)
-            free[unsettled], done[unsettled] = body.free, (body.left < self._unfinished).numpy()
-            if held.angles is not None:
-                held.angles[unsettled] = body.free[:, 13:-3]
+            targets = _centred(evidence, unsettled)
+            found, by_priors = self._plain.arrive(targets, evidence.variance_m2[unsettled])
+            body = self._plain.evaluated(found, targets, by_priors)
+            free[unsettled], done[unsettled] = body.free, body.left < self._unfinished
+            held.angles[unsettled] = body.free[:, 13:-3]
         return free, held.angles, done
 
-    def _start(self, initial: BodyFit, centre: Array) -> Tensor:
+    def _start(self, initial: BodyFit, centre: Array) -> Array:
         """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
-        start = self.energy.parameters(initial, centre).float()
-        start[torch.from_numpy(~initial.ok)] = torch.nan
+        start = self.energy.parameters(initial, centre)
+        start[~initial.ok] = np.nan
         return start
+
+
+def _parts(rows: Index, size: int) -> list[Index]:
+    """Rows in parts of at most `size`."""
+    return [rows[at : at + size] for at in range(0, len(rows), size)]
+
+
+def _centred(evidence: Evidence, rows: Index) -> WhitenedTargets:
+    """The targets of some rows, around each row's own centre."""
+    return WhitenedTargets(evidence.xyz[rows] - evidence.centre[rows, None], evidence.root[rows])
 
 
 def evenly(groups: Index, count: int) -> Mask:
@@ -283,8 +316,3 @@ def evenly(groups: Index, count: int) -> Mask:
     chosen = np.zeros(len(order), dtype=bool)
     chosen[order] = (rank == 0) | (np.diff(number, prepend=0) != 0)
     return chosen
-
-
-def _part(start: Tensor | None, chunk: Index) -> Tensor | None:
-    """The starts of a chunk: passes that leave targets out have none, an earlier body has seen them."""
-    return None if start is None or chunk[0] >= len(start) else start[chunk]

@@ -1,25 +1,17 @@
 """How one body is fitted to one row of targets: by a network's steps and a polish, or by Levenberg-Marquardt.
 
-Both have `arrive`, from which `again` is short, and `first`, the two in one; rows are independent.
+Both have `arrive`, from which `evaluated` is short, and `again`, held by something else; rows are independent.
 """
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from shapepose_fg.body.fitting.descent import BodyState, DescentTargets, LearnedDescent
-from shapepose_fg.body.fitting.energy import (
-    BodyEnergy,
-    Evaluated,
-    Held,
-    Linearisation,
-    WhitenedTargets,
-    robust_weight,
-)
+from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent
+from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
+from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
@@ -35,6 +27,8 @@ MAX_ITERATIONS = 40
 """Levenberg-Marquardt steps, refused ones included."""
 TOLERANCE = 1e-2
 """A row is done when a step lowers its energy (in squared standard deviations) by less."""
+_NOBODY = 50.0
+"""A beta that the network gave to a row on which it went wild: the plain optimiser fits that."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
 
 
@@ -44,7 +38,7 @@ class NetworkDescent:
     def __init__(self, energy: BodyEnergy, weights: FitterWeights, kernel_scale: float, polish_steps: int):
         model = energy.model
         self._energy, self._frame, self._polish_steps = energy, weights.frame, polish_steps
-        self._scale, self._slots = torch.tensor(kernel_scale), slots(model.keypoint_names)
+        self._scale, self._slots = kernel_scale, slots(model.keypoint_names)
         # The body's own points where there are no targets; offsets are the detector's.
         rest = [place for place in range(len(BODY_POINTS)) if place not in self._slots]
         moved = model.keypoint_offsets.xyz_m.any()
@@ -54,56 +48,50 @@ class NetworkDescent:
             others=body.points.part(rest) if rest else None, offsets=model.offsets_of_keypoints,
         )  # fmt: skip
 
-    def arrive(
-        self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
-    ) -> tuple[Tensor, Held]:
+    def arrive(self, targets: WhitenedTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
         """Parameters (B, P) where the network arrives from the closed form on, and that bodies are held there.
 
         `variance` (B, J) is that of each target, infinite where it is not known in all directions, m².
         """
-        frame, count, sigma2 = self._frame, len(targets.xyz), torch.from_numpy(variance).float()
-        rotation, origin = frame.place(targets.xyz, sigma2, self._slots)
+        frame, count = self._frame, len(targets.xyz)
+        rotation, origin = frame.place(targets.xyz, variance, self._slots)
         inside = (targets.xyz - origin[:, None]) @ rotation
         # What is hardly seen is left to the polish: the pull of a guess that had seen it would count it twice.
-        well_seen = sigma2 < WELL_SEEN_M**2
+        well_seen = variance < WELL_SEEN_M**2
         well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
         root = targets.root @ rotation[:, None] * well_seen[..., None, None]
-        state = BodyState(
-            torch.zeros(count, 10), frame.local.expand(count, 24, 3, 3), frame.transl.expand(count, 3)
-        )
-        *_, arrived = self._descent.unroll(state, DescentTargets(inside, root.mT @ root))
+        local = np.broadcast_to(frame.local, (count, 24, 3, 3))
+        state = BodyState(np.zeros((count, 10)), local, np.broadcast_to(frame.transl, (count, 3)))
+        with np.errstate(all="ignore"):  # who goes wild ends in NaN, and is fitted by the other
+            *_, arrived = self._descent.unroll(state, inside, root.swapaxes(-1, -2) @ root)
         # From the person's frame to that of the targets.
         orient = log_so3(rotation @ arrived.local[:, 0])
-        angles = log_so3(arrived.local[:, 1:]).flatten(1)[:, self._energy.angles]
+        angles = log_so3(arrived.local[:, 1:]).reshape(count, -1)[:, self._energy.angles]
         # The root turns about the pelvis: R (v - p) + p + transl, with p where betas put it in the T-pose.
         pelvis = self._energy.model.rest_pelvis(arrived.betas)
-        transl = (rotation @ (pelvis + arrived.transl)[..., None]).squeeze(-1) + origin - pelvis
-        free = torch.cat((arrived.betas, orient, angles, transl), 1)
-        return free, Held(arrived.betas, torch.ones(count, 1), angles)
+        transl = (rotation @ (pelvis + arrived.transl)[..., None])[..., 0] + origin - pelvis
+        free = np.concatenate((arrived.betas, orient, angles, transl), 1)
+        free[~(np.abs(arrived.betas).max(axis=1) < _NOBODY)] = np.nan
+        return free, Held(arrived.betas, np.ones(count), angles)
 
-    def first(
-        self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
-    ) -> tuple[Evaluated, Held]:
-        """Bodies (B) after a short polish from where the network arrived, and what they were held by."""
-        arrived, held = self.arrive(targets, variance, start)
-        return self.again(arrived, targets, held), held
+    def evaluated(self, free: Array, targets: WhitenedTargets, held: Held) -> Evaluated:
+        """The bodies of `arrive` (B, P), polished."""
+        return self.again(free, targets, held)
 
-    def again(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
+    def again(self, free: Array, targets: WhitenedTargets, held: Held) -> Evaluated:
         """Gauss-Newton steps from `free` (B, P); one that does not lower a row's energy is not taken.
 
         The energy is linearised before each step. After the last, only rows are in which the weight of some joint
-        changed: covariances hardly change otherwise, and a linearisation is a quarter of the whole cost.
+        changed: covariances hardly change otherwise, and a linearisation is a third of the whole cost.
         """
         scale, energy = self._scale, self._energy
         body = energy.evaluate(free, targets, scale, held)
         for _ in range(self._polish_steps):
-            before = robust_weight(body.here.squared, scale)
+            before = robust_weight(body.squared, scale)
             there = energy.retract(body.free, body.step)
-            slope = energy.slope(there, targets, scale, held)
-            better = slope.energy(scale) < body.here.energy(scale)  # a step into NaN is not
-            body = body.moved(better, there, slope)
-            change = (robust_weight(body.here.squared, scale) - before).abs().amax(1)
-            stale = torch.nonzero(change > STALE)[:, 0]
+            slope = energy.linearise(there, targets, scale, held, slope_only=True)
+            body.move(slope.energy < body.energy, there, slope)  # a step into NaN is not better
+            stale = np.flatnonzero(np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE)
             if len(stale) > 0:
                 body.put(stale, energy.evaluate(body.free[stale], targets.rows(stale), scale, held.rows(stale)))
         return body
@@ -113,76 +101,77 @@ class LevenbergMarquardt:
     """The optimum of the energy from a closed form: no training, any body."""
 
     def __init__(self, energy: BodyEnergy, prior: PosePrior, kernel_scale: float):
-        self._energy, self._kernel_scale = energy, kernel_scale
+        self._energy, self._scale = energy, kernel_scale
         self._slots = slots(energy.model.keypoint_names)
         self._frame = PersonFrame.of_angles(energy.model, prior.mean, prior.covariance)
-        self._mean_angles = torch.from_numpy(prior.mean[energy.angles])
+        self._mean_angles = prior.mean[energy.angles]
 
-    def arrive(
-        self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
-    ) -> tuple[Tensor, Held]:
+    def arrive(self, targets: WhitenedTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
         """The optimum (B, P), each with its own shape, held by the priors; from `start` where that is no NaN."""
-        rotation, pelvis = self._frame.place(targets.xyz.double(), torch.from_numpy(variance), self._slots)
-        angles = self._mean_angles.expand(len(variance), -1)
-        parts = (angles.new_zeros(len(variance), 10), log_so3(rotation), angles, pelvis + self._frame.transl)
-        free, warm = torch.cat(parts, 1).float(), np.zeros(len(variance), dtype=bool)
+        rotation, pelvis = self._frame.place(targets.xyz, variance, self._slots)
+        count = len(variance)
+        angles = np.broadcast_to(self._mean_angles, (count, len(self._mean_angles)))
+        parts = (np.zeros((count, 10)), log_so3(rotation), angles, pelvis + self._frame.transl)
+        free, warm = np.concatenate(parts, 1), np.zeros(count, dtype=bool)
         if start is not None:
-            warm = ~start.isnan().any(1).numpy()
-            free = torch.where(start.isnan(), free, start)
-        held = Held.by_priors(len(free))
+            warm = ~np.isnan(start).any(axis=1)
+            free = np.where(np.isnan(start), free, start)
+        held = self._energy.held_by_priors(count)
         return self.solve(free, targets, warm, held), held
 
-    def first(
-        self, targets: WhitenedTargets, variance: Array, start: Tensor | None = None
-    ) -> tuple[Evaluated, Held]:
-        """The bodies of `arrive`, evaluated."""
-        free, held = self.arrive(targets, variance, start)
-        return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held), held
+    def evaluated(self, free: Array, targets: WhitenedTargets, held: Held) -> Evaluated:
+        """The bodies of `arrive` (B, P), and the energy around them."""
+        return self._energy.evaluate(free, targets, self._scale, held)
 
-    def again(self, free: Tensor, targets: WhitenedTargets, held: Held) -> Evaluated:
+    def again(self, free: Array, targets: WhitenedTargets, held: Held, tolerance: float = TOLERANCE) -> Evaluated:
         """The optimum from `free` (B, P) on, held by something else."""
-        free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
-        return self._energy.evaluate(free, targets, torch.tensor(self._kernel_scale), held)
+        free = self.solve(free, targets, np.ones(len(free), dtype=bool), held, tolerance)
+        return self.evaluated(free, targets, held)
 
-    def solve(self, free: Tensor, targets: WhitenedTargets, warm: Mask, held: Held) -> Tensor:
+    def solve(
+        self, free: Array, targets: WhitenedTargets, warm: Mask, held: Held, tolerance: float = TOLERANCE
+    ) -> Array:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
-        energy, kernel_scale = self._energy, self._kernel_scale
-        result, rows = free.clone(), torch.arange(len(free))
-        widening = torch.where(torch.from_numpy(warm), 0, ANNEAL_STEPS)[:, None]
-        damping = torch.full((len(free),), _DAMPING_START)
-        here = energy.linearise(free, targets, kernel_scale * 2.0**widening, held)
+        energy, P, rows = self._energy, free.shape[1], np.arange(len(free))
+        result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)
+        widening = np.where(warm, 0, ANNEAL_STEPS)
+        here = energy.linearise(free, targets, self._scale * 2.0**widening, held, vectors=False)
         for _ in range(MAX_ITERATIONS):
-            step, promised = _damped_step(here, damping)
+            step, promised = np.empty(free.shape), np.empty(len(free))
+            solved(here.system.copy(), damping, step, promised)
+            promised += np.einsum("bi,bii,bi,b->b", step, here.system[:, :P], step, damping, optimize=True)
             trial = energy.retract(free, step)
-            scale, annealed = kernel_scale * 2.0**widening, widening[:, 0] == 0
-            widening = (widening - 1).clamp_min(0)
-            there = energy.linearise(trial, targets, kernel_scale * 2.0**widening, held)
-            gain = here.energy(scale) - there.energy(scale)
+            scale, annealed = self._scale * 2.0**widening, widening == 0
+            there = energy.linearise(trial, targets, scale, held, vectors=False)
+            gain = here.energy - there.energy
             better = gain > 0  # a step into NaN is not
-            here, free = here.replaced(better, there), torch.where(better[:, None], trial, free)
+            for old, new in zip((free, *here), (trial, *there), strict=True):
+                old[better] = new[better]
             damping = _next_damping(damping, better, gain / promised)
-            settled = torch.where(better, gain, promised) < TOLERANCE
+            settled = np.where(better, gain, promised) < tolerance
             going = ~(annealed & settled) & (damping < _DAMPING_MAX)
-            if bool(going.all()):
+            narrower = np.flatnonzero(going & (widening > 0))
+            if len(narrower) > 0:
+                widening[narrower] -= 1
+                some = targets.rows(narrower), self._scale * 2.0 ** widening[narrower], held.rows(narrower)
+                for old, new in zip(here, energy.linearise(free[narrower], *some, vectors=False), strict=True):
+                    old[narrower] = new
+            if going.all():
                 continue
             result[rows[~going]] = free[~going]
             rows, free, damping, widening = rows[going], free[going], damping[going], widening[going]
-            here, targets, held = here.rows(going), targets.rows(going), held.rows(going)
+            here, targets, held = (
+                type(here)(*(each[going] for each in here)),
+                targets.rows(going),
+                held.rows(going),
+            )
             if len(rows) == 0:
                 break
         result[rows] = free
         return result
 
 
-def _damped_step(here: Linearisation, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """The Levenberg-Marquardt step (B, P), and the fall in energy (B,) that the linearisation promises."""
-    added = damping[:, None] * torch.diagonal(here.hessian, dim1=-2, dim2=-1)
-    factor, _ = torch.linalg.cholesky_ex(here.hessian + torch.diag_embed(added))
-    step = -torch.cholesky_solve(here.gradient[..., None], factor).squeeze(-1)
-    return step, (step * (added * step - here.gradient)).sum(-1)
-
-
-def _next_damping(damping: Tensor, better: Tensor, ratio: Tensor) -> Tensor:
+def _next_damping(damping: Array, better: Mask, ratio: Array) -> Array:
     """Nielsen's rule for steps that gained `ratio` of what they promised; eightfold after a refusal."""
-    factor = torch.where(better, (1 - (2 * ratio - 1) ** 3).clamp(0.1, 2.0), 8.0)
-    return (damping * factor).clamp(_DAMPING_MIN, _DAMPING_MAX)
+    factor = np.where(better, np.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0), 8.0)
+    return np.clip(damping * factor, _DAMPING_MIN, _DAMPING_MAX)

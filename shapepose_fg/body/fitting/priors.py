@@ -145,19 +145,16 @@ def longest_bones(skeleton: Skeleton) -> Array:
     The 99.9 % quantile over bodies within three standard deviations of shape, in poses drawn from the pose prior,
     with a margin. Joints that the body does not have get the longest of all.
     """
-    import torch  # not before bodies are asked for: who only imports this needs none
-
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 
     known = [j for j, name in enumerate(skeleton.joints) if name in BODY_POINTS]
     model = BodyModel.default().with_keypoints(tuple(skeleton.joints[j] for j in known))
     rng = np.random.default_rng(0)
-    pose = torch.from_numpy(PosePrior.default().sample(rng, _SAMPLES)).to(model.dtype)
-    betas = torch.from_numpy(rng.standard_normal((_SAMPLES, 10)).clip(-3, 3)).to(model.dtype)
-    still = pose.new_zeros(_SAMPLES, 3)
+    pose = PosePrior.default().sample(rng, _SAMPLES)
+    betas = rng.standard_normal((_SAMPLES, 10)).clip(-3, 3)
+    still = np.zeros((_SAMPLES, 3))
     xyz = np.full((_SAMPLES, len(skeleton), 3), np.nan)
-    with torch.inference_mode():
-        xyz[:, known] = model.keypoints(BodyParameters(betas, still, pose, still)).numpy()
+    xyz[:, known] = model.keypoints(BodyParameters(betas, still, pose, still))
     parents = np.array(skeleton.parents)
     length = np.quantile(np.linalg.norm(xyz - xyz[:, parents], axis=-1), 0.999, axis=0)
     longest = np.where(np.isfinite(length), _MARGIN * length + _NOISE_M, _UNKNOWN_M)

@@ -9,7 +9,6 @@ is then the nearest one that the model has *of the same stature*.
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
@@ -23,10 +22,8 @@ _POINT_M = 0.02
 
 def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
     """All points of the mean body's T-pose from its pelvis, (150,), metres, and how betas move them, (150, 10)."""
-    body = body.to(torch.float64)
-    still = torch.eye(3, dtype=torch.float64).expand(11, 24, 3, 3)
-    betas = torch.cat((torch.zeros(1, 10), torch.eye(10))).double()
-    xyz = body.points.positions(still, betas, betas.new_zeros(11, 3), body.points.feature(still)).numpy()
+    betas = np.concatenate((np.zeros((1, 10)), np.eye(10)))
+    xyz = body.points.positions(np.tile(np.eye(3), (11, 24, 1, 1)), betas, np.zeros((11, 3)))
     xyz = (xyz - xyz[:, [BODY_POINTS.index("pelvis")]]).reshape(11, -1)
     return xyz[0], (xyz[1:] - xyz[0]).T
 

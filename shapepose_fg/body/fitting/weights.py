@@ -7,12 +7,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from safetensors.numpy import save
 
-from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
+from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
@@ -33,12 +32,12 @@ class FitterWeights:
     """A trained update network and the frame in which it works."""
 
     network: UpdateNetwork
-    """In evaluation mode."""
+    """What it has learnt."""
     frame: PersonFrame
     """Mean body and mean pose from which it starts."""
     body: str
     """Fingerprint of the body model it was trained on (see `fingerprint`)."""
-    spread: Tensor = field(default_factory=lambda: torch.ones(len(BODY_POINTS)))
+    spread: Array = field(default_factory=lambda: np.ones(len(BODY_POINTS)))
     """(K,) by which the variance of each of `BODY_POINTS` without its own target is multiplied: calibrated."""
     card: dict[str, str] = field(default_factory=dict)
     """What it was trained on, by which command, and its errors."""
@@ -47,7 +46,7 @@ class FitterWeights:
 
     def __post_init__(self) -> None:
         if self.spread.shape != (len(BODY_POINTS),):
-            raise ValueError(f"spread must be ({len(BODY_POINTS)},), got {tuple(self.spread.shape)}")
+            raise ValueError(f"spread must be ({len(BODY_POINTS)},), got {self.spread.shape}")
 
     @staticmethod
     @cache
@@ -65,7 +64,7 @@ class FitterWeights:
 
     def spread_of(self, names: tuple[str, ...]) -> Array:
         """(J,) `spread` of the keypoints with these names."""
-        return self.spread[list(slots(names))].double().numpy()
+        return np.asarray(self.spread[list(slots(names))], dtype=np.float64)
 
     @classmethod
     def load(cls, path: Path) -> "FitterWeights":
@@ -75,27 +74,23 @@ class FitterWeights:
             raise InputError(
                 f"{path}: not weights of the learned fitter; make some with shapepose-fg train-fitter"
             )
-        if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
+        if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
             raise InputError(f"{path}: the weights hold NaN or infinity; train or fetch them again")
         try:
             spread = tensors.pop(_SPREAD)
-            with torch.device("meta"):  # what the file says of the size takes no memory
-                network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])))
-            learnt = {name: value.float() for name, value in tensors.items() if not name.startswith(_FRAME)}
-            network.load_state_dict(learnt, assign=True)
+            learnt = {name: value for name, value in tensors.items() if not name.startswith(_FRAME)}
+            network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])), learnt)
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
-            network.requires_grad_(False)
-            return cls(network.eval(), frame, about["body"], spread, json.loads(about["card"]), path)
+            return cls(network, frame, about["body"], spread, json.loads(about["card"]), path)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             why = f"weights of another version of the fitter ({str(error).splitlines()[0]}); train them anew"
             raise InputError(f"{path}: {why}") from error
 
     def save(self, path: Path) -> None:
         """Write a safetensors file."""
-        tensors: dict[str, Tensor] = dict(self.network.state_dict())
-        tensors[_SPREAD] = self.spread
+        tensors = {**self.network.weights, _SPREAD: self.spread}
         tensors |= {_FRAME + name: value for name, value in vars(self.frame).items()}
-        tensors = {name: value.contiguous() for name, value in tensors.items()}
+        tensors = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in tensors.items()}
         about = {
             "format": _FORMAT,
             "network": json.dumps(asdict(self.network.config)),
@@ -113,10 +108,10 @@ class FitterWeights:
             )
 
 
-def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.floating]]]:
     """Texts and tensors of a safetensors file; InputError where it cannot be read."""
     try:
-        with open_regular(path, _CURE), safe_open(path, framework="pt") as file:
+        with open_regular(path, _CURE), safe_open(path, framework="np") as file:
             names = list(file.keys())
             for name in names:
                 kind = file.get_slice(name).get_dtype()

@@ -5,16 +5,13 @@ blend shapes (where the file has any), linear blend skinning.
 The model's own frame: metres, y up, facing +z, T-pose.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import exp_so3
@@ -30,38 +27,39 @@ _SHAPES = {"betas": (NUM_BETAS,), "global_orient": (3,), "body_pose": (23, 3), "
 
 @dataclass(frozen=True)
 class BodyParameters:
-    """Shape and pose of B bodies, with SMPL's meaning; all four of one floating point type."""
+    """Shape and pose of B bodies, with SMPL's meaning."""
 
-    betas: Tensor
+    betas: Array
     """(B, 10) shape, in standard deviations over adults."""
-    global_orient: Tensor
+    global_orient: Array
     """(B, 3) axis-angle in radians of the pelvis, from the model's frame (y up, facing +z) to the world."""
-    body_pose: Tensor
+    body_pose: Array
     """(B, 23, 3) axis-angle in radians of each further joint, relative to its parent, in SMPL's order."""
-    transl: Tensor
+    transl: Array
     """(B, 3) metres, added to every vertex after posing; not the place of the pelvis."""
 
     def __post_init__(self) -> None:
         for name, shape in _SHAPES.items():
-            value = getattr(self, name)
-            if value.shape != (len(self.betas), *shape) or value.dtype != self.betas.dtype:
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (len(self.betas), *shape):
                 expected = ", ".join(map(str, ("B", *shape)))
                 raise ValueError(
-                    f"{name} must be ({expected}) with the B and dtype of betas {tuple(self.betas.shape)} "
-                    f"{self.betas.dtype}, got {tuple(value.shape)} {value.dtype}"
+                    f"{name} must be ({expected}) with the B of betas {self.betas.shape}, got {value.shape}"
                 )
+            object.__setattr__(self, name, value)
 
     @classmethod
-    def zeros(cls, batch: int, dtype: torch.dtype = torch.float32) -> "BodyParameters":
+    def zeros(cls, batch: int) -> "BodyParameters":
         """`batch` mean bodies in T-pose."""
-        return cls(**{name: torch.zeros(batch, *shape, dtype=dtype) for name, shape in _SHAPES.items()})
+        return cls(**{name: np.zeros((batch, *shape)) for name, shape in _SHAPES.items()})
 
     def __len__(self) -> int:
         return len(self.betas)
 
-    def to(self, dtype: torch.dtype) -> "BodyParameters":
-        """The same parameters in another floating point type."""
-        return BodyParameters(**{field.name: getattr(self, field.name).to(dtype) for field in fields(self)})
+    @property
+    def local(self) -> Array:
+        """(B, 24, 3, 3) rotations relative to the parents."""
+        return exp_so3(np.concatenate((self.global_orient[:, None], self.body_pose), 1))
 
 
 class BodyModel:
@@ -81,7 +79,6 @@ class BodyModel:
     def __init__(
         self,
         arrays: SmplArrays,
-        dtype: torch.dtype = torch.float32,
         offsets: KeypointOffsets | None = None,
         keypoint_names: tuple[str, ...] = BODY_25.joints,
         contracted: SkinnedPoints | None = None,
@@ -92,14 +89,12 @@ class BodyModel:
         """
         self.arrays = arrays
         """What the file held, in float64."""
-        self.dtype = dtype
-        """Floating point type of parameters and results."""
         self.keypoint_offsets = KeypointOffsets.identity() if offsets is None else offsets
         """Where the detector's joints lie against the body's; in `keypoints`, not in `vertices` and `joints`."""
         self.keypoint_names = keypoint_names
         """(K,) names of the keypoints, some of `BODY_POINTS`."""
         self._contracted = _contract(arrays) if contracted is None else contracted
-        self.points = _moved(self._contracted, self.keypoint_offsets).to(dtype)
+        self.points = _moved(self._contracted, self.keypoint_offsets)
         """All `BODY_POINTS`: BODY_25's keypoints, the top of the head, the 24 joints."""
         self.keypoint_points = self.points.part(list(slots(keypoint_names)))
         """The keypoints (K)."""
@@ -109,7 +104,7 @@ class BodyModel:
     @staticmethod
     @cache
     def default() -> "BodyModel":
-        """The open body that ships with the package, float32; read once."""
+        """The open body that ships with the package; read once."""
         return BodyModel.load(_DEFAULT_FILE)
 
     @classmethod
@@ -121,10 +116,6 @@ class BodyModel:
         """
         return cls(read_smpl_file(Path(path), keypoint_regressor))
 
-    def to(self, dtype: torch.dtype) -> "BodyModel":
-        """The same model computing in another floating point type."""
-        return self if dtype == self.dtype else self._with(dtype=dtype)
-
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "BodyModel":
         """The same body with its keypoints where a detector puts them; takes the place of offsets it has."""
         return self._with(offsets=offsets)
@@ -134,7 +125,7 @@ class BodyModel:
         return self._with(keypoint_names=names)
 
     def _with(self, **changed: Any) -> "BodyModel":
-        kept = {"dtype": self.dtype, "offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
+        kept = {"offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
         return BodyModel(self.arrays, **(kept | changed), contracted=self._contracted)
 
     @property
@@ -147,79 +138,59 @@ class BodyModel:
         """Vertices of the mesh, Nv."""
         return len(self.arrays.template)
 
-    def vertices(self, parameters: BodyParameters, only: Index | None = None) -> Tensor:
+    def vertices(self, parameters: BodyParameters, only: Index | None = None) -> Array:
         """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
 
         The only thing here whose cost grows with the mesh. ValueError where `only` has other than one axis.
         """
         mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
-        local, rotations = self._rotations(parameters)
-        shaped = mesh.template + (parameters.betas @ mesh.shapes).unflatten(-1, (-1, 3))
+        B, local, betas = len(parameters), parameters.local, parameters.betas
+        rotations = accumulate(local)
+        shaped = mesh.template + (betas @ mesh.shapes).reshape(B, -1, 3)
         if mesh.pose_blend is not None:
-            bent = (local[:, 1:] - torch.eye(3, dtype=self.dtype)).flatten(1)
-            shaped = shaped + (bent @ mesh.pose_blend).unflatten(-1, (-1, 3))
-        rest = mesh.rest_joints + (parameters.betas @ mesh.rest_joint_shapes).unflatten(-1, (-1, 3))
-        posed = self._joints.positions(rotations, parameters.betas, parameters.transl, None)
-        shift = posed - (rotations @ rest[..., None]).squeeze(-1)
-        transforms = torch.cat((rotations, shift[..., None]), -1).flatten(2)  # (B, 24, 12)
-        blended = (mesh.weights @ transforms).unflatten(-1, (3, 4))
-        return (blended[..., :3] @ shaped[..., None]).squeeze(-1) + blended[..., 3]
+            bent = (local[:, 1:] - np.eye(3)).reshape(B, -1)
+            shaped = shaped + (bent @ mesh.pose_blend).reshape(B, -1, 3)
+        rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(B, -1, 3)
+        shift = self.joints(parameters) - (rotations @ rest[..., None])[..., 0]
+        posed = mesh.weights @ shift
+        for axis in range(3):  # of the vertex at rest
+            posed += (mesh.weights @ rotations[..., axis]) * shaped[..., axis, None]
+        return np.asarray(posed)
 
-    def joints(self, parameters: BodyParameters) -> Tensor:
+    def joints(self, parameters: BodyParameters) -> Array:
         """(B, 24, 3) SMPL's joints, metres, without the mesh."""
-        _, rotations = self._rotations(parameters)
-        return self._joints.positions(rotations, parameters.betas, parameters.transl, None)
+        return self._joints.positions(parameters.local, parameters.betas, parameters.transl)
 
-    def keypoints(self, parameters: BodyParameters) -> Tensor:
+    def keypoints(self, parameters: BodyParameters) -> Array:
         """(B, K, 3) keypoints, metres: keypoint regressor x vertices, without the mesh."""
-        local, rotations = self._rotations(parameters)
-        points = self.keypoint_points
-        return points.positions(rotations, parameters.betas, parameters.transl, points.feature(local))
+        return self.keypoint_points.positions(parameters.local, parameters.betas, parameters.transl)
 
-    @torch.no_grad()
-    def keypoints_with_jacobian(
-        self, parameters: BodyParameters, tangents: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Keypoints (B, K, 3) and their analytic Jacobian (B, K, 3, 85); carries no autograd graph.
+    def keypoints_with_jacobian(self, parameters: BodyParameters) -> tuple[Array, Array]:
+        """Keypoints (B, K, 3) and their analytic Jacobian (B, K, 3, 85).
 
         Columns: betas 10, global_orient 3, body_pose 23 x 3, transl 3. A rotation's columns are its right tangent
-        `R <- R exp(delta)`, the rotation being the joint's own, relative to its parent; with `tangents` T
-        (B, 24, 3, 3) it is `R <- R exp(T delta)`: with T its right Jacobian the columns are those of axis-angles.
+        `R <- R exp(delta)`, the rotation being the joint's own, relative to its parent.
         """
-        local, rotations = self._rotations(parameters)
-        return self.keypoint_points.positions_with_jacobian(
-            rotations, parameters.betas, parameters.transl, local, self.keypoint_points.feature(local), tangents
-        )
+        points = self.keypoint_points
+        return points.positions_with_jacobian(parameters.local, parameters.betas, parameters.transl)
 
     @property
-    def offsets_of_keypoints(self) -> tuple[Tensor, Tensor] | None:
+    def offsets_of_keypoints(self) -> tuple[Array, Index] | None:
         """What the keypoint offsets add to each keypoint (K, 3) and on which bone (K,); None where nothing."""
         if not self.keypoint_offsets.xyz_m.any():
             return None
-        xyz = torch.zeros(len(self.points.root), 3, dtype=self.dtype)
-        bones = torch.zeros(len(xyz), dtype=torch.long)
-        xyz[: len(BODY_25)] = torch.from_numpy(self.keypoint_offsets.xyz_m).to(self.dtype)
-        bones[: len(BODY_25)] = torch.from_numpy(self.keypoint_offsets.bones)
+        xyz, bones = np.zeros((len(self.points.root), 3)), np.zeros(len(self.points.root), dtype=np.intp)
+        xyz[: len(BODY_25)], bones[: len(BODY_25)] = self.keypoint_offsets.xyz_m, self.keypoint_offsets.bones
         chosen = list(slots(self.keypoint_names))
         return xyz[chosen], bones[chosen]
 
-    def rest_pelvis(self, betas: Tensor) -> Tensor:
+    def rest_pelvis(self, betas: Array) -> Array:
         """(B, 3) the pelvis of bodies (B, 10) in the T-pose, metres: what `global_orient` turns about."""
-        return self._joints.root[0] + betas @ self._joints.root_shape[:, 0]
+        return np.asarray(self._joints.root[0] + betas @ self._joints.root_shape[:, 0])
 
-    def bone_rotations(self, parameters: BodyParameters) -> Tensor:
+    def bone_rotations(self, parameters: BodyParameters) -> Array:
         """(B, 24, 3, 3) world from bone: in the T-pose every bone's frame is the model's own."""
-        return self._rotations(parameters)[1]
-
-    def _rotations(self, parameters: BodyParameters) -> tuple[Tensor, Tensor]:
-        """Local and world rotations of the joints, (B, 24, 3, 3) each."""
-        if parameters.betas.dtype != self.dtype:
-            raise ValueError(
-                f"parameters are {parameters.betas.dtype}, the model computes in {self.dtype}: "
-                "convert one of them with .to(dtype)"
-            )
-        local = exp_so3(torch.cat((parameters.global_orient[:, None], parameters.body_pose), 1))
-        return local, accumulate(local)
+        return accumulate(parameters.local)
 
     def _part_of_mesh(self, only: Index) -> "_Mesh":
         """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
@@ -238,12 +209,12 @@ class BodyModel:
         rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes
         blend = arrays.pose_blend
         return _Mesh(
-            template=torch.from_numpy(arrays.template).to(self.dtype),
-            shapes=torch.from_numpy(shapes.reshape(NUM_BETAS, -1)).to(self.dtype),
-            pose_blend=None if blend is None else torch.from_numpy(blend.reshape(-1, 207).T.copy()).to(self.dtype),
-            rest_joints=torch.from_numpy(rest).to(self.dtype),
-            rest_joint_shapes=torch.from_numpy(rest_shapes.reshape(NUM_BETAS, -1)).to(self.dtype),
-            weights=torch.from_numpy(arrays.weights).to(self.dtype),
+            template=arrays.template,
+            shapes=shapes.reshape(NUM_BETAS, -1),
+            pose_blend=None if blend is None else blend.reshape(-1, 207).T.copy(),
+            rest_joints=rest,
+            rest_joint_shapes=rest_shapes.reshape(NUM_BETAS, -1),
+            weights=arrays.weights,
         )
 
 
@@ -251,50 +222,37 @@ class BodyModel:
 class _Mesh:
     """What only the vertices need."""
 
-    template: Tensor
+    template: Array
     """(Nv, 3) metres."""
-    shapes: Tensor
+    shapes: Array
     """(10, Nv * 3) metres per unit of each beta."""
-    pose_blend: Tensor | None
+    pose_blend: Array | None
     """(207, Nv * 3) metres per unit of each entry of R - I."""
-    rest_joints: Tensor
+    rest_joints: Array
     """(24, 3) metres."""
-    rest_joint_shapes: Tensor
+    rest_joint_shapes: Array
     """(10, 24 * 3) metres per unit of each beta."""
-    weights: Tensor
+    weights: Array
     """(Nv, 24) skinning weights."""
 
     def part(self, vertices: Index) -> "_Mesh":
         """What some of the vertices need."""
-        rows = torch.from_numpy(vertices)
-        blend = self.pose_blend
+        columns = (3 * vertices[:, None] + np.arange(3)).ravel()
         return replace(
             self,
-            template=self.template[rows],
-            shapes=self.shapes.unflatten(1, (-1, 3))[:, rows].flatten(1),
-            pose_blend=None if blend is None else blend.unflatten(1, (-1, 3))[:, rows].flatten(1),
-            weights=self.weights[rows],
+            template=self.template[vertices],
+            shapes=self.shapes[:, columns],
+            pose_blend=None if self.pose_blend is None else self.pose_blend[:, columns],
+            weights=self.weights[vertices],
         )
 
 
-def _tree_levels() -> Iterator[tuple[Tensor, Tensor]]:
-    """Joints level by level below the root, and their parents' places in the level above."""
-    level = [0]
-    while children := [j for j in range(1, len(SMPL_PARENTS)) if SMPL_PARENTS[j] in level]:
-        yield torch.tensor(children), torch.tensor([level.index(SMPL_PARENTS[j]) for j in children])
-        level = children
-
-
-_LEVELS = list(_tree_levels())
-_FROM_LEVEL_ORDER = torch.cat((torch.zeros(1, dtype=torch.long), *(joints for joints, _ in _LEVELS))).argsort()
-
-
-def accumulate(local: Tensor) -> Tensor:
+def accumulate(local: Array) -> Array:
     """World rotations of SMPL's bones from those relative to their parents; (B, 24, 3, 3) both."""
-    levels = [local[:, :1]]
-    for joints, parents_in_level in _LEVELS:  # tensors: lists would be converted each time
-        levels.append(levels[-1].index_select(1, parents_in_level) @ local.index_select(1, joints))
-    return torch.cat(levels, 1).index_select(1, _FROM_LEVEL_ORDER)
+    world = local.copy()
+    for bone in range(1, len(SMPL_PARENTS)):  # parents come before their children
+        world[:, bone] = world[:, SMPL_PARENTS[bone]] @ local[:, bone]
+    return world
 
 
 def _contract(arrays: SmplArrays) -> SkinnedPoints:
@@ -324,6 +282,6 @@ def _regressed(arrays: SmplArrays, regressor: Array, joints: Array) -> SkinnedPo
 
 def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
     """`BODY_POINTS`, BODY_25's a constant offset away on one bone each: x_k + R_b o_k, so d_kb + o_k."""
-    moved = points.offsets.clone()
-    moved[torch.arange(len(offsets.bones)), :, torch.from_numpy(offsets.bones)] += torch.from_numpy(offsets.xyz_m)
+    moved = points.offsets.copy()
+    moved[np.arange(len(offsets.bones)), :, offsets.bones] += offsets.xyz_m
     return replace(points, offsets=moved)

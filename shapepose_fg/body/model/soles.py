@@ -1,7 +1,6 @@
 """Bodies on a floor: the lowest point of each foot, and how what sinks gets out of it."""
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -16,7 +15,7 @@ _BEND_RAD = 0.6
 """So far an ankle is bent for it at the most."""
 _OF_FEET, _BEYOND = 3, 10
 """Of the feet's vertices every third is looked at, of the rest of the skin every tenth, 1 to 3 cm apart."""
-_ROWS = 256
+_ROWS = 8
 """Bodies whose vertices are made at a time."""
 
 Bodies = tuple[Array, Array, Array, Array]
@@ -53,14 +52,13 @@ def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float
     return betas, orient, pose, transl + sunk[:, None] * normal
 
 
-@torch.no_grad()
 def _bends(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> Array:
     """(B, 2, 3) by how much the ankles turn so that the lowest points of the feet come up, as rotation vectors in
     the frame of the shank.
     """
-    parameters = BodyParameters(*(torch.from_numpy(column).to(model.dtype) for column in bodies))
-    ankles = model.joints(parameters)[:, _ANKLES].double().numpy()
-    shanks = model.bone_rotations(parameters)[:, _KNEES].double().numpy()
+    parameters = BodyParameters(*bodies)
+    ankles = model.joints(parameters)[:, _ANKLES]
+    shanks = model.bone_rotations(parameters)[:, _KNEES]
     low = lowest_of_feet(model, bodies, normal)
     sunk = np.maximum(height_m - SINK_M - low @ normal, 0.0)
     arm = low - ankles
@@ -76,12 +74,10 @@ def _lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
     return np.asarray((_vertices(model, bodies, chosen) @ normal).min(axis=1))
 
 
-@torch.no_grad()
 def _vertices(model: BodyModel, bodies: Bodies, only: Index) -> Array:
     """(B, M, 3) some of the vertices."""
-    columns = [torch.from_numpy(column).to(model.dtype) for column in bodies]
     parts = [
-        model.vertices(BodyParameters(*(column[at : at + _ROWS] for column in columns)), only)
-        for at in range(0, len(columns[0]), _ROWS)
+        model.vertices(BodyParameters(*(column[at : at + _ROWS] for column in bodies)), only)
+        for at in range(0, len(bodies[0]), _ROWS)
     ]
-    return torch.cat(parts).double().numpy() if parts else np.zeros((0, len(only), 3))
+    return np.concatenate(parts) if parts else np.zeros((0, len(only), 3))

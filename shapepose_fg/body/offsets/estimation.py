@@ -15,8 +15,6 @@ alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
@@ -24,9 +22,10 @@ from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.sizes import Sizes
+from shapepose_fg.body.kernels.solving import reduce_systems
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
-from shapepose_fg.core.arrays import Real
+from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
 from shapepose_fg.core.skeleton import BODY_25
 
@@ -83,7 +82,7 @@ def learn_offsets(
             fit = fitter.fit_whole(targets)
         if not fit.ok.any():
             break
-        energy = BodyEnergy(model.to(torch.float64), wide)
+        energy = BodyEnergy(model, wide)
         evidence = weigh(targets, config.model_sigma_m)
         model = model.with_keypoint_offsets(_solved(energy, fit, evidence, config.kernel_scale, precision))
     return model.keypoint_offsets
@@ -98,7 +97,7 @@ def _solved(
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
-        seen = WhitenedTargets(torch.from_numpy(centred), torch.from_numpy(evidence.root[part]))
+        seen = WhitenedTargets(centred, evidence.root[part])
         here = _eliminate(energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale)
         hessian, gradient, prior = hessian + here[0], gradient + here[1], prior + here[2] / len(rows)
     count = (np.abs(evidence.root[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
@@ -121,33 +120,36 @@ def _made(xyz_m: Real, precision: Real, count: Real) -> KeypointOffsets:
 
 
 def _eliminate(
-    energy: BodyEnergy, free: Tensor, targets: WhitenedTargets, kernel_scale: float
+    energy: BodyEnergy, free: Array, targets: WhitenedTargets, kernel_scale: float
 ) -> tuple[Real, Real, Real]:
     """Sums over the rows (R, P) `free`, each row's body eliminated.
 
     Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's Hessian (P, P).
     """
-    scale = torch.tensor(kernel_scale, dtype=free.dtype)
-    body = energy.evaluate(free, targets, scale)
-    xyz, jacobian, here = body.here.xyz, body.jacobian, body.here
-    root = robust_weight(here.squared, scale).sqrt()[..., None, None] * targets.root
-    rotations = energy.model.bone_rotations(energy.complete(free))[:, torch.from_numpy(RIDES_ON)]
+    (R, P), K = free.shape, len(BODY_25)
+    linear = energy.linearise(free, targets, kernel_scale, energy.held_by_priors(R))
+    here, jacobian = linear.hessian, linear.jacobian
+    root = np.sqrt(robust_weight(linear.squared, kernel_scale))[..., None, None] * targets.root
+    rotations = energy.model.bone_rotations(energy.complete(free))[:, RIDES_ON]
     by_offset = root @ rotations  # (R, 25, 3, 3), whitened
-    residual = (root @ (targets.xyz - xyz)[..., None]).squeeze(-1)
-    by_body = (root @ jacobian.unflatten(1, xyz.shape[1:])).flatten(1, 2)  # (R, 75, P)
-    prior_hessian = here.hessian - by_body.mT @ by_body
-    prior_gradient = here.gradient + (by_body.mT @ residual.flatten(1)[..., None]).squeeze(-1)
-    crossed = (by_offset.mT @ by_body.unflatten(1, xyz.shape[1:])).flatten(1, 2)
-    both = torch.cat([crossed, -prior_hessian], dim=1)  # (R, 75 + P, P): second derivatives with the body
-    gradient = torch.cat([-(by_offset.mT @ residual[..., None]).flatten(1), -prior_gradient], dim=1)
-    factor = torch.linalg.cholesky(here.hessian)
-    right = torch.cat([both.mT, here.gradient[..., None]], dim=-1)
-    half = torch.linalg.solve_triangular(factor, right, upper=False).flatten(0, 1)  # all rows' in one matrix
-    hessian = -(half[:, :-1].mT @ half[:, :-1])
-    hessian[:75, :75] += torch.block_diag(*(by_offset.mT @ by_offset).sum(dim=0))
-    hessian[75:, 75:] += prior_hessian.sum(dim=0)
-    gradient = gradient.sum(dim=0) - half[:, :-1].mT @ half[:, -1]
-    return hessian.numpy(), gradient.numpy(), prior_hessian.sum(dim=0).numpy()
+    residual = (root @ (targets.xyz - linear.xyz)[..., None])[..., 0]
+    by_body = (root @ jacobian.reshape(R, K, 3, P)).reshape(R, 3 * K, P)
+    prior_hessian = here - by_body.swapaxes(1, 2) @ by_body
+    prior_gradient = linear.gradient + (by_body.swapaxes(1, 2) @ residual.reshape(R, -1, 1))[..., 0]
+    crossed = (by_offset.swapaxes(-1, -2) @ by_body.reshape(R, K, 3, P)).reshape(R, 3 * K, P)
+    both = np.concatenate([crossed, -prior_hessian], axis=1)  # (R, 75 + P, P): second derivatives with the body
+    by_own = -(by_offset.swapaxes(-1, -2) @ residual[..., None]).reshape(R, -1)
+    gradient = np.concatenate([by_own, -prior_gradient], axis=1)
+    system = np.concatenate([here, both, linear.gradient[:, None]], axis=1)
+    reduce_systems(system)
+    half = system[:, P:].swapaxes(0, 1).reshape(76 + P, -1)  # all rows' in one matrix
+    hessian = -(half[:-1] @ half[:-1].T)
+    own = (by_offset.swapaxes(-1, -2) @ by_offset).sum(axis=0)
+    for joint in range(K):
+        here_ = slice(3 * joint, 3 * joint + 3)
+        hessian[here_, here_] += own[joint]
+    hessian[75:, 75:] += prior_hessian.sum(axis=0)
+    return hessian, gradient.sum(axis=0) - half[:-1] @ half[-1], prior_hessian.sum(axis=0)
 
 
 def _prior_covariance(prior: OffsetPrior) -> Real:

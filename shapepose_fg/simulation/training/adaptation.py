@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.fitting.descent import NUM_PARAMETERS, UpdateNetwork, gradient_scale
+from shapepose_fg.body.fitting.descent import gradient_scale
 from shapepose_fg.body.fitting.fitters import SmplFitter
+from shapepose_fg.body.fitting.network import NUM_PARAMETERS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.sizes import points_at_rest
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
@@ -18,6 +19,7 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.simulation.training.differentiable import TrainedNetwork
 from shapepose_fg.simulation.training.motions import Motions
 from shapepose_fg.simulation.training.train import (
     PeopleSource,
@@ -59,7 +61,7 @@ def adapted(
     trainer = Trainer(PeopleSource(motions, body, frame, config), frame, network, config)
     for done, _ in enumerate(trainer.run(config.iterations), start=1):
         progress(done, config.iterations)
-    network = trainer.averaged.requires_grad_(False).eval().cpu()
+    network = trainer.averaged.finished()
     source = PeopleSource(unseen, body, frame, replace(config, shake_rad=0.0, exchange=0.0))
     weights = FitterWeights(network, frame, fingerprint(body), shipped.spread)
     weights = calibrated(weights, source, _CALIBRATION_PEOPLE)
@@ -72,19 +74,19 @@ def adapted(
     return replace(weights, card={**card, **about}), scores
 
 
-def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -> UpdateNetwork:
+def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -> TrainedNetwork:
     """The network of `weights` for `body`: shapes are those of `trained_on` in other words, all else stays.
 
     With betas c = M b of the body that it knows, the same person has b = N c: by least squares of all points. So
     it is told M b and the gradient Nᵀ dE/db, and steps by N times what it says.
     """
-    network = UpdateNetwork(weights.network.config)
-    network.load_state_dict(weights.network.state_dict())
+    network = TrainedNetwork.of(weights.network)
     if fingerprint(body) == weights.body:
         return network
     (_, old), (_, new) = points_at_rest(trained_on), points_at_rest(body)
     M, N = _solved(old, new), _solved(new, old)
-    before, after = weights.network.gradient_scale[:10], gradient_scale(body.points, _SEEN)
+    before = torch.from_numpy(weights.network.gradient_scale[:10])
+    after = torch.from_numpy(gradient_scale(body.points, _SEEN)).float()
     betas = slice(7 * len(BODY_POINTS), 7 * len(BODY_POINTS) + 10)
     gradient = slice(betas.start + NUM_PARAMETERS, betas.stop + NUM_PARAMETERS)
     with torch.no_grad():

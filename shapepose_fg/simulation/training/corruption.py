@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from shapepose_fg.body.model.rotation import inverse_3x3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
+from shapepose_fg.simulation.training.differentiable import inverse_3x3
 
 _NEAREST = {
     "Head": "Nose", "pelvis": "MidHip", "spine1": "MidHip", "spine2": "MidHip", "spine3": "Neck", "neck": "Neck",

@@ -9,23 +9,25 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from shapepose_fg.body.fitting.descent import (
-    NUM_ROTATIONS,
-    BodyState,
-    DescentTargets,
-    LearnedDescent,
-    NetworkConfig,
-    UpdateNetwork,
-)
+from shapepose_fg.body.fitting.descent import Sight
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
+from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights
-from shapepose_fg.body.model.body_model import BodyModel, accumulate
-from shapepose_fg.body.model.rotation import exp_so3, inverse_3x3
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
+from shapepose_fg.simulation.training.differentiable import (
+    DescentTargets,
+    State,
+    TrainedNetwork,
+    exp_so3,
+    inverse_3x3,
+    positions,
+    unroll,
+)
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 
 INSIDE = 0.9
@@ -78,7 +80,7 @@ class TrainingConfig:
 class People:
     """True bodies, upright, without a camera: pelvis at the origin, any heading."""
 
-    state: BodyState
+    state: State
     """Shape and pose."""
     points: Tensor
     """(B, K, 3) all `BODY_POINTS`, metres."""
@@ -105,8 +107,8 @@ class PeopleSource:
         shake[:, 0] = 0
         betas = torch.randn(count, 10, generator=generator).clamp(-3, 3)
         local = local @ exp_so3(shake)
-        state = BodyState(betas, local, self._frame.transl.expand(count, 3))
-        return People(state, body_points(self.model, state))
+        state = State(betas, local, _tensor(self._frame.transl).expand(count, 3))
+        return People(state, positions(self.model.points, state))
 
     def _pose(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 24, 3) axis-angle, half of them in the mirror."""
@@ -116,10 +118,9 @@ class PeopleSource:
         return torch.where(torch.rand(count, 1, 1, generator=generator) < 0.5, pose, flipped)
 
 
-def body_points(model: BodyModel, state: BodyState) -> Tensor:
-    """(B, K, 3) all `BODY_POINTS` of a state, differentiable."""
-    points = model.points
-    return points.positions(accumulate(state.local), state.betas, state.transl, points.feature(state.local))
+def _tensor(values: Array) -> Tensor:
+    """In single precision, as training is."""
+    return torch.from_numpy(values).float()
 
 
 _CHAINS = torch.zeros(4, 24, dtype=torch.bool)
@@ -131,10 +132,10 @@ for _row, _joints in enumerate(((13, 16, 18, 20), (14, 17, 19, 21), (1, 4, 7, 10
 class Trainer:
     """One run of training."""
 
-    def __init__(self, source: PeopleSource, frame: PersonFrame, network: UpdateNetwork, config: TrainingConfig):
+    def __init__(self, source: PeopleSource, frame: PersonFrame, network: TrainedNetwork, config: TrainingConfig):
         self.source, self.frame, self.config = source, frame, config
         self.network = network
-        self.averaged = UpdateNetwork(config.network).to(network.gradient_scale.device)
+        self.averaged = TrainedNetwork(config.network).to(network.gradient_scale.device)
         self.averaged.load_state_dict(network.state_dict())
         self.optimiser = torch.optim.AdamW(
             network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
@@ -156,10 +157,10 @@ class Trainer:
         people = self.source.draw(config.batch, generator)
         targets, state, truth, true_points = prepared(people, self.frame, config, generator)
         self.network.train()
-        descent = LearnedDescent(self.source.model.points, _ALL, self.network, config.kernel_scale)
+        see = Sight(self.source.model.points, _ALL, config.kernel_scale)
         self.optimiser.zero_grad()
         errors = []
-        for iterate in descent.unroll(state, targets):
+        for iterate in unroll(see, self.network, state, targets):
             error, loss = _judge(self.source.model, iterate, truth, true_points, config)
             loss.backward()
             errors.append(1000 * float(error))
@@ -185,7 +186,7 @@ def _learning_rate(config: TrainingConfig, iteration: int) -> float:
 @torch.no_grad()
 def prepared(
     people: People, frame: PersonFrame, config: TrainingConfig, generator: torch.Generator
-) -> tuple[DescentTargets, BodyState, BodyState, Tensor]:
+) -> tuple[DescentTargets, State, State, Tensor]:
     """Corrupted targets, the start, the true state and true points, all in the person's frame as it is found."""
     B = len(people.points)
     offered = _OFFERED[torch.multinomial(torch.tensor(config.skeletons), B, True, generator=generator)]
@@ -196,13 +197,14 @@ def prepared(
     enough = torch.isfinite(variance).sum(1) >= 4
     xyz, information, variance, points = (value[enough] for value in (xyz, information, variance, people.points))
     local, betas = people.state.local[enough], people.state.betas[enough]
-    rotation, origin = frame.place(xyz, variance, _ALL)
+    placed = frame.place(xyz.double().numpy(), variance.double().numpy(), _ALL)
+    rotation, origin = map(_tensor, placed)
     inside = lambda places: (places - origin[:, None]) @ rotation  # noqa: E731
     turned = rotation.mT[:, None] @ information @ rotation[:, None]
     true_local = torch.cat((rotation.mT[:, None] @ local[:, :1], local[:, 1:]), 1)
-    truth = BodyState(betas, true_local, torch.zeros(len(xyz), 3))
-    start = BodyState(torch.zeros(len(xyz), 10), frame.local.expand(len(xyz), 24, 3, 3),
-                      frame.transl.expand(len(xyz), 3))  # fmt: skip
+    truth = State(betas, true_local, torch.zeros(len(xyz), 3))
+    local, transl = _tensor(frame.local).expand(len(xyz), 24, 3, 3), _tensor(frame.transl).expand(len(xyz), 3)
+    start = State(torch.zeros(len(xyz), 10), local, transl)
     return DescentTargets(inside(xyz), turned), start, truth, inside(points)
 
 
@@ -220,10 +222,10 @@ for _row, _names in enumerate(TARGET_SKELETONS.values()):
 
 
 def _judge(
-    model: BodyModel, state: BodyState, truth: BodyState, true_points: Tensor, config: TrainingConfig
+    model: BodyModel, state: State, truth: State, true_points: Tensor, config: TrainingConfig
 ) -> tuple[Tensor, Tensor]:
     """Mean joint error in metres, and the loss: joints, rotations, shape."""
-    distance = torch.linalg.vector_norm(body_points(model, state) - true_points, dim=-1)
+    distance = torch.linalg.vector_norm(positions(model.points, state) - true_points, dim=-1)
     turn = (state.local[:, :NUM_ROTATIONS] - truth.local[:, :NUM_ROTATIONS]).square().sum((-1, -2))
     turn = (turn / 2 + 1e-4).sqrt().mean()
     shape = (state.betas - truth.betas).abs().mean()
@@ -238,7 +240,7 @@ def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) 
     whether or not they have one) is widened or narrowed so that `INSIDE` of them are there. Left and right are
     taken together.
     """
-    plain = replace(weights, spread=torch.ones(len(BODY_POINTS)))
+    plain = replace(weights, spread=np.ones(len(BODY_POINTS)))
     spread = np.ones(len(BODY_POINTS))
     generator = torch.Generator().manual_seed(2)
     for name in _SKELETONS:
@@ -248,7 +250,7 @@ def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) 
             both = np.concatenate([squared.get(place, np.zeros(0)), squared.get(MIRROR[place], np.zeros(0))])
             if len(both) >= _ENOUGH:
                 spread[place] = np.quantile(both, INSIDE) / chi2.ppf(INSIDE, 3)
-    return replace(weights, spread=torch.from_numpy(spread).float())
+    return replace(weights, spread=spread)
 
 
 def left_out_squared(

@@ -96,18 +96,16 @@ def saved(result: Reconstruction, scene: Scene, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def true_bodies(result: Reconstruction):
-    """A function (person, frame) -> joints (24, 3) and vertices (Nv, 3), by the body model in float64."""
-    import torch
-
+    """A function (person, frame) -> joints (24, 3) and vertices (Nv, 3), by the body model."""
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 
-    body = BodyModel.default().to(torch.float64)
+    body = BodyModel.default()
 
     def pose(person: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
         row = result.rows((result.person == person) & (result.frame == frame))
         parts = (row.betas, row.global_orient, row.body_pose, row.transl)
-        parameters = BodyParameters(*(torch.from_numpy(part) for part in parts))
-        return body.joints(parameters).numpy()[0], body.vertices(parameters).numpy()[0]
+        parameters = BodyParameters(*parts)
+        return body.joints(parameters)[0], body.vertices(parameters)[0]
 
     return pose
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -34,7 +33,7 @@ def test_amass_posed_by_the_body_model_stands_where_it_stood(job, true_bodies):
     # The hole of one frame without a body is filled, the eight frames out of sight are not.
     assert names == ["person_3_frames_100-123", "person_7_frames_100-107", "person_7_frames_116-123"]
     assert any("betas are those of the open body" in note for note in written.notes)
-    body = BodyModel.default().to(torch.float64)
+    body = BodyModel.default()
     for path in written.files:
         with np.load(path, allow_pickle=False) as file:
             data = {name: file[name] for name in file.files}
@@ -46,7 +45,7 @@ def test_amass_posed_by_the_body_model_stands_where_it_stood(job, true_bodies):
         assert not data["poses"][:, 66:].any()
         pose = data["poses_smpl"].reshape(T, 24, 3)
         parts = (np.tile(data["betas"][:10], (T, 1)), pose[:, 0], pose[:, 1:], data["trans"])
-        joints = body.joints(BodyParameters(*(torch.from_numpy(part.copy()) for part in parts))).numpy()
+        joints = body.joints(BodyParameters(*(part.copy() for part in parts)))
         for index, frame in enumerate(data["frames"].tolist()):
             assert bool(data["filled"][index]) == (frame == BARE and "person_7" in path.name)
             if not data["filled"][index]:
@@ -58,11 +57,11 @@ def test_amass_posed_by_the_body_model_stands_where_it_stood(job, true_bodies):
 def test_amass_is_z_up_whatever_the_world_is(result, tmp_path, true_bodies):
     """The same people in a world whose y points down: heads are above feet along z."""
     written = write_amass(Job(Take.of(result, "-y"), tmp_path))
-    body = BodyModel.default().to(torch.float64)
+    body = BodyModel.default()
     with np.load(written.files[0]) as file:
         pose = file["poses_smpl"][:1].reshape(1, 24, 3)
         parts = (file["betas"][None, :10], pose[:, 0], pose[:, 1:], file["trans"][:1])
-    joints = body.joints(BodyParameters(*(torch.from_numpy(part.copy()) for part in parts))).numpy()[0]
+    joints = body.joints(BodyParameters(*(part.copy() for part in parts)))[0]
     truly, _ = true_bodies(3, FIRST)
     np.testing.assert_allclose(joints, np.stack([truly[:, 0], truly[:, 2], -truly[:, 1]], axis=1), atol=1e-6)
 

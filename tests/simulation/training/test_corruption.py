@@ -28,7 +28,7 @@ def people() -> torch.Tensor:
     orient[:, 1] = rng.uniform(-np.pi, np.pi, COUNT)
     parts = (rng.normal(size=(COUNT, 10)), orient, PosePrior.default().sample(rng, COUNT), np.zeros((COUNT, 3)))
     model = BodyModel.default().with_keypoints(BODY_POINTS)
-    return model.keypoints(BodyParameters(*(torch.from_numpy(part).float() for part in parts)))
+    return torch.from_numpy(model.keypoints(BodyParameters(*parts))).float()
 
 
 def made(people: torch.Tensor, config: CorruptionConfig | None = None, seed: int = 0, offered=None):

@@ -7,21 +7,21 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from shapepose_fg.body.fitting.descent import LearnedDescent, NetworkConfig, UpdateNetwork, gradient_scale
+from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale
+from shapepose_fg.body.fitting.network import NetworkConfig
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.simulation.training.differentiable import TrainedNetwork, exp_so3, inverse_3x3, positions, unroll
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 from shapepose_fg.simulation.training.train import (
     INSIDE,
     PeopleSource,
     Trainer,
     TrainingConfig,
-    body_points,
     calibrated,
     left_out_squared,
     prepared,
@@ -67,20 +67,22 @@ def make_source(frame: PersonFrame, config: TrainingConfig = SMALL) -> PeopleSou
 
 def make_trainer(frame: PersonFrame, config: TrainingConfig = SMALL) -> Trainer:
     torch.manual_seed(config.seed)
-    network = UpdateNetwork(config.network)
-    network.gradient_scale.copy_(gradient_scale(BodyModel.default().points, tuple(range(25))))
+    network = TrainedNetwork(config.network)
+    scale = gradient_scale(BodyModel.default().points, tuple(range(25)))
+    network.gradient_scale.copy_(torch.from_numpy(scale))
     return Trainer(make_source(frame, config), frame, network, config)
 
 
 @torch.no_grad()
-def error_mm(trainer: Trainer, network: UpdateNetwork) -> float:
+def error_mm(trainer: Trainer, network: TrainedNetwork) -> float:
     """Mean joint error after the last step on people that are always the same."""
     generator = torch.Generator().manual_seed(9)
     people = trainer.source.draw(100, generator)
     targets, start, _, truth = prepared(people, trainer.frame, SMALL, generator)
-    descent = LearnedDescent(trainer.source.model.points, ALL, network.eval(), SMALL.kernel_scale)
-    *_, arrived = descent.unroll(start, targets)
-    distance = torch.linalg.vector_norm(body_points(trainer.source.model, arrived) - truth, dim=-1)
+    points = trainer.source.model.points
+    see = Sight(points, ALL, SMALL.kernel_scale)
+    *_, arrived = unroll(see, network.eval(), start, targets)
+    distance = torch.linalg.vector_norm(positions(points, arrived) - truth, dim=-1)
     return 1000 * float(distance.mean())
 
 
@@ -106,6 +108,43 @@ def test_training_is_the_same_each_time_and_another_with_another_seed(frame):
     assert first[0] == first[1] != first[2]
     for a, b in zip(weights_of(one), weights_of(again), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_training_and_fits_take_the_same_steps(frame):
+    """One is torch and differentiable, the other NumPy."""
+    trainer, generator = make_trainer(frame), torch.Generator().manual_seed(3)
+    torch.nn.init.normal_(trainer.network.leave.weight, 0, 0.3)
+    people, points = trainer.source.draw(20, generator), trainer.source.model.points
+    targets, start, *_ = prepared(people, frame, SMALL, generator)
+    given = (value.double().numpy() for value in (targets.xyz, targets.information))
+    plain = BodyState(*(value.double().numpy() for value in vars(start).values()))
+    descent = LearnedDescent(points, ALL, trainer.network.finished(), SMALL.kernel_scale)
+    ours = unroll(Sight(points, ALL, SMALL.kernel_scale), trainer.network.eval(), start, targets)
+    for one, other in zip(ours, descent.unroll(plain, *given), strict=True):
+        for name, value in vars(other).items():
+            np.testing.assert_allclose(getattr(one, name).detach().numpy(), value, atol=2e-5, err_msg=name)
+        placed = points.positions(other.local, other.betas, other.transl)
+        np.testing.assert_allclose(positions(points, one).detach().numpy(), placed, atol=2e-5)
+    assert np.abs(other.transl - plain.transl).max() > 0.01
+    again = TrainedNetwork.of(trainer.network.finished()).state_dict()
+    for name, value in trainer.network.state_dict().items():
+        assert torch.equal(again[name], value), name
+
+
+def test_gradients_reach_the_network_from_the_last_step_only_through_itself(frame):
+    trainer, generator = make_trainer(frame), torch.Generator().manual_seed(3)
+    targets, start, *_ = prepared(trainer.source.draw(20, generator), frame, SMALL, generator)
+    first, second = unroll(Sight(trainer.source.model.points, ALL, 6.0), trainer.network.eval(), start, targets)
+    (slope,) = torch.autograd.grad(second.transl.sum(), trainer.network.leave.bias, retain_graph=True)
+    # transl <- transl + 0.1 * output: each row gives 0.1, of the second step alone.
+    np.testing.assert_allclose(slope[-3:].numpy(), 0.1 * len(start.betas), rtol=1e-5)
+    assert first.transl.requires_grad
+
+
+def test_inverses_by_cross_products():
+    matrices = np.random.default_rng(0).normal(size=(50, 3, 3))
+    found = inverse_3x3(torch.from_numpy(matrices)).numpy()
+    np.testing.assert_allclose(found, np.linalg.inv(matrices), rtol=1e-8)
 
 
 def test_people_are_drawn_upright_with_the_pelvis_at_the_origin_and_shapes_of_the_model(frame):
@@ -150,10 +189,10 @@ def test_what_is_prepared_is_in_the_frame_in_which_the_fitter_starts(frame):
     assert float(error.median()) < 0.05
     assert float(torch.linalg.eigvalsh(targets.information).amax()) <= 1.001 / SMALL.model_sigma_m**2
     # True rotations pose the true points, but for where the person stands.
-    posed = body_points(BodyModel.default(), truth)
+    posed = positions(BodyModel.default().points, truth)
     shift = points - posed
     np.testing.assert_allclose((shift - shift[:, :1]).numpy(), 0, atol=2e-5)
-    assert float((start.local - frame.local).abs().max()) == 0
+    assert np.abs(start.local.numpy() - frame.local).max() < 1e-6
     # The person's frame faces as the body does, to what noise and bends leave.
     forward = truth.local[:, 0, 2, 2].numpy()
     assert np.median(forward) > 0.95
@@ -164,11 +203,11 @@ def test_calibrated_beliefs_hold_what_they_say_of_hidden_joints(frame):
     trainer = make_trainer(frame)
     list(trainer.run(20))
     model, still = BodyModel.default(), replace(SMALL, shake_rad=0.0, exchange=0.0)
-    network = trainer.averaged.requires_grad_(False).eval()
+    network = trainer.averaged.finished()
     source = make_source(frame, still)
     raw = FitterWeights(network, frame, fingerprint(model))
     weights = calibrated(raw, source, count=500)
-    spread = weights.spread.numpy()
+    spread = weights.spread
     assert (spread > 0).all() and np.ptp(spread) > 0
     generator = torch.Generator().manual_seed(5)  # others than those who were calibrated on
     places = tuple(range(25))

@@ -1,0 +1,1 @@
+"""What is compiled: bodies row by row, and their normal equations."""

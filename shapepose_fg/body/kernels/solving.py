@@ -1,0 +1,293 @@
+"""Normal equations of bodies, row by row, compiled: steps, covariances, and the same with targets left out.
+
+A system (P + 1 + 3 K + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
+Hessian H, below it vectors. It is reduced in place to the factor L, H = L Lᵀ, and L^-1 of the vectors. Everything
+is scalar products of rows.
+"""
+
+import math
+
+from shapepose_fg.core.compiled import kernel, part
+
+LIMB_M = 0.4
+"""Radius on which the end of a swinging limb moves, for the curvature that a linearisation leaves out.
+
+Chosen so that hidden wrists, arms and legs of held-out motions lie where their covariance says."""
+
+
+@kernel
+def _reduced(H, n, first, end):
+    """Reduce the rows `first` to `end` of a system with n unknowns; False where H is not positive definite."""
+    for i in range(first, end, 4):
+        stop, begin = min(i + 4, end), 0
+        if stop == i + 4:  # four rows at a time
+            begin = min(i, n)
+            for j in range(begin):
+                a, b, c, d = 0.0, 0.0, 0.0, 0.0
+                for p in range(j):
+                    a += H[i, p] * H[j, p]
+                    b += H[i + 1, p] * H[j, p]
+                    c += H[i + 2, p] * H[j, p]
+                    d += H[i + 3, p] * H[j, p]
+                scale = 1 / H[j, j]
+                H[i, j] = (H[i, j] - a) * scale
+                H[i + 1, j] = (H[i + 1, j] - b) * scale
+                H[i + 2, j] = (H[i + 2, j] - c) * scale
+                H[i + 3, j] = (H[i + 3, j] - d) * scale
+        for r in range(i, stop):
+            for j in range(begin, min(r + 1, n)):
+                total = H[r, j]
+                for p in range(j):
+                    total -= H[r, p] * H[j, p]
+                if r > j:
+                    H[r, j] = total / H[j, j]
+                elif total > 0.0:
+                    H[r, j] = math.sqrt(total)
+                else:
+                    return False
+    return True
+
+
+@part
+def _back(H, n, row, step):
+    """`step` = -L^-T of a row."""
+    for k in range(n):
+        step[k] = -H[row, k]
+    for k in range(n - 1, -1, -1):
+        step[k] /= H[k, k]
+        for j in range(k):
+            step[j] -= step[k] * H[k, j]
+
+
+@kernel
+def _products(Y, first, count, n, out):
+    """`out` = the scalar products of `count` rows (n,) of Y from `first` on."""
+    for i in range(count):
+        for j in range(i + 1):
+            total = 0.0
+            for p in range(n):
+                total += Y[first + i, p] * Y[first + j, p]
+            out[i, j] = out[j, i] = total
+
+
+@kernel
+def reduce_systems(system):
+    """Reduce B whole systems (B, M, P)."""
+    for b in range(len(system)):
+        _reduced(system[b], system.shape[2], 0, system.shape[1])
+
+
+@kernel
+def solved(system, damping, step, promised):
+    """Reduce the Hessians of B systems, their diagonals `damping` (B,) times larger, and their gradients; the
+    `step` (B, P), and by how much it would lower the energy, `promised` (B,), NaN where H is not positive
+    definite. With a negative damping the factor is there, and the gradient is new.
+
+    Priors say nothing of the root's turn and place: where too few joints are left to determine them, they are
+    known to a radian and a metre.
+    """
+    P = step.shape[1]
+    for b in range(len(system)):
+        H, lower, new = system[b], 0.0, damping[b] >= 0
+        for i in range(P if new else 0):
+            H[i, i] += damping[b] * H[i, i] + (1.0 if 10 <= i < 13 or i >= P - 3 else 0.0)
+        if not _reduced(H, P, 0 if new else P, P + 1):
+            lower = math.nan
+        for i in range(P):
+            lower += H[P, i] * H[P, i]
+        _back(H, P, P, step[b])
+        promised[b] = lower
+
+
+@part
+def _with_sag(C, at):
+    """To first order a limb that may swing moves in a plane; in truth on a sphere. Where a joint's covariance A is
+    large, the sag tr(A) / (2 LIMB_M) is added as a sigma along every axis: a hidden wrist is not a thin disc.
+    """
+    sag = (C[at, at] + C[at + 1, at + 1] + C[at + 2, at + 2]) / (2 * LIMB_M)
+    for x in range(at, at + 3):
+        C[x, x] += sag * sag
+
+
+@kernel
+def known(system, covariance, shape):
+    """From B systems with reduced Hessians: the `covariance` (B, K, 3, 3) of the joints (Laplace), m², as
+    `_with_sag` has it, and that of the betas, `shape` (B, 10, 10). The rest of the systems is reduced.
+    """
+    for b in range(len(system)):
+        H, P, K = system[b], system.shape[2], covariance.shape[1]
+        _reduced(H, P, P + 1, len(H))
+        for k in range(K):
+            C = covariance[b, k]
+            _products(H, P + 1 + 3 * k, len(C), P, C)
+            _with_sag(C, len(C) - 3)
+        _products(H, P + 1 + 3 * K, shape.shape[1], P, shape[b])
+
+
+@kernel
+def lessened(system, row, without, root, Y, B, C, good):
+    """Prepare the fits of N pairs, a `row` (N,) and targets `without` (N, M) that are left out of it, -1 for none.
+
+    With Y = J L^-T of the Jacobian of these and R the square `root` (N, M, 3, 3) of their information, the Hessian
+    without them is L (I - Yᵀ Rᵀ R Y) Lᵀ, and its inverse is known by the factor of I - R Y Yᵀ Rᵀ (Woodbury).
+    Written are `Y` (N, 6 M + 10, P), R Y, Y and L^-1 of the betas; `B` (N, 6 M + 11, 3 M), that factor, a place
+    for right-hand sides, and products of Y; `C` (N, 3 M + 10, 3 M + 10), the covariance of the joints, as
+    `_with_sag` has it, and of the betas without them; whether it is positive definite, `good` (N,).
+    """
+    P, m = system.shape[2], B.shape[2]
+    for n in range(len(row)):
+        H, Z, D, G, count = system[row[n]], Y[n], B[n], C[n], 2 * m + 10
+        for i in range(m // 3):
+            S, at = root[n, i], P + 1 + 3 * max(without[n, i], 0)
+            for x in range(3):
+                for p in range(P):
+                    Z[3 * i + x, p] = S[x, 0] * H[at, p] + S[x, 1] * H[at + 1, p] + S[x, 2] * H[at + 2, p]
+                    Z[m + 3 * i + x, p] = H[at + x, p]
+        for i in range(10):
+            for p in range(P):
+                Z[2 * m + i, p] = H[len(H) - 10 + i, p]
+        for i in range(count):
+            for j in range(i + 1):
+                total = 0.0
+                for p in range(P):
+                    total += Z[i, p] * Z[j, p]
+                if i < m:
+                    D[i, j] = (1.0 if i == j else 0.0) - total
+                elif j < m:
+                    D[i + 1, j] = total
+                else:
+                    G[i - m, j - m] = G[j - m, i - m] = total
+        good[n] = _reduced(D, m, m - m, m)
+        if good[n]:
+            _reduced(D, m, m + 1, count + 1)
+            for i in range(m + 10):
+                for j in range(m + 10):
+                    for p in range(m):
+                        G[i, j] += D[m + 1 + i, p] * D[m + 1 + j, p]
+            for i in range(0, m, 3):
+                _with_sag(G, i)
+
+
+@kernel
+def stepped(system, row, pair, Y, B, gradient, step, move):
+    """The Gauss-Newton `step` (N, P) of `pair`s (N,) among those that `lessened` prepared, where half the
+    gradient is `gradient` (N, P), and by how much the joints that are left out would `move` (N, 3 M), metres.
+    """
+    P, m = gradient.shape[1], B.shape[2]
+    for n in range(len(row)):
+        H, Z, D, s, moved = system[row[n]], Y[pair[n]], B[pair[n]], step[pair[n]], move[pair[n]]
+        for p in range(P):
+            H[P, p] = gradient[n, p]
+        _reduced(H, P, P, P + 1)
+        for i in range(m):
+            D[m, i] = 0.0
+            for p in range(P):
+                D[m, i] += Z[i, p] * H[P, p]
+        _reduced(D, m, m, m + 1)
+        _back(D, m, m, s)
+        for i in range(m):
+            for p in range(P):
+                H[P, p] -= Z[i, p] * s[i]
+        _back(H, P, P, s)
+        for i in range(m):
+            moved[i] = 0.0
+            for p in range(P):
+                moved[i] -= Z[m + i, p] * H[P, p]
+
+
+@kernel
+def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
+    """Eliminate the rows of a chain one after the other; N of the unknowns of each are left without the betas.
+
+    `system` (T, P + 1, P) are the rows' Hessians and gradients, the root's in its own tangents, which `turn` (T,
+    3, 3) takes to those of the world. Links add a `diagonal` (T, N), couplings `beyond` (T, N, n) with the next n
+    rows, of each unknown with itself only, and the gradient `pull` (T, N). The diagonal of all is `damping` times
+    larger.
+
+    `front` (M, M), zero, holds what is open: the row at hand, the n after it, and 11 right-hand sides, the
+    gradient and the couplings with the betas. Of these its last rows have the sums in the end, all poses
+    eliminated. `kept` (T, M, N) is the factor, and what `put_back` needs.
+    """
+    (T, N, n), M = beyond.shape, len(front)
+    P, rhs, last = N + 10, M - 11, M - 11 - N
+    for t in range(T):
+        H, K, R = system[t], kept[t], turn[t]
+        for i in range(N):
+            for j in range(i + 1):
+                K[i, j] = H[10 + i, 10 + j]
+        for j in range(N):
+            K[rhs, j] = H[P, 10 + j]
+            for m in range(10):
+                K[rhs + 1 + m, j] = H[10 + j, m]
+        K[0, 1], K[0, 2], K[1, 2] = K[1, 0], K[2, 0], K[2, 1]
+        for i in range(M):
+            if i < N or i >= rhs:
+                a, b, c = K[i, 0], K[i, 1], K[i, 2]
+                for x in range(3):
+                    K[i, x] = R[x, 0] * a + R[x, 1] * b + R[x, 2] * c
+        for j in range(3):
+            a, b, c = K[0, j], K[1, j], K[2, j]
+            for x in range(3):
+                K[x, j] = R[x, 0] * a + R[x, 1] * b + R[x, 2] * c
+        for i in range(N):
+            K[i, i] = (K[i, i] + diagonal[t, i]) * (1 + damping)
+            K[rhs, i] += pull[t, i]
+        for i in range(M):
+            for j in range(min(i + 1, N)):
+                K[i, j] = front[i, j] + (0.0 if N <= i < rhs else K[i, j])
+        for b in range(min(n, T - 1 - t)):
+            for j in range(N):
+                K[N + b * N + j, j] += beyond[t, j, b]
+        for m in range(10):
+            front[rhs + 1 + m, rhs] += H[P, m]
+            for j in range(m + 1):
+                front[rhs + 1 + m, rhs + 1 + j] += H[m, j]
+        if not _reduced(K, N, 0, M):
+            front[M - 1, M - 1] = math.nan  # and so in all that follows
+        for i in range(N, M, 4):
+            stop = min(i + 4, M)
+            for j in range(N, i if stop == i + 4 else N):
+                a, b, c, d = 0.0, 0.0, 0.0, 0.0
+                for p in range(K.shape[1]):
+                    a += K[i, p] * K[j, p]
+                    b += K[i + 1, p] * K[j, p]
+                    c += K[i + 2, p] * K[j, p]
+                    d += K[i + 3, p] * K[j, p]
+                front[i, j] -= a
+                front[i + 1, j] -= b
+                front[i + 2, j] -= c
+                front[i + 3, j] -= d
+            for r in range(i, stop):
+                for j in range(i if stop == i + 4 else N, r + 1):
+                    a = 0.0
+                    for p in range(N):
+                        a += K[r, p] * K[j, p]
+                    front[r, j] -= a
+        for i in range(N, M):  # the next row comes first
+            to = i if i >= rhs else i - N
+            for j in range(N, min(i + 1, rhs)):
+                front[to, j - N] = front[i, j]
+        for i in range(last, M):
+            for j in range(last if i >= rhs else 0, rhs):
+                front[i, j] = 0.0
+
+
+@kernel
+def put_back(kept, coefficients, step):
+    """The `step` (T, N) of the rows that `eliminated` left, the right-hand sides taken `coefficients` (11,)
+    times.
+    """
+    (T, N), M = step.shape, kept.shape[1]
+    for t in range(T - 1, -1, -1):
+        K, s, rhs = kept[t], step[t], M - 11
+        for p in range(N):
+            s[p] = 0.0
+        for i in range(N, M):
+            after = t + i // N
+            v = coefficients[i - rhs] if i >= rhs else (step[after, i % N] if after < T else 0.0)
+            for p in range(N):
+                s[p] -= v * K[i, p]
+        for k in range(N - 1, -1, -1):
+            s[k] /= K[k, k]
+            for j in range(k):
+                s[j] -= s[k] * K[k, j]

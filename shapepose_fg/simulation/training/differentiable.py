@@ -1,0 +1,159 @@
+"""What training differentiates, in torch: the update network's layers, its steps, and the points of a body.
+
+What the network sees is computed by the fitter's own code (`body/fitting/descent.py`), which has no gradient.
+Fits use NumPy's network (`body/fitting/network.py`); a test holds the two together.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from shapepose_fg.body.fitting.descent import STEP, BodyState, Sight, believed
+from shapepose_fg.body.fitting.network import (
+    NUM_PARAMETERS,
+    NUM_ROTATIONS,
+    NUM_TANGENT,
+    NetworkConfig,
+    UpdateNetwork,
+)
+from shapepose_fg.body.model.skinned_points import SkinnedPoints
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
+
+
+class TrainedNetwork(nn.Module):
+    """An `UpdateNetwork` that learns. Its last layer starts at zero, so an untrained one stands still."""
+
+    def __init__(self, config: NetworkConfig):
+        super().__init__()
+        self.config = config
+        self.enter = nn.Linear(UpdateNetwork.num_inputs + config.steps, config.width)
+        self.blocks = nn.ModuleList(_Block(config.width, config.dropout) for _ in range(config.blocks))
+        self.leave = nn.Linear(config.width, NUM_PARAMETERS)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+        self.gradient_scale: Tensor
+        self.register_buffer("gradient_scale", torch.ones(NUM_TANGENT))
+
+    @classmethod
+    def of(cls, network: UpdateNetwork) -> "TrainedNetwork":
+        """With the weights of a network of the fitter's."""
+        found = cls(network.config)
+        found.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in network.weights.items()})
+        return found
+
+    def finished(self) -> UpdateNetwork:
+        """The same for the fitter."""
+        return UpdateNetwork(self.config, {name: value.cpu().numpy() for name, value in self.state_dict().items()})
+
+    def forward(self, inputs: Tensor, step: int) -> Tensor:
+        """(B, `NUM_PARAMETERS`) the change of the parameters in update number `step`; inputs (B, `num_inputs`)."""
+        place, count = self.leave.weight.device, UpdateNetwork.num_inputs
+        with torch.autocast(place.type, torch.bfloat16, enabled=self.training and self.config.half_precision):
+            weight, bias = self.enter.weight, self.enter.bias + self.enter.weight[:, count + step]
+            hidden = nn.functional.linear(inputs.to(place), weight[:, :count], bias)
+            for block in self.blocks:
+                hidden = hidden + block(hidden)
+            return self.leave(hidden).float().to(inputs.device)
+
+
+class _Block(nn.Module):
+    def __init__(self, width: int, dropout: float):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Dropout(dropout), nn.Linear(width, width)
+        )
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return self.layers(hidden)
+
+
+@dataclass(frozen=True)
+class DescentTargets:
+    """Targets in the person's own frame."""
+
+    xyz: Tensor
+    """(B, K, 3) metres, finite."""
+    information: Tensor
+    """(B, K, 3, 3) 1/m², the model's error included; zero for a joint never seen."""
+
+
+@dataclass(frozen=True)
+class State:
+    """A `BodyState` of tensors."""
+
+    betas: Tensor
+    """(B, 10) shape."""
+    local: Tensor
+    """(B, 24, 3, 3) rotations relative to the parent, the root's to the person's frame."""
+    transl: Tensor
+    """(B, 3) metres."""
+
+
+def unroll(see: Sight, network: TrainedNetwork, state: State, targets: DescentTargets) -> Iterator[State]:
+    """The states after each update of bodies that `see` their targets. Each starts from the last one detached."""
+    xyz, information = (value.double().numpy() for value in (targets.xyz, targets.information))
+    trusted, scale = believed(information), network.gradient_scale.cpu().numpy()
+    for step in range(network.config.steps):
+        plain = BodyState(*(value.detach().double().numpy() for value in vars(state).values()))
+        change = STEP * network(torch.from_numpy(see(plain, xyz, information, trusted, scale)), step)
+        turned = _six_d(state.local[:, :NUM_ROTATIONS]) + change[:, 10:-3].unflatten(1, (NUM_ROTATIONS, 6))
+        local = torch.cat((_from_six_d(turned), state.local[:, NUM_ROTATIONS:]), 1)
+        state = State(state.betas + 10 * change[:, :10], local, state.transl + change[:, -3:])
+        yield state
+        state = State(*(value.detach() for value in vars(state).values()))
+
+
+def positions(points: SkinnedPoints, state: State) -> Tensor:
+    """(B, K, 3) points of bodies, metres, in single precision."""
+    offsets, by_shape, root, root_by_shape, share = (
+        torch.from_numpy(np.ascontiguousarray(part)).float()
+        for part in (points.offsets, points.offsets_shape, points.root, points.root_shape, points.translation)
+    )
+    world = [state.local[:, 0]]
+    for bone in range(1, len(SMPL_PARENTS)):  # parents come before their children
+        world.append(world[SMPL_PARENTS[bone]] @ state.local[:, bone])
+    terms = offsets + torch.einsum("bn,nkyj->bkyj", state.betas, by_shape)
+    if points.offsets_pose is not None:
+        bent = (state.local[:, 1:] - torch.eye(3)).flatten(1)
+        terms = terms + torch.einsum("be,ekyj->bkyj", bent, torch.from_numpy(points.offsets_pose).float())
+    still = root + torch.einsum("bn,nkx->bkx", state.betas, root_by_shape) + share[:, None] * state.transl[:, None]
+    return still + torch.einsum("bjxy,bkyj->bkx", torch.stack(world, 1), terms)
+
+
+def exp_so3(axis_angle: Tensor) -> Tensor:
+    """Rotation matrices of axis-angle vectors in radians, any norm; (..., 3) -> (..., 3, 3) (Rodrigues)."""
+    angle = torch.linalg.vector_norm(axis_angle, dim=-1, keepdim=True)[..., None]
+    first = torch.sinc(angle / torch.pi)  # sin(t) / t, which torch has exact at 0
+    second = 0.5 * torch.sinc(angle / (2 * torch.pi)).square()  # (1 - cos(t)) / t^2 without cancellation
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    return torch.eye(3, dtype=axis_angle.dtype) + first * cross + second * (cross @ cross)
+
+
+def inverse_3x3(matrix: Tensor) -> Tensor:
+    """Inverses (..., 3, 3) by cross products of the rows; a singular matrix gives infinities, not an error.
+
+    LAPACK would go through a batch one by one.
+    """
+    a, b, c = matrix.unbind(-2)
+    columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
+    determinant = (a * columns[..., 0]).sum(-1)
+    return columns / determinant[..., None, None]
+
+
+def _six_d(R: Tensor) -> Tensor:
+    """The first two columns of rotation matrices (`body/model/rotation.py`); (..., 3, 3) -> (..., 6)."""
+    return R[..., :2].transpose(-1, -2).flatten(-2)
+
+
+def _from_six_d(columns: Tensor) -> Tensor:
+    """Rotation matrices from two columns (`body/model/rotation.py`); (..., 6) -> (..., 3, 3)."""
+    first, second = columns[..., :3], columns[..., 3:]
+    x = first / torch.linalg.vector_norm(first, dim=-1, keepdim=True)
+    across = second - (x * second).sum(-1, keepdim=True) * x
+    y = across / torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+    return torch.stack((x, y, torch.linalg.cross(x, y)), -1)
