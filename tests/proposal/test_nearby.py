@@ -73,7 +73,7 @@ def test_without_hips_nobody_is_sought_by_hips(five_cameras, two_people, seen_ex
 
 
 def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_people, seen_exactly, monkeypatch):
-    """Of 14 people on whom no affinities speak, nobody by evidence, there are over 100 points of a joint, and 50 candidates."""
+    """14 people on whom no affinities speak, nobody by evidence: over 100 points of a joint, and 50 candidates."""
     monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_LEFT", 100)
     beside = np.array([[0.0, 0.3 * n, 0.0] for n in range(7)])
     seen = seen_exactly(five_cameras, (two_people[:, None] + beside[:, None]).reshape(-1, 25, 3))
