@@ -100,10 +100,15 @@ class Notebook:
         self._notes = Notes()
         self._inner = 0.0
         self._frame: int | None = None
+        self._searched: int | None = None
+
+    def search(self, frame: int) -> None:
+        """New people are sought in a frame, one of many that are looked at: what is thinned now is of this one."""
+        self._searched = frame
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
         """Note down that some of a frame's detections, points or candidates were too many and left out."""
-        frame = self._frame if frame is None else frame
+        frame = next((each for each in (frame, self._frame, self._searched) if each is not None), None)
         if is_thinned and frame is not None:
             noted = self._notes.thinned_frames.setdefault(what, [])
             noted += [frame] if frame not in noted[-1:] else []

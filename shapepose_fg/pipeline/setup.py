@@ -107,7 +107,8 @@ class Setup:
         motion = MotionModel.load(skeleton.joints, config.motion, law)
         scale = BodyScale(longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law)
         find = (sure, hips) if config.temporal else (sure,)
-        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, drop=book.drop_in), config)
+        told = {"drop": book.drop_in, "search": book.search}
+        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
 
 
 def find_people(detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig) -> Observations:

@@ -122,7 +122,9 @@ def nearby(
         room = count
         person, detection, distance_m = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room)
         found = begins, person, detection, distance_m
-        count = _near(places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.xy, *found)
+        count = _near(
+            places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.columns[2], *found
+        )
     return Nearby(begins, person[:count], detection[:count], distance_m[:count])
 
 
@@ -132,13 +134,13 @@ def own_affinity(
     """Mean affinity (N,) of each `detection` (N,) to what a `person` (N,) has of `candidate` (A, J, V) at the
     other ends of the joint's limbs, and how many (N,) of these there are.
     """
-    count, pairs = len(detections), detections.pairs
-    begin, (limb, ends) = np.zeros(count + 2, dtype=np.intp), _limb_ends(skeleton)
+    view, joint, _, pairs, affinity = detections.columns
+    begin, (limb, ends) = np.zeros(len(view) + 2, dtype=np.intp), _limb_ends(skeleton)
     other, value = np.empty(pairs.size, dtype=np.intp), np.empty(pairs.size)
     mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
     _tie(
-        person, detection, candidate, detections.joint, detections.view, pairs, detections.affinity, limb, ends,
-        begin, other, value, mean, neighbours,
+        person, detection, candidate, joint, view, pairs, affinity, limb, ends, begin, other, value, mean,
+        neighbours,
     )  # fmt: skip
     return mean, neighbours
 
@@ -201,8 +203,7 @@ def _tie(
     """
     for e in range(len(pairs)):
         for end in range(2):
-            if pairs[e, end] + 2 < len(begin):
-                begin[pairs[e, end] + 2] += 1
+            begin[pairs[e, end] + 2] += 1
     for d in range(2, len(begin)):
         begin[d] += begin[d - 1]
     for e in range(len(pairs)):

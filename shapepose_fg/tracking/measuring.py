@@ -45,7 +45,7 @@ def measured(
     numbers = np.array([*sigma, *gate, _KERNELS.index(config.kernel), wide, MIN_DEPTH_M])
     mean, covariance = joints.mean.copy(), joints.covariance.copy()
     inlier = np.zeros(candidate.shape, dtype=bool)
-    seen = np.ascontiguousarray(detections.xy), weight, config.scatter(names)
+    seen = detections.columns[2], weight, config.scatter(names)
     _measure(mean, covariance, at, candidate, *seen, rig.K @ rig.cTw, rig.focal_px, numbers, inlier)
     return JointStates(mean, covariance), inlier
 

@@ -133,6 +133,8 @@ class Tracker:
     """How far detections are trusted."""
     drop: NoteDropped = lambda reason, frames: None
     """Is told why somebody was not kept, and in which frames."""
+    search: Callable[[int], None] = lambda frame: None
+    """Is told in which frame new people are sought."""
 
     def nobody(self) -> Tracks:
         """Tracks of no people."""

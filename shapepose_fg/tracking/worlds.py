@@ -163,8 +163,16 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
     parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / _KEY_S)))
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
-    found = [(key, *tracker.newcomers(nobody, none, frames[key].detections, frames[key].rig)) for key in keys]
+    found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
     return [back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
+
+
+def _newcomers(
+    tracker: Tracker, tracks: Tracks, candidate: NDArray[np.intp], frame: Input
+) -> tuple[Array, NDArray[np.intp]]:
+    """New people in a frame; the tracker is told in which."""
+    tracker.search(frame.frame)
+    return tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
 
 
 def _seed(
@@ -261,7 +269,7 @@ def _follow(
             tracks, candidate = tracks.rows(rest), candidate[rest]
         for world in [world for world, since in births.items() if (since <= t if forwards else since >= t)]:
             here = tracks.world == world
-            places, theirs = tracker.newcomers(tracks.rows(here), candidate[here], frame.detections, frame.rig)
+            places, theirs = _newcomers(tracker, tracks.rows(here), candidate[here], frame)
             if len(places) > 0:
                 new = tracker.at(
                     places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s

@@ -207,6 +207,9 @@ class NobodyIsThere:
         """Tracks of no people."""
         return Tracks.none(BODY_25)
 
+    def search(self, frame: int) -> None:
+        """Nowhere."""
+
     def newcomers(self, *_: object) -> tuple[np.ndarray, np.ndarray]:
         """Nobody."""
         return np.zeros((0, 25, 3)), np.zeros((0, 25, 1), dtype=np.intp)

@@ -1,15 +1,22 @@
 """Lists of what is near: what is in them, and what becomes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.priors import longest_bones
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.pipeline import PipelineConfig
+from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.proposal.nearby import nearby
 from shapepose_fg.proposal.possible_people import Frame, _claimed
 from shapepose_fg.proposal.stage_one import StageOne
+from shapepose_fg.tracking.following import FollowState, finish
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +70,16 @@ def test_without_hips_nobody_is_sought_by_hips(five_cameras, two_people, seen_ex
     assert len(search(without, five_cameras)) == 0
     monkeypatch.setattr("shapepose_fg.proposal.stage_one.vote", None)
     assert len(search(without, five_cameras)) == 0, "not even asked"
+
+
+def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_people, seen_exactly, monkeypatch):
+    """14 people on whom no affinities speak, nobody by evidence: over 100 points of a joint, and 50 candidates."""
+    monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_LEFT", 100)
+    beside = np.array([[0.0, 0.3 * n, 0.0] for n in range(7)])
+    seen = seen_exactly(five_cameras, (two_people[:, None] + beside[:, None]).reshape(-1, 25, 3))
+    seen = replace(seen, pairs=np.zeros((0, 2), dtype=np.intp), affinity=np.zeros(0))
+    config, book = PipelineConfig(), Notebook()
+    fitter = make_fitter(config.body, BodyModel.default().with_keypoints(BODY_25.joints))
+    tracker = Setup(five_cameras, BODY_25, config, fitter).engine(book).tracker
+    finish(tracker, FollowState(tracker.nobody(), pending=(Input(7, np.zeros(5), seen, five_cameras),)))
+    assert book.torn_off().thinned_frames == {"points": [7], "candidates": [7]}
