@@ -15,18 +15,22 @@ from numba.core import event
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+_OPTIONS: dict[str, Any] = {
+    "error_model": "numpy",
+    "nogil": True,
+    "fastmath": {"contract", "reassoc"},
+    "no_cfunc_wrapper": True,
+}
+
+
 def kernel(function: F) -> F:
     """The function, compiled at its first call. Sums may be taken in another order, NaN and infinity are kept."""
-    fast = {"contract", "reassoc"}
-    compiled = numba.njit(cache=True, error_model="numpy", nogil=True, fastmath=fast, no_cfunc_wrapper=True)
-    return cast(F, compiled(function))
+    return cast(F, numba.njit(cache=True, **_OPTIONS)(function))
 
 
 def part(function: F) -> F:
-    """A piece of one or two kernels, compiled as if it stood there: what is only called need not be compiled
-    alone.
-    """
-    return cast(F, numba.njit(inline="always")(function))
+    """A piece of kernels, which Python cannot call: compiled with them, sooner than a kernel is."""
+    return cast(F, numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function))
 
 
 class _Compiling(event.Listener):

@@ -132,7 +132,7 @@ def fitted_without(
     out[known] = (weight[..., None, None] * root[place, pairs.without])[known]
     root[np.nonzero(known)[0], pairs.without[known]] = 0.0
     given, xyz = WhitenedTargets(targets.xyz[pairs.row], root), np.zeros((N, *body.xyz.shape[1:]))
-    Y, B, C = np.zeros((N, 6 * M + 10, P)), np.zeros((N, 6 * M + 11, 3 * M)), np.zeros((N, 3 * M + 10, 3 * M + 10))
+    Y, B, C = np.empty((N, 6 * M + 10, P)), np.empty((N, 6 * M + 11, 3 * M)), np.empty((N, 3 * M + 10, 3 * M + 10))
     good = np.zeros(N, dtype=bool)
     lessened(body.system, pairs.row, pairs.without, out, Y, B, C, good)
     covariance = np.stack([C[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(M)], axis=1)
@@ -145,10 +145,10 @@ def fitted_without(
         better, before[going] = slope.energy < before[going], slope.energy
         stepped(body.system, row, going, Y, B, slope.gradient, step, move)
     xyz[going] = slope.xyz
-    far = np.linalg.norm(move.reshape(N, M, 3), axis=2) > NEAR * sigma
-    far = (far & known).any(axis=1) | ~good | ~np.isfinite(move).all(axis=1)
     free[going[~better]] = body.free[row[~better]]
-    shape, far = C[:, -10:, -10:], np.flatnonzero(far)
+    good[going] = better
+    close = np.linalg.norm(move.reshape(N, M, 3), axis=2) < NEAR * sigma  # NaN is not
+    shape, far = C[:, -10:, -10:], np.flatnonzero(~(good & (close | ~known).all(axis=1)))
     if len(far) > 0:
         anew = plain.again(free[far], given.rows(far), held.rows(far), _SETTLED)
         free[far], xyz[far] = anew.free, anew.xyz

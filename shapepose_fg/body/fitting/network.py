@@ -109,15 +109,21 @@ def _layer(x, weight, bias, y):
     for start in range(0, outputs, 16):
         for i in range(0, B, 4):
             j, k, m = min(i + 1, B - 1), min(i + 2, B - 1), min(i + 3, B - 1)
-            for o in range(start, min(start + 16, outputs)):
-                a, b, c, d = bias[o], bias[o], bias[o], bias[o]
+            for o in range(start, min(start + 16, outputs), 2):
+                q = min(o + 1, outputs - 1)
+                a, b, c, d, e, f, g, h = bias[o], bias[o], bias[o], bias[o], bias[q], bias[q], bias[q], bias[q]
                 for p in range(count):
-                    v = weight[o, p]
+                    v, w = weight[o, p], weight[q, p]
                     a += x[i, p] * v
                     b += x[j, p] * v
                     c += x[k, p] * v
                     d += x[m, p] * v
+                    e += x[i, p] * w
+                    f += x[j, p] * w
+                    g += x[k, p] * w
+                    h += x[m, p] * w
                 y[i, o], y[j, o], y[k, o], y[m, o] = a, b, c, d
+                y[i, q], y[j, q], y[k, q], y[m, q] = e, f, g, h
 
 
 _ROOT_HALF, _HALF, _ONE, _FAR = (np.float32(value) for value in (0.5**0.5, 0.5, 1.0, 3.9))

@@ -132,21 +132,23 @@ class LevenbergMarquardt:
         self, free: Array, targets: WhitenedTargets, warm: Mask, held: Held, tolerance: float = TOLERANCE
     ) -> Array:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
-        energy, P, rows = self._energy, free.shape[1], np.arange(len(free))
+        energy, rows = self._energy, np.arange(len(free))
         result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)
         widening = np.where(warm, 0, ANNEAL_STEPS)
         here = energy.linearise(free, targets, self._scale * 2.0**widening, held, vectors=False)
         for _ in range(MAX_ITERATIONS):
             step, promised = np.empty(free.shape), np.empty(len(free))
             solved(here.system.copy(), damping, step, promised)
-            promised += np.einsum("bi,bii,bi,b->b", step, here.system[:, :P], step, damping, optimize=True)
+            promised += damping * (np.diagonal(here.system, axis1=1, axis2=2) * step**2).sum(axis=1)
             trial = energy.retract(free, step)
             scale, annealed = self._scale * 2.0**widening, widening == 0
             there = energy.linearise(trial, targets, scale, held, vectors=False)
             gain = here.energy - there.energy
             better = gain > 0  # a step into NaN is not
-            for old, new in zip((free, *here), (trial, *there), strict=True):
-                old[better] = new[better]
+            if not better.all():
+                for old, new in zip((free, *here), (trial, *there), strict=True):
+                    new[~better] = old[~better]
+            free, here = trial, there
             damping = _next_damping(damping, better, gain / promised)
             settled = np.where(better, gain, promised) < tolerance
             going = ~(annealed & settled) & (damping < _DAMPING_MAX)

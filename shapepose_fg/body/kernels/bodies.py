@@ -46,7 +46,7 @@ def _product(A, B, C):
             C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@kernel
+@part
 def _put(limbs, betas, place, jacobian, w):
     """World rotations and axes from `local` and `tangent`, points, and their Jacobian.
 
@@ -61,7 +61,7 @@ def _put(limbs, betas, place, jacobian, w):
             _product(w.world[limbs.parent[q]], w.local[q], w.world[q])
         _product(w.world[q], w.tangent[q], w.axes[q])
     for k in range(len(limbs.root)):
-        J, first, end, m = w.J[k], limbs.first[k], limbs.first[k + 1], 10
+        J, first, end, m = w.J[k], limbs.first[k], limbs.first[k + 1], len(betas)
         for x in range(3):
             for n in range(10):
                 J[x, n] = limbs.root_by_shape[k, x, n]
@@ -129,7 +129,7 @@ def _pull(w, k, f0, f1, f2):
         w.gradient[column[i]] += f0 * J[0, i] + f1 * J[1, i] + f2 * J[2, i]
 
 
-@kernel
+@part
 def _slope(limbs, priors, free, rows, b, scale, w):
     """The energy of row b, and half its gradient."""
     A, g, c2, energy = len(priors.mean), w.gradient, scale * scale, 0.0

@@ -7,6 +7,8 @@ is scalar products of rows.
 
 import math
 
+import numpy as np
+
 from shapepose_fg.core.compiled import kernel, part
 
 LIMB_M = 0.4
@@ -14,8 +16,11 @@ LIMB_M = 0.4
 
 Chosen so that hidden wrists, arms and legs of held-out motions lie where their covariance says."""
 
+_FIRST = np.intp(0)
+"""A literal 0 would have functions compiled once more."""
 
-@kernel
+
+@part
 def _reduced(H, n, first, end):
     """Reduce the rows `first` to `end` of a system with n unknowns; False where H is not positive definite."""
     for i in range(first, end, 4):
@@ -59,7 +64,7 @@ def _back(H, n, row, step):
             step[j] -= step[k] * H[k, j]
 
 
-@kernel
+@part
 def _products(Y, first, count, n, out):
     """`out` = the scalar products of `count` rows (n,) of Y from `first` on."""
     for i in range(count):
@@ -74,7 +79,7 @@ def _products(Y, first, count, n, out):
 def reduce_systems(system):
     """Reduce B whole systems (B, M, P)."""
     for b in range(len(system)):
-        _reduced(system[b], system.shape[2], 0, system.shape[1])
+        _reduced(system[b], system.shape[2], _FIRST, system.shape[1])
 
 
 @kernel
@@ -157,7 +162,7 @@ def lessened(system, row, without, root, Y, B, C, good):
                     D[i + 1, j] = total
                 else:
                     G[i - m, j - m] = G[j - m, i - m] = total
-        good[n] = _reduced(D, m, m - m, m)
+        good[n] = _reduced(D, m, _FIRST, m)
         if good[n]:
             _reduced(D, m, m + 1, count + 1)
             for i in range(m + 10):
@@ -242,7 +247,7 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
             front[rhs + 1 + m, rhs] += H[P, m]
             for j in range(m + 1):
                 front[rhs + 1 + m, rhs + 1 + j] += H[m, j]
-        if not _reduced(K, N, 0, M):
+        if not _reduced(K, N, _FIRST, M):
             front[M - 1, M - 1] = math.nan  # and so in all that follows
         for i in range(N, M, 4):
             stop = min(i + 4, M)
