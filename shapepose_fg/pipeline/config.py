@@ -116,6 +116,7 @@ class PipelineConfig(Settings):
     memory."""
 
     replaced: ClassVar[dict[str, str]] = {
+        "threads": "is gone: bodies are fitted by one thread",
         "candidates": f"{_CONSTANT}; gate_m and most_pairs are in [people]",
         "proposals": f"{_CONSTANT}; min_probability is in [people], and method chooses between evidence and hips",
         "association": _CONSTANT,

@@ -266,10 +266,11 @@ def tiny_body(seed: int) -> dict[str, np.ndarray]:
 
 
 def _weights(folder: Path, seed: int) -> Read:
-    from shapepose_fg.body.fitting.descent import NetworkConfig, UpdateNetwork
+    from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork, layer_shapes
     from shapepose_fg.body.fitting.weights import FitterWeights
 
-    network = UpdateNetwork(NetworkConfig(width=2, blocks=1))
+    config = NetworkConfig(width=2, blocks=1)
+    network = UpdateNetwork(config, {name: np.zeros(shape) for name, shape in layer_shapes(config).items()})
     shipped = FitterWeights.default()
     FitterWeights(network, shipped.frame, "body", shipped.spread, {}).save(folder / "weights.safetensors")
     return lambda: FitterWeights.load(folder / "weights.safetensors")

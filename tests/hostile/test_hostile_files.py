@@ -273,7 +273,6 @@ def test_weights_that_lie(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "threads = 100000",
         "[body]\npolish_steps = 100000",
         "[people]\ngate_m = 1e308",
         "batch_frames = 0",

@@ -243,9 +243,8 @@ class _Chain:
         )
         moved, pull = self._links.at(root, others)
         away = state.betas - self._mean
-        return _Normal(
-            float(linear.energy.sum()) + moved + away @ self._firm @ away, linear.system, pull[:T], away
-        )
+        energy = float(linear.energy.sum() + moved + away @ self._firm @ away)
+        return _Normal(energy, linear.system, pull[:T], away)
 
     def _step(self, state: _State, here: _Normal, damping: float) -> tuple[Array, Array, Array]:
         """Steps of betas (10,) and poses (T, N), and the rows' information about the betas (10, 10)."""

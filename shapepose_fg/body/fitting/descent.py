@@ -119,10 +119,10 @@ class Sight:
 
 def _moved(state: BodyState, change: NDArray[np.float32]) -> BodyState:
     """The state after a change (B, `NUM_PARAMETERS`) of betas, 6D rotations, translation."""
-    change, local = STEP * change.astype(np.float64), state.local.copy()
-    turned = six_d(local[:, :NUM_ROTATIONS]) + change[:, 10:-3].reshape(-1, NUM_ROTATIONS, 6)
+    step, local = STEP * change.astype(np.float64), state.local.copy()
+    turned = six_d(local[:, :NUM_ROTATIONS]) + step[:, 10:-3].reshape(-1, NUM_ROTATIONS, 6)
     local[:, :NUM_ROTATIONS] = from_six_d(turned)
-    return BodyState(state.betas + 10 * change[:, :10], local, state.transl + change[:, -3:])
+    return BodyState(state.betas + 10 * step[:, :10], local, state.transl + step[:, -3:])
 
 
 def believed(information: Array) -> tuple[Array, Array]:

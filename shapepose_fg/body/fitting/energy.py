@@ -6,7 +6,9 @@ with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose p
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -123,7 +125,7 @@ class BodyEnergy:
         self._hidden = hidden
         parts = (prior.mean[self.angles], prior.marginal_precision(self.angles), place, gain,
                  prior.mean[hidden] - gain @ prior.mean[self.angles])  # fmt: skip
-        self.priors = Priors(*(np.array(part, order="C") for part in parts))
+        self.priors = Priors(*_contiguous(parts))
         """The pose prior of the free parameters."""
         column = np.full(24, -1)
         column[0], column[1 + visible] = 10, 13 + 3 * np.arange(len(visible))
@@ -174,6 +176,11 @@ class BodyEnergy:
         linear, step, left = self.linearise(free, targets, scale, held), np.empty(free.shape), np.empty(len(free))
         solved(linear.system, np.zeros(len(free)), step, left)
         return Evaluated(_plain(free).copy(), *linear, step, left)
+
+
+def _contiguous(parts: Sequence[Any]) -> Iterator[Any]:
+    """As kernels want them."""
+    return (np.array(part, order="C") for part in parts)
 
 
 def _plain(array: Array) -> Array:

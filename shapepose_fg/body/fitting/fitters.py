@@ -178,9 +178,9 @@ class SmplFitter(BodyFitter):
                     body, part = body.rows(~unsettled[part]), part[~unsettled[part]]
             self._fill(fit, rows, evidence, part, body, held.rows(part), pairs)
         for part in _parts(np.flatnonzero(unsettled), _CHUNK):
-            targets = _centred(evidence, part)
-            arrived, held = self._plain.arrive(targets, evidence.variance_m2[part])
-            body = self._plain.evaluated(arrived, targets, held)
+            given = _centred(evidence, part)
+            arrived, held = self._plain.arrive(given, evidence.variance_m2[part])
+            body = self._plain.evaluated(arrived, given, held)
             self._fill(fit, rows, evidence, part, body, held, pairs)
         return fit
 
@@ -225,7 +225,9 @@ class SmplFitter(BodyFitter):
                 place = part[mine.row], mine.group
                 alone[place], precision[place] = found.betas, np.linalg.inv(found.betas_covariance)
                 voting[place] = voting[place[0], S]
-        for number in range(S if pairs is not None else 0):
+        for number in range(S):
+            if pairs is None:
+                break
             betas = pooled_betas(alone[:, number], precision[:, number], groups, voting[:, number], by_priors)
             pairs = pairs.at_shape(number, betas, shared(groups, voting[:, number]))
         settled = shared(groups, voting[:, S])

@@ -138,11 +138,11 @@ def fitted_without(
     covariance = np.stack([C[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(M)], axis=1)
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 3)
     going, step, move = np.flatnonzero(good), np.zeros((N, P)), np.zeros((N, 3 * M))
-    row, before = pairs.row[going], np.full(N, np.inf)
+    row, before, better = pairs.row[going], np.full(N, np.inf), np.ones(len(going), dtype=bool)
     for _ in range(2):  # the second time only to see how far that was
         free[going] = energy.retract(free[going], step[going])
         slope = energy.linearise(free[going], given.rows(going), scale, held.rows(going), slope_only=True)
-        better, before[going] = slope.energy < before[going], slope.energy
+        better, before[going] = np.asarray(slope.energy < before[going]), slope.energy
         stepped(body.system, row, going, Y, B, slope.gradient, step, move)
     xyz[going] = slope.xyz
     free[going[~better]] = body.free[row[~better]]

@@ -114,7 +114,7 @@ class LevenbergMarquardt:
         parts = (np.zeros((count, 10)), log_so3(rotation), angles, pelvis + self._frame.transl)
         free, warm = np.concatenate(parts, 1), np.zeros(count, dtype=bool)
         if start is not None:
-            warm = ~np.isnan(start).any(axis=1)
+            warm = np.asarray(~np.isnan(start).any(axis=1))
             free = np.where(np.isnan(start), free, start)
         held = self._energy.held_by_priors(count)
         return self.solve(free, targets, warm, held), held

@@ -80,8 +80,9 @@ class FitterWeights:
             spread = tensors.pop(_SPREAD)
             learnt = {name: value for name, value in tensors.items() if not name.startswith(_FRAME)}
             network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])), learnt)
-            frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in tensors.items() if k.startswith(_FRAME)})
-            return cls(network, frame, about["body"], spread, json.loads(about["card"]), path)
+            placed = {k: v.astype(np.float64) for k, v in tensors.items() if k.startswith(_FRAME)}
+            frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in placed.items()})
+            return cls(network, frame, about["body"], spread.astype(np.float64), json.loads(about["card"]), path)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             why = f"weights of another version of the fitter ({str(error).splitlines()[0]}); train them anew"
             raise InputError(f"{path}: {why}") from error

@@ -12,6 +12,7 @@ with their sum. `body/kernels/bodies.py` is where that is computed.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -95,7 +96,7 @@ class SkinnedPoints:
             pose.transpose(0, 2, 1), self.root, self.root_shape.transpose(1, 2, 0), self.translation, parents,
             column,
         )  # fmt: skip
-        return Limbs(*(np.array(part, order="C") for part in parts))
+        return Limbs(*map(_contiguous, parts))
 
     @cached_property
     def _limbs(self) -> Limbs:
@@ -144,6 +145,11 @@ class SkinnedPoints:
         work = Work.of(self._limbs, NUM_COLUMNS)
         placed(self._limbs, local, betas, transl, target, information, kernel_scale, xyz, gradient, slopes, work)
         return xyz, slopes, gradient
+
+
+def _contiguous(part: Any) -> Any:
+    """As kernels want it."""
+    return np.array(part, order="C")
 
 
 def contract(
