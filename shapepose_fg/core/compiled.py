@@ -15,22 +15,17 @@ from numba.core import event
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-_OPTIONS: dict[str, Any] = {
-    "error_model": "numpy",
-    "nogil": True,
-    "fastmath": {"contract", "reassoc"},
-    "no_cfunc_wrapper": True,
-}
+_OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": {"contract", "reassoc"}, "no_cfunc_wrapper": True}
 
 
 def kernel(function: F) -> F:
     """The function, compiled at its first call. Sums may be taken in another order, NaN and infinity are kept."""
-    return cast(F, numba.njit(cache=True, **_OPTIONS)(function))
+    return cast(F, cast(Any, numba.njit)(cache=True, **_OPTIONS)(function))
 
 
 def part(function: F) -> F:
     """A piece of kernels, which Python cannot call: compiled with them, sooner than a kernel is."""
-    return cast(F, numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function))
+    return cast(F, cast(Any, numba.njit)(no_cpython_wrapper=True, **_OPTIONS)(function))
 
 
 class _Compiling(event.Listener):
