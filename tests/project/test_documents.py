@@ -80,7 +80,7 @@ def test_readme_and_using_in_python(recording, tmp_path):
     assert metrics.mpjpe_mm < 30
     # Four people in the first frame: each surface is that of one true person, to a few centimetres.
     assert names["vertices"].shape[0] == len(saved) == 24
-    found, true = names["vertices"][:4].numpy(), recording.vertices_at(0)
+    found, true = names["vertices"][:4], recording.vertices_at(0)
     apart = np.linalg.norm(found[:, None] - true[None], axis=-1).mean(axis=-1)
     assert sorted(apart.argmin(axis=1).tolist()) == [0, 1, 2, 3]
     assert apart.min(axis=1).max() < 0.05

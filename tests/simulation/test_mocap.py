@@ -129,7 +129,7 @@ def test_parameters_pose_the_body_that_was_planned(tiny_mocap: Mocap, body: Body
     double = BodyModel(body.arrays)
     performed = perform(double, SHAPES[1], tiny_mocap.clip(0)).moved(np.array([0.4, -0.3]), 1.1)
     motion = together(SHAPES[1:2], [performed], len(performed))
-    joints = double.joints(parameters_of(double, motion))
+    joints = double.joints(parameters_of(motion))
     np.testing.assert_allclose(joints, performed.joints, atol=1e-9)
 
 

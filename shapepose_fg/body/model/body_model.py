@@ -146,11 +146,11 @@ class BodyModel:
         mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
         B, local, betas = len(parameters), parameters.local, parameters.betas
         rotations = accumulate(local)
-        shaped = mesh.template + (betas @ mesh.shapes).reshape(B, -1, 3)
+        shaped = mesh.template + (betas @ mesh.shapes).reshape(B, *mesh.template.shape)
         if mesh.pose_blend is not None:
             bent = (local[:, 1:] - np.eye(3)).reshape(B, -1)
-            shaped = shaped + (bent @ mesh.pose_blend).reshape(B, -1, 3)
-        rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(B, -1, 3)
+            shaped = shaped + (bent @ mesh.pose_blend).reshape(shaped.shape)
+        rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(B, *mesh.rest_joints.shape)
         shift = self.joints(parameters) - (rotations @ rest[..., None])[..., 0]
         posed = mesh.weights @ shift
         for axis in range(3):  # of the vertex at rest
