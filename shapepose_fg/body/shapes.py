@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
 from shapepose_fg.core.arrays import Array, Index
@@ -34,6 +33,8 @@ def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -
     factor = _log_evidence(seen, gradient, known.betas, known.information)
     factor -= _log_evidence(seen, gradient, np.zeros((1, len(eye))), eye[None])
     gain = np.maximum(factor - np.log(ratio), 0.0)
+    from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
+
     rows, columns = linear_sum_assignment(gain, maximize=True)
     kept = gain[rows, columns] > 0
     whose[rows[kept]] = columns[kept]

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.arrays import Array, Index
@@ -173,6 +172,8 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
         new = moved(step)
         at = (points @ new.cTw[:, :3].T + new.cTw[:, 3]) @ new.K.T
         return ((at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy) / width_px).ravel()
+
+    from scipy.optimize import least_squares  # loads for a fifth of a second
 
     start = np.zeros(len(columns))
     return moved(least_squares(errors, start, x_scale="jac", loss="cauchy", max_nfev=_STEPS).x)

@@ -5,7 +5,6 @@ memory.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Seconds, Settings
@@ -154,9 +153,12 @@ def _identities(
     early = np.flatnonzero(needed & (chosen.start == 0))
     carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
     apart = core_distance(found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton)
-    for row, column in zip(*linear_sum_assignment(np.minimum(apart, 2 * _SAME_M)), strict=True):
-        if apart[row, column] < _SAME_M:
-            identity[early[row]] = found.carried[carried[column]]
+    if apart.size > 0:
+        from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
+
+        for row, column in zip(*linear_sum_assignment(np.minimum(apart, 2 * _SAME_M)), strict=True):
+            if apart[row, column] < _SAME_M:
+                identity[early[row]] = found.carried[carried[column]]
     next_id = state.next_id
     for k in np.argsort(chosen.start, kind="stable").tolist():
         if not needed[k] or identity[k] >= 0:

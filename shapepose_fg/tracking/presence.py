@@ -5,7 +5,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Rig
@@ -253,6 +252,8 @@ class Account:
         owners = owners[:, :-1][:, (owners[:, :-1] >= 0).any(axis=0)]
         shared = np.zeros((len(one.start) + 1, len(other.start) + 1))
         np.add.at(shared, tuple(owners), 1.0)  # the last row and column are nobody's
+        from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
+
         same = linear_sum_assignment(shared[:-1, :-1], maximize=True)
         return float(shared[same].sum() / owners.shape[1]) if owners.shape[1] > 0 else 1.0
 

@@ -136,9 +136,7 @@ class SkinnedPoints:
         energy of targets (B, K, 3) with `information` (B, K, 3, 3).
         """
         B, K = len(betas), len(self.root)
-        given = (
-            np.ascontiguousarray(part, dtype=np.float64) for part in (local, betas, transl, target, information)
-        )
+        given = (np.require(part, float, ["C", "W"]) for part in (local, betas, transl, target, information))
         local, betas, transl, target, information = given
         xyz, gradient = np.zeros((B, K, 3)), np.zeros((B, NUM_COLUMNS))
         slopes = np.zeros((B if jacobian else 0, K, 3, NUM_COLUMNS))

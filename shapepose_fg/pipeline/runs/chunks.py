@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.detections import Input
@@ -128,6 +127,8 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
     for i, a in enumerate(old):
         mine = before.rows(before.track == a)
         alike[i] = [_alike(mine, after.rows(after.track == b)) for b in new]
+    from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
+
     rows, columns = linear_sum_assignment(-alike)
     return {int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if alike[i, k] > 0}
 
