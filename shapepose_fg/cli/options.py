@@ -39,7 +39,6 @@ def argument(metavar: str, text: str) -> Any:
 class Preset(StrEnum):
     """Settings that hang together."""
 
-    FAST = "fast"
     ACCURATE = "accurate"
     PAPER = "paper"
 
@@ -47,12 +46,12 @@ class Preset(StrEnum):
         """All of them."""
         from shapepose_fg.pipeline.config import PipelineConfig
 
-        return {"fast": PipelineConfig.fast, "accurate": PipelineConfig, "paper": PipelineConfig.paper}[self]()
+        return PipelineConfig.paper() if self is Preset.PAPER else PipelineConfig()
 
 
 def preset_option(default: Preset | None) -> Any:
     """Which of them."""
-    return option(RESULT, "fast; accurate (default); paper: the method as the paper has it.", default)
+    return option(RESULT, "accurate (default), or paper: the method as the paper has it.", default)
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -127,11 +127,6 @@ class PipelineConfig(Settings):
     """Tables that there were, and what took their place."""
 
     @classmethod
-    def fast(cls) -> "PipelineConfig":
-        """For many hours of footage: what it loses is in docs/evaluation.md."""
-        return cls(windows=WindowConfig(again_over_time=1, again_alone=2))
-
-    @classmethod
     def paper(cls) -> "PipelineConfig":
         """The method as the paper has it written in section 3, without what we settled differently."""
         return cls(

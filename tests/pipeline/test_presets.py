@@ -51,9 +51,7 @@ def seen(rig, people, confidence=0.8) -> Observations:
     return Observations(xy, np.full(xy.shape[:3], confidence), people.copy())
 
 
-@pytest.mark.parametrize(
-    ("name", "settings"), [("paper", PAPER), ("accurate", PipelineConfig()), ("fast", PipelineConfig.fast())]
-)
+@pytest.mark.parametrize(("name", "settings"), [("paper", PAPER), ("accurate", PipelineConfig())])
 def test_presets_read_back(name, settings, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["config", "--preset", name])
@@ -216,11 +214,11 @@ def test_stage_two_s_settings_of_the_paper():
     assert not PAPER.temporal and PAPER.offsets.source == "none"
 
 
-def test_a_preset_is_one_of_three_and_stands_for_itself(tmp_path):
+def test_a_preset_stands_for_itself(tmp_path):
     """Beside a file of settings nobody could say which of the two counts."""
-    request = Request(calibration=tmp_path, detections=tmp_path, preset=Preset.FAST)
-    assert prepare(request, tmp_path).settings() == PipelineConfig.fast() != PipelineConfig()
+    request = Request(calibration=tmp_path, detections=tmp_path, preset=Preset.PAPER)
+    assert prepare(request, tmp_path).settings() == PAPER != PipelineConfig()
     assert prepare(replace(request, preset=None), tmp_path).settings() == PipelineConfig()
     both = prepare(replace(request, config=tmp_path / "mine.toml"), tmp_path)
-    with pytest.raises(InputError, match=r"--preset fast: not beside --config .*mine.toml; `shapepose-fg config"):
+    with pytest.raises(InputError, match=r"--preset paper: not beside --config .*mine.toml; `shapepose-fg config"):
         both.settings()
