@@ -11,6 +11,7 @@ before six cameras, from recorded motions where they are found. Longer ones are 
 
 import argparse
 import json
+import math
 import os
 import platform
 import subprocess
@@ -55,11 +56,11 @@ class Spent:
     """What a run of a command took."""
 
     cpu_s: float
-    """Seconds of all processors, of processes that it started too."""
+    """Seconds of the processor; NaN with worker processes, whose times nobody adds up."""
     wall_s: float
     """Seconds of the clock."""
     peak_mib: float
-    """The most memory of its largest process, MiB."""
+    """The most memory of the process, MiB."""
     stages_s: dict[str, float]
     """The clock's seconds of each stage, without those of stages inside it."""
 
@@ -121,7 +122,8 @@ def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
             raise SystemExit(f"{tree}: {' '.join(command)} failed:\n{said.read().decode()}")
     peak_mib = used.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     stages_s = json.loads((output / "run.json").read_text(encoding="utf-8"))["seconds"]
-    return Spent(used.ru_utime + used.ru_stime, wall_s, peak_mib, stages_s)
+    cpu_s = math.nan if "--workers" in options else used.ru_utime + used.ru_stime
+    return Spent(cpu_s, wall_s, peak_mib, stages_s)
 
 
 def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
@@ -199,6 +201,8 @@ def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
     def row(label: str, values: list[list[float]], digits: int, style: str | None = None) -> None:
         cells = [f"{median(v):.{digits}f} ({min(v):.{digits}f} to {max(v):.{digits}f})" for v in values]
         first, last = median(values[0]), median(values[-1])
+        if math.isnan(last):
+            return
         table.add_row(label, *cells, f"{last / first:.2f}" if first > 0 else "", style=style)
 
     runs = list(spent.values())
