@@ -37,7 +37,7 @@ from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.storage.output_folder import prepare_output
 
-# Everything else is imported inside the commands: `--help` must not wait for torch.
+# Everything else is imported inside the commands: `--help` must not wait for GTSAM and Numba.
 
 app = typer.Typer(
     name="shapepose-fg",

@@ -17,11 +17,9 @@ def match_best_first(left: Index, right: Index, score: Array) -> Index:
     Of equal scores the first edge is picked. Ends are numbers from 0.
     """
     order = np.argsort(-score, kind="stable")
-    ends = left.max(initial=-1) + 1, right.max(initial=-1) + 1
-    taken = np.zeros(ends[0], dtype=bool), np.zeros(ends[1], dtype=bool)
-    return order[
-        : _pick(order, np.require(left, np.intp, ["C", "W"]), np.require(right, np.intp, ["C", "W"]), *taken)
-    ]
+    left, right = (np.require(end, np.intp, ["C", "W"]) for end in (left, right))
+    taken = (np.zeros(end.max(initial=-1) + 1, dtype=bool) for end in (left, right))
+    return order[: _pick(order, left, right, *taken)]
 
 
 @kernel

@@ -13,7 +13,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
 from shapepose_fg.viz.rendering import look_at
 
-if TYPE_CHECKING:  # torch comes with it: processes that only look at people do without
+if TYPE_CHECKING:  # processes that only look at people do without
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 
 UP = np.array([0.0, 0.0, 1.0])

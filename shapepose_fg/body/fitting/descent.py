@@ -3,8 +3,8 @@
     Theta <- Theta + N_w(dE_shape/dTheta, Theta, X)              (Eq. 5 of the paper; Song et al., ECCV 2020)
 
 in the person's own frame: pelvis near the origin, upright, facing +z (see `PersonFrame`). E_shape is the data term
-of `BodyEnergy`, its gradient analytic. Training (`simulation/training/network.py`) sees the very same inputs, and
-has the network's layers and the bodies' points once more, differentiable.
+of `BodyEnergy`, its gradient analytic. Training (`simulation/training/differentiable.py`) sees the very same
+inputs, and has the network's layers and the bodies' points once more, differentiable.
 """
 
 from collections.abc import Iterator

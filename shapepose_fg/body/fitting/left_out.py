@@ -2,7 +2,7 @@
 
 A fit without a set is held by the priors, not by where the network arrived, which had seen the set. It starts
 from the fit with all targets, whose factor serves for it, too: taking a few targets out changes a Hessian by
-little. Where a further step would still move some joint by a third of its standard deviation, it is linearised
+little. Where a further step would still move some joint by half of its standard deviation, it is linearised
 anew, to the optimum.
 """
 

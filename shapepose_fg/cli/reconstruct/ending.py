@@ -83,7 +83,7 @@ def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds:
         table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
     if len(people) > 0:
         table.add_row("joints", _joints(counts["joints"], people))
-    # Loading torch and the body takes a second or two, once; it says nothing about the time of a frame.
+    # Loading the body takes a third of a second, once; it says nothing about the time of a frame.
     stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
     table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
     words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
