@@ -1,7 +1,7 @@
 """The solver: poses and lenses of all cameras, and joints of the people they see, in one factor graph (GTSAM).
 
-A joint seen by a camera is `GeneralSFMFactor2` between pose, joint and lens, with a robust kernel; what is known of
-each camera beforehand is a prior on its pose and its lens.
+A joint seen by a camera is `GeneralSFMFactor2` between pose, joint and lens, with a robust kernel; what is known
+of each camera beforehand is a prior on its pose and its lens.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,16 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 
 TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
-"""Where a camera's parameters stand: rad and m along its own axes, logarithm of the focal length, px, k1 k2 p1 p2."""
+"""Where a camera's parameters stand: rad and m along its own axes, log of the focal length, px, k1 k2 p1 p2."""
 Q = 13
 _HELD = 1e-6
 """Sigma of what must not change, as a part of what it would be."""
-_STEPS = 15
-_ENOUGH = 1e-5
+_HELD_PX = 0.1
+"""The same of what lenses hold, pixels; tighter constraints of single numbers would damp what they share."""
+_STEPS = 6
+_ENOUGH = 1e-4
 _PRIOR_WIDTH = 4.0
-"""Sigmas at which a camera's prior begins to give way: of six numbers; one that was bumped must not pull the rig."""
+"""Sigmas, of six numbers, at which a camera's prior gives way: one that was bumped must not pull the rig."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ def adjust(
     The camera `reference` keeps its pose; without one the rig stays where it is as a whole.
 
     `dilution` is how many of the errors of a detection, of joints and of frames, are one error: the priors are
-    weighed up by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies the
-    detections' sigmas.
+    weighed up by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies
+    the detections' sigmas.
     """
     free = freedom.lens > 0
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -115,7 +117,8 @@ def adjust(
     order = gtsam.Ordering()
     for each in [*dict.fromkeys(joints), *last]:
         order.push_back(each)
-    params = gtsam.LevenbergMarquardtParams()
+    # Ceres's way damps each parameter by its own information: pixels and metres stand side by side.
+    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
     params.setMaxIterations(_STEPS)
     params.setRelativeErrorTol(_ENOUGH)
     params.setOrdering(order)
@@ -132,7 +135,7 @@ def adjust(
 
 
 def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
-    """How large the residuals are as against what sigmas (times `scale`) say, by their median: 1 as they should."""
+    """How large residuals are as against what sigmas (times `scale`) say, by their median: 1 as they should."""
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
     away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
@@ -159,7 +162,7 @@ def _lens_columns(camera: Camera, free: bool) -> Array:
 
 def _lens_covariance(camera: Camera, sigmas: Array, free: bool) -> Array:
     columns = _lens_columns(camera, free)
-    held = np.diag(np.r_[1e-4 * np.ones(5), 1e-9 * np.ones(4)][: len(columns)]) ** 2
+    held = np.diag(np.r_[_HELD_PX * np.ones(5), _HELD_PX / camera.K[0, 0] * np.ones(4)][: len(columns)]) ** 2
     return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + held
 
 
@@ -175,7 +178,12 @@ def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Came
 
 
 def _information(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, joints: Sequence[int], views: Sequence[int], rig: Rig, free: bool
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    joints: Sequence[int],
+    views: Sequence[int],
+    rig: Rig,
+    free: bool,
 ) -> Array:
     """(V Q, V Q) what the people say of the cameras' parameters, their joints eliminated."""
     first, last = gtsam.Ordering(), gtsam.Ordering()
