@@ -1,0 +1,123 @@
+"""People of one camera followed from frame to frame in its picture, before anything is known of other cameras."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import correlate1d
+from scipy.optimize import linear_sum_assignment
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Views
+from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, rays_of
+
+_SAME = 0.08
+"""A person's joints move by less than this part of their size from frame to frame, in the median."""
+_SHORTEST_S = 0.4
+"""Tracks that are shorter say nothing of motion."""
+_SMOOTH_S = 0.05
+"""One sigma of the kernel by which tracks are smoothed: what lies between two frames is then no smoother than they."""
+
+_LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25
+"""What is known around a frame, and how far apart in time, as parts of what they are where all is known."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """K people as one camera followed them: M rows, those of a track side by side, a frame apart."""
+
+    first: Index
+    """(K,) row at which each begins."""
+    frame: Index
+    """(M,) frame of each row."""
+    track: Index
+    """(M,) its track."""
+    rays: Array
+    """(M, J, 3) directions in the world, smoothed; NaN where a joint is not seen."""
+    speed: Array
+    """(M, J, 3) how these change per frame."""
+    size: Array
+    """(M,) how large the person is, rad."""
+
+    def at(self, track: Index, time: Array) -> tuple[Array, Array, Array]:
+        """Directions (N, J, 3), their speeds and sizes (N,) of tracks (N,) at `time` (N,), frames; NaN outside."""
+        stop = np.append(self.first[1:], len(self.frame))
+        before = np.floor(time).astype(np.intp)
+        row = self.first[track] + before - self.frame[self.first[track]]
+        inside = (row >= self.first[track]) & (row + 1 < stop[track])
+        row = np.where(inside, row, 0)
+        part = np.where(inside, time - before, np.nan)
+        near, far = (1 - part)[:, None, None], part[:, None, None]
+        rays = near * self.rays[row] + far * self.rays[row + 1]
+        speed = near * self.speed[row] + far * self.speed[row + 1]
+        return rays, speed, np.where(inside, self.size[row], np.nan)
+
+    @classmethod
+    def of(cls, sightings: Sightings, views: Views, view: int, fps: float) -> "Tracks":
+        """What camera `view` saw, followed and smoothed."""
+        seen = sightings.only(sightings.view == view)
+        rays, size = rays_of(seen, views), seen.size_px / views.focal_px[view]
+        shortest = max(4, round(_SHORTEST_S * fps))
+        parts = [rows for rows in _followed(seen) if len(rows) >= shortest]
+        frames = [np.arange(seen.frame[rows[0]], seen.frame[rows[-1]] + 1) for rows in parts]
+        joints = seen.xy.shape[1]
+        every = [_smoothed(rays[rows], seen.frame[rows], _SMOOTH_S * fps) for rows in parts]
+        sizes = [np.interp(f, seen.frame[rows], size[rows]) for f, rows in zip(frames, parts, strict=True)]
+        lengths = [len(each) for each in frames]
+        none = np.zeros((0, joints, 3))
+        return cls(
+            np.cumsum([0, *lengths])[:-1].astype(np.intp),
+            np.concatenate([np.zeros(0, np.intp), *frames]),
+            np.repeat(np.arange(len(parts)), lengths),
+            np.concatenate([none, *(each for each, _ in every)]),
+            np.concatenate([none, *(change for _, change in every)]),
+            np.concatenate([np.zeros(0), *sizes]),
+        )
+
+
+def _followed(seen: Sightings) -> list[Index]:
+    """Rows of each track, by frames; one frame may be missing between two."""
+    open_, done = list[list[int]](), list[list[int]]()
+    order = np.argsort(seen.frame, kind="stable")
+    frames, starts = np.unique(seen.frame[order], return_index=True)
+    for frame, rows in zip(frames.tolist(), np.split(order, starts[1:]), strict=True):
+        done += [each for each in open_ if frame - seen.frame[each[-1]] > 2]
+        open_ = [each for each in open_ if frame - seen.frame[each[-1]] <= 2]
+        free = set(rows.tolist())
+        if open_:
+            last = np.array([each[-1] for each in open_])
+            away = np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1) / seen.size_px[rows][:, None]
+            both = np.isfinite(away)
+            middle = np.nanmedian(np.where(both.any(axis=-1, keepdims=True), away, 9.0), axis=-1)
+            cost = np.where(both.sum(axis=-1) >= MIN_JOINTS, np.minimum(middle, 1.0), 1.0)
+            for one, other in zip(*linear_sum_assignment(cost), strict=True):
+                if cost[one, other] < _SAME:
+                    open_[one].append(int(rows[other]))
+                    free.discard(int(rows[other]))
+        open_ += [[row] for row in sorted(free)]
+    return [np.array(each, dtype=np.intp) for each in done + open_]
+
+
+def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:
+    """`lines` of directions (N, J, 3) seen at rising frames (N,), in every frame from the first to the last."""
+    full = np.full((frame[-1] - frame[0] + 1, *rays.shape[1:]), np.nan)
+    full[frame - frame[0]] = rays
+    return lines(full, width)
+
+
+def lines(values: Array, width: float) -> tuple[Array, Array]:
+    """Values (T, J, 3) and their change per step: lines through what is known around each, within `width` steps.
+
+    Means would be those of another time beside gaps. NaN where little is known around.
+    """
+    known = np.isfinite(values[..., :1])
+    apart = np.arange(-np.ceil(3 * width), np.ceil(3 * width) + 1)
+    near = np.exp(-0.5 * (apart / width) ** 2) / (width * np.sqrt(2 * np.pi))
+
+    def around(each: Array, power: int) -> Array:
+        return np.asarray(correlate1d(each, near * apart**power, axis=0, mode="constant"))
+
+    there, full = known.astype(np.float64), np.where(known, values, 0.0)
+    w0, w1, w2, y0, y1 = around(there, 0), around(there, 1), around(there, 2), around(full, 0), around(full, 1)
+    spread = w0 * w2 - w1**2
+    spread = np.where((w0 > _LEAST_AROUND) & (spread > _LEAST_SPREAD * width**2), spread, np.nan)
+    return (w2 * y0 - w1 * y1) / spread, (w0 * y1 - w1 * y0) / spread
