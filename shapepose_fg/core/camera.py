@@ -189,6 +189,8 @@ class Rig:
     """The V cameras; a view is an index into them."""
     up: Axis
     """Which axis of the world points up."""
+    dark: tuple[int, ...] = ()
+    """Views without a picture, at the moment that the rig is of: nobody is expected to be seen there."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
@@ -230,8 +232,10 @@ class Rig:
 
     @cached_property
     def image_sizes(self) -> Array:
-        """(V, 2) width and height, pixels."""
-        return np.array([camera.image_size for camera in self.cameras], dtype=np.float64)
+        """(V, 2) width and height, pixels; 0 of a view without a picture."""
+        sizes = np.array([camera.image_size for camera in self.cameras], dtype=np.float64)
+        sizes[list(self.dark)] = 0.0
+        return sizes
 
     @cached_property
     def focal_px(self) -> Array:

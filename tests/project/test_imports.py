@@ -26,7 +26,7 @@ LEVELS = (
     "body.fitting body.shapes",
     "body.offsets",
     "core.detections core.frame_times",
-    "core.observations core.notes",
+    "core.observations core.notes core.repeated_pictures",
     "core.observation_table",
     "core.reconstruction",
     "proposal",
