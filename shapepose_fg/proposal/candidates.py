@@ -245,8 +245,8 @@ def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
 
 @kernel
 def _pick_seeds(order, along, place, xyz, joint, radius_m, seed):
-    """Fill in `seed` (M,). Points are picked in `order`; `along` are those of a joint by their first coordinate, and
-    `place` where each one is there, so that only those beside it are looked at.
+    """Fill in `seed` (M,). Points are picked in `order`; `along` are those of a joint by their first coordinate,
+    and `place` where each one is there, so that only those beside it are looked at.
     """
     for i in order:
         if seed[i] >= 0:
