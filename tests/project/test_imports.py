@@ -43,7 +43,7 @@ LEVELS = (
     "pipeline.solving",
     "simulation viz.bodies detection2d",
     "viz.overlay setup_check",
-    "viz.viewer",
+    "viz.viewer calibration",
     "io.export",
     "viz.report",
     "evaluation",
@@ -52,7 +52,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command",
+    " cli.train_fitter cli.batch.command cli.refine",
     "cli.main",
     "__main__",
 )
