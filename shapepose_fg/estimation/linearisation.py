@@ -12,7 +12,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.kernels import ROBUST, look, ready
+from shapepose_fg.core.pieces import ROBUST
+from shapepose_fg.estimation.kernels import look, ready
 
 MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
