@@ -10,7 +10,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight
+from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
 
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-13, 1e-6, 1e-10
@@ -60,6 +60,26 @@ def _eigen(A, values, vectors):
             values[a], values[a + 1] = values[a + 1], values[a]
             for b in range(3):
                 vectors[b, a], vectors[b, a + 1] = vectors[b, a + 1], vectors[b, a]
+
+
+@kernel
+def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, points):
+    """Fill in `points` (N, J, 3) that are NaN where two views see them and agree (`linearisation.triangulate`)."""
+    weight, x = np.empty(xy.shape[2]), np.empty(3)
+    for n in range(len(points)):
+        at = n if len(cameras) > 1 else 0
+        for j in range(points.shape[1]):
+            seen = 0
+            for v in range(xy.shape[2]):
+                if confidence[n, j, v] > 0.0:
+                    seen += 1
+            if seen < 2 or not math.isnan(points[n, j, 0] + points[n, j, 1] + points[n, j, 2]):
+                continue
+            agree = triangulated(
+                cameras[at], focal[at], xy[n, j], confidence[n, j], scale_m, reach_m, least_depth, weight, x
+            )
+            if agree >= 2:
+                points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
 
 
 @kernel

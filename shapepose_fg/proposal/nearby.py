@@ -41,6 +41,8 @@ class Sight(NamedTuple):
     """(D,) of which joint."""
     xy: Array
     """(D, 2) undistorted pixels."""
+    confidence: Array
+    """(D,) the detector's score."""
     order: Index
     """(D,) `Detections.order`."""
     rank: Array
@@ -58,7 +60,8 @@ class Sight(NamedTuple):
     def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "Sight":
         """What a rig saw."""
         view, joint, xy, _, _ = detections.columns
-        seen = view, joint, xy, detections.order, detections.rank, *detections.ties
+        confidence = np.require(detections.confidence, float, ["C", "W"])
+        seen = view, joint, xy, confidence, detections.order, detections.rank, *detections.ties
         return cls(rig.K @ rig.cTw, rig.focal_px, rig.image_sizes, *seen, *_limb_ends(skeleton))
 
 

@@ -11,6 +11,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.pieces import solved
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, nearby
 
@@ -196,12 +197,7 @@ def _nearest(chosen, rays, weight, centres, place):
             xx, yy, zz = xx + w * (1 - x * x), yy + w * (1 - y * y), zz + w * (1 - z * z)
             xy, xz, yz = xy - w * x * y, xz - w * x * z, yz - w * y * z
             px, py, pz = px + w * (a - along * x), py + w * (b - along * y), pz + w * (c - along * z)
-    # A matrix of three is solved by its cofactors.
-    first, second, third = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    over = 1.0 / (xx * first + xy * second + xz * third)
-    place[0] = (first * px + second * py + third * pz) * over
-    place[1] = (second * px + (xx * zz - xz * xz) * py + (xy * xz - xx * yz) * pz) * over
-    place[2] = (third * px + (xy * xz - xx * yz) * py + (xx * yy - xy * xy) * pz) * over
+    solved(xx, xy, xz, yy, yz, zz, px, py, pz, place)
 
 
 @part

@@ -6,12 +6,9 @@ import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight
-from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig, triangulate
+from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
+from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
 from shapepose_fg.tracking.plausibility import tear
@@ -47,56 +44,52 @@ class Trust(NamedTuple):
 
 
 def measured(
-    joints: JointStates,
-    lost: Mask,
-    candidate: Index,
-    detections: Detections,
-    rig: Rig,
-    sight: Sight,
-    config: ObservationConfig,
-    trust: Trust,
-    bones: Bones,
+    joints: JointStates, lost: Mask, candidate: Index, weight: Array, sight: Sight, trust: Trust, bones: Bones
 ) -> tuple[JointStates, Index, Mask]:
     """A people's joints after a frame in which they have the detections `candidate` (A, J, V), -1 for none; those
     of them that are within the gate, and of joints that can be the person's own; and for whom they are evidence
     (A,): enough core joints are seen by two views, or by one.
 
-    It is what `observation_sigmas` and `linearise` say at the joints, as the measurement of a Kalman filter.
-    Joints that are `lost` (A, J) begin where the views put them, if two or more do.
+    It is what `observation_sigmas` and `linearise` say at the joints, as the measurement of a Kalman filter;
+    `weight` (D,) is that of each detection, 0 for none. Joints that are `lost` (A, J) begin where the views put
+    them, if two or more do.
     """
-    at, mean, covariance = joints.position.copy(), joints.mean.copy(), joints.covariance.copy()
-    if lost.any():
-        unplaced = lost & ((candidate >= 0).sum(axis=-1) >= 2)
-        rows = np.flatnonzero(unplaced.any(axis=1))
-        if len(rows) > 0:
-            begin = np.where(unplaced[rows][..., None], np.nan, at[rows])
-            placed = triangulate(Observations.of(candidate[rows], detections, begin), Views.of(rig), config)
-            at[rows] = np.where(np.isfinite(placed), placed, at[rows])
-    weight = np.where(detections.confidence > 0, config.weight(detections.confidence), 0.0)
-    kept, evident = candidate.copy(), np.empty(len(mean), dtype=bool)
-    _measure(mean, covariance, at, kept, weight, sight, trust, bones, evident)
+    mean, covariance, kept = joints.mean.copy(), joints.covariance.copy(), candidate.copy()
+    evident = np.empty(len(mean), dtype=bool)
+    _measure(mean, covariance, lost, kept, weight, sight, trust, bones, evident)
     return JointStates(mean, covariance), kept, evident
 
 
 @kernel
-def _measure(mean, covariance, at, candidate, confident, sight, trust, bones, evident):
+def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, evident):
     """Update `mean` (A, J, S) and `covariance` (A, J, S, S), take out of `candidate` what does not fit, fill in
     `evident` (A,).
     """
     people, joints, views = candidate.shape
-    sigma_px, depths, inlier = np.empty(views), np.empty(views), np.empty((joints, views), dtype=np.bool_)
+    sigma_px, depths, room, inlier = (
+        np.empty(views),
+        np.empty(views),
+        np.empty(views),
+        np.empty((joints, views), dtype=np.bool_),
+    )
     L, g, M, gain = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, mean.shape[2], 3))
     trusted, torn = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
     seen_by, above = np.empty(joints, dtype=np.intp), np.empty(joints, dtype=np.intp)
     way_m, count, too_long = np.empty(joints), np.empty(joints), np.empty(joints)
     cameras, focal, xy, core, scatter = sight.cameras, sight.focal, sight.xy, bones.core, trust.scatter
     numbers, fixed_m = trust[1:], trust.fixed_depth_m
-    longest_m, parents = bones.longest_m, bones.parents
+    longest_m, parents, at, uv, sure = (
+        bones.longest_m,
+        bones.parents,
+        np.empty(3),
+        np.empty((views, 2)),
+        np.empty(views),
+    )
     for a in range(people):
         for v in range(views):
             depths[v] = _mean_depth(mean[a], cameras[v])
         for j in range(joints):
-            seen = False
+            seen, at[0], at[1], at[2] = 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             for v in range(views):
                 d, sigma_px[v], inlier[j, v] = candidate[a, j, v], 0.0, False
                 if d >= 0 and confident[d] > 0:
@@ -104,11 +97,19 @@ def _measure(mean, covariance, at, candidate, confident, sight, trust, bones, ev
                     depth = depth if depth >= MIN_DEPTH_M else depths[v]
                     depth = fixed_m if fixed_m > 0 else depth
                     px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
-                    sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), True
-            if seen:
+                    sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
+            if lost[a, j] and seen >= 2:
+                for v in range(views):
+                    d = candidate[a, j, v]
+                    sure[v] = sight.confidence[d] if d >= 0 else 0.0
+                    uv[v, 0], uv[v, 1] = xy[d, 0], xy[d, 1]
+                scale_m, reach_m = 2.0 * trust.sigma_m, trust.rho_2d_m
+                if triangulated(cameras, focal, uv, sure, scale_m, reach_m, MIN_DEPTH_M, room, at) < 2:
+                    at[0], at[1], at[2] = mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
+            if seen > 0:
                 for _ in range(_ITERATIONS):
-                    _linearise(at[a, j], candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j])
-                    _move(mean[a, j], covariance[a, j], at[a, j], L, g, M, gain)
+                    _linearise(at, candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j])
+                    _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
             trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, 0
             for v in range(views):

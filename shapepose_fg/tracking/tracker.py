@@ -134,8 +134,9 @@ class Tracker:
         step_s = time_s - tracks.time_s
         joints, lost = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, bones)
         candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), sight)
-        given = joints, lost, candidate, detections, rig, sight
-        joints, candidate, evident = measured(*given, self.observation, self._trust, bones)
+        certain = detections.confidence
+        weight = np.where(certain > 0, self.observation.weight(certain), 0.0)
+        joints, candidate, evident = measured(joints, lost, candidate, weight, sight, self._trust, bones)
         evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 

@@ -77,7 +77,8 @@ def test_a_measurement_is_the_information_filter_s_also_for_a_ray(five_cameras, 
         right[..., :3] += pull
         mean = np.einsum("...ij,...j->...i", covariance, right)
         at = mean[..., :3]
-    given = before, lost, candidate, seen, five_cameras, sight, config, Trust.of(config, names), BONES
+    weight = config.weight(seen.confidence)
+    given = before, lost, candidate, weight, sight, Trust.of(config, names), BONES
     after, kept, evident = measured(*given)
     inlier = kept >= 0
     assert evident.all()
@@ -99,7 +100,7 @@ def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, se
     candidate = assign(Predicted(two_people, sure / 20, lost & False), sight)
     before = JointStates.at(two_people + 0.5 * lost[..., None], sure, (2.0,))
     trust = Trust.of(config, BODY_25.joints)
-    after, kept, _ = measured(before, lost, candidate, seen, five_cameras, sight, config, trust, BONES)
+    after, kept, _ = measured(before, lost, candidate, config.weight(seen.confidence), sight, trust, BONES)
     assert (kept >= 0).all()
     np.testing.assert_allclose(after.position, two_people, atol=2e-3)
 
