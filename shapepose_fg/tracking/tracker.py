@@ -33,6 +33,8 @@ NoteDropped = Callable[[str, list[int]], None]
 
 _APART_M = 0.25
 """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
+_MOST_PEOPLE = 64
+"""Where stage I finds as many as it may (`ProposalConfig.most_people`), nobody is sought among the rest."""
 _BIRTH_SIGMA_M = 0.04
 """Sigma of a new person's joints as stage I places them."""
 
@@ -170,7 +172,7 @@ class Tracker:
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
         for find in self.find:
-            if not self.enough(detections, free):
+            if not self.enough(detections, free) or sum(map(len, found)) >= _MOST_PEOPLE:
                 break
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)
