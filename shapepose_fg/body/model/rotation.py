@@ -28,7 +28,7 @@ def exp_so3(axis_angle: Array) -> Array:
     return np.eye(3) + first * cross + second * (cross @ cross)
 
 
-def _quaternion(R: Array) -> Array:
+def quaternion(R: Array) -> Array:
     """Unit quaternions (w, x, y, z) with w >= 0 of rotation matrices; (..., 3, 3) -> (..., 4)."""
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R, (-2, -1), (0, 1))
     # Each row is the quaternion times four times one of its own components; the longest row divides best.
@@ -52,8 +52,7 @@ def log_so3(R: Array) -> Array:
 
     Goes by way of the quaternion, so that nothing is lost near pi; at exactly pi either axis may come out.
     """
-    quaternion = _quaternion(R)
-    real, xyz = quaternion[..., :1], quaternion[..., 1:]
+    real, xyz = np.split(quaternion(R), [1], axis=-1)
     sine = np.linalg.norm(xyz, axis=-1, keepdims=True)
     safe = np.where(sine > 0, sine, 1.0)
     return xyz * np.where(sine > 0, 2 * np.arctan2(sine, real) / safe, 2.0)
