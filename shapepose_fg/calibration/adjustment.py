@@ -112,7 +112,7 @@ def adjust(
         priors.addPriorPose3(X(each), gtsam.Pose3(before.wTc), pose)
         noise = gaussian(_lens_covariance(before, sigmas, free))
         factor = gtsam.PriorFactorCal3DS2 if free else gtsam.PriorFactorCal3_S2
-        priors.add(factor(C(each), _lens(before, free), noise))
+        priors.add(factor(C(each), _lens(before, free), noise))  # type: ignore[arg-type]
     last = [letter(each) for letter in (X, C) for each in range(len(start))]
     order = gtsam.Ordering()
     for each in [*dict.fromkeys(joints), *last]:

@@ -121,7 +121,8 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
         near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
         count = _assign(
             given, predicted.sigma_m, predicted.lost, world, people, sight, near, np.empty((2, A, J)), first[1],
-            whole[2], np.empty(len(sight.of_view), np.intp), real[2], real[3], real[4], flag[1], chosen[0], chosen[1],
+            whole[2], np.empty(len(sight.of_view), np.intp), real[2], real[3], real[4], flag[1], chosen[0],
+            chosen[1],
         )  # fmt: skip
     return chosen[0], near.cut(count)
 
