@@ -1,6 +1,6 @@
-"""Normal equations of bodies, row by row, compiled: steps, covariances, and the same with targets left out.
+"""Normal equations of bodies, row by row, compiled: steps, covariances, and chains of rows.
 
-A system (P + 1 + 3 K + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
+A system (P + 1 + 3 N + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
 Hessian H, below it vectors. It is reduced in place to the factor L, H = L Lᵀ, and L^-1 of the vectors. Everything
 is scalar products of rows.
 """
@@ -25,20 +25,27 @@ def _reduced(H, n, first, end):
     """Reduce the rows `first` to `end` of a system with n unknowns; False where H is not positive definite."""
     for i in range(first, end, 4):
         stop, begin = min(i + 4, end), 0
-        if stop == i + 4:  # four rows at a time
-            begin = min(i, n)
-            for j in range(begin):
-                a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        if stop == i + 4:  # four rows and two columns at a time
+            begin = min(i, n) // 2 * 2
+            for j in range(0, begin, 2):
+                a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for p in range(j):
-                    a += H[i, p] * H[j, p]
-                    b += H[i + 1, p] * H[j, p]
-                    c += H[i + 2, p] * H[j, p]
-                    d += H[i + 3, p] * H[j, p]
-                scale = 1 / H[j, j]
-                H[i, j] = (H[i, j] - a) * scale
-                H[i + 1, j] = (H[i + 1, j] - b) * scale
-                H[i + 2, j] = (H[i + 2, j] - c) * scale
-                H[i + 3, j] = (H[i + 3, j] - d) * scale
+                    v, w = H[j, p], H[j + 1, p]
+                    a += H[i, p] * v
+                    b += H[i + 1, p] * v
+                    c += H[i + 2, p] * v
+                    d += H[i + 3, p] * v
+                    e += H[i, p] * w
+                    f += H[i + 1, p] * w
+                    g += H[i + 2, p] * w
+                    h += H[i + 3, p] * w
+                v, w, scale = 1 / H[j, j], H[j + 1, j], 1 / H[j + 1, j + 1]
+                a, b, c, d = (H[i, j] - a) * v, (H[i + 1, j] - b) * v, (H[i + 2, j] - c) * v, (H[i + 3, j] - d) * v
+                H[i, j], H[i + 1, j], H[i + 2, j], H[i + 3, j] = a, b, c, d
+                H[i, j + 1] = (H[i, j + 1] - e - a * w) * scale
+                H[i + 1, j + 1] = (H[i + 1, j + 1] - f - b * w) * scale
+                H[i + 2, j + 1] = (H[i + 2, j + 1] - g - c * w) * scale
+                H[i + 3, j + 1] = (H[i + 3, j + 1] - h - d * w) * scale
         for r in range(i, stop):
             for j in range(begin, min(r + 1, n)):
                 total = H[r, j]
@@ -116,7 +123,7 @@ def _with_sag(C, at):
 
 @kernel
 def known(system, covariance, shape):
-    """From B systems with reduced Hessians: the `covariance` (B, K, 3, 3) of the joints (Laplace), m², as
+    """From B systems with reduced Hessians: the `covariance` (B, N, 3, 3) of their joints (Laplace), m², as
     `_with_sag` has it, and that of the betas, `shape` (B, 10, 10). The rest of the systems is reduced.
     """
     for b in range(len(system)):
@@ -127,77 +134,6 @@ def known(system, covariance, shape):
             _products(H, P + 1 + 3 * k, len(C), P, C)
             _with_sag(C, len(C) - 3)
         _products(H, P + 1 + 3 * K, shape.shape[1], P, shape[b])
-
-
-@kernel
-def lessened(system, row, without, root, Y, B, C, good):
-    """Prepare the fits of N pairs, a `row` (N,) and targets `without` (N, M) that are left out of it, -1 for none.
-
-    With Y = J L^-T of the Jacobian of these and R the square `root` (N, M, 3, 3) of their information, the Hessian
-    without them is L (I - Yᵀ Rᵀ R Y) Lᵀ, and its inverse is known by the factor of I - R Y Yᵀ Rᵀ (Woodbury).
-    Written are `Y` (N, 6 M + 10, P), R Y, Y and L^-1 of the betas; `B` (N, 6 M + 11, 3 M), that factor, a place
-    for right-hand sides, and products of Y; `C` (N, 3 M + 10, 3 M + 10), the covariance of the joints, as
-    `_with_sag` has it, and of the betas without them; whether it is positive definite, `good` (N,).
-    """
-    P, m = system.shape[2], B.shape[2]
-    for n in range(len(row)):
-        H, Z, D, G, count = system[row[n]], Y[n], B[n], C[n], 2 * m + 10
-        for i in range(m // 3):
-            S, at = root[n, i], P + 1 + 3 * max(without[n, i], 0)
-            for x in range(3):
-                for p in range(P):
-                    Z[3 * i + x, p] = S[x, 0] * H[at, p] + S[x, 1] * H[at + 1, p] + S[x, 2] * H[at + 2, p]
-                    Z[m + 3 * i + x, p] = H[at + x, p]
-        for i in range(10):
-            for p in range(P):
-                Z[2 * m + i, p] = H[len(H) - 10 + i, p]
-        for i in range(count):
-            for j in range(i + 1):
-                total = 0.0
-                for p in range(P):
-                    total += Z[i, p] * Z[j, p]
-                if i < m:
-                    D[i, j] = (1.0 if i == j else 0.0) - total
-                elif j < m:
-                    D[i + 1, j] = total
-                else:
-                    G[i - m, j - m] = G[j - m, i - m] = total
-        good[n] = _reduced(D, m, _FIRST, m)
-        if good[n]:
-            _reduced(D, m, m + 1, count + 1)
-            for i in range(m + 10):
-                for j in range(m + 10):
-                    for p in range(m):
-                        G[i, j] += D[m + 1 + i, p] * D[m + 1 + j, p]
-            for i in range(0, m, 3):
-                _with_sag(G, i)
-
-
-@kernel
-def stepped(system, row, pair, Y, B, gradient, step, move):
-    """The Gauss-Newton `step` (N, P) of `pair`s (N,) among those that `lessened` prepared, where half the
-    gradient is `gradient` (N, P), and by how much the joints that are left out would `move` (N, 3 M), metres.
-    """
-    P, m = gradient.shape[1], B.shape[2]
-    for n in range(len(row)):
-        H, Z, D, s, moved = system[row[n]], Y[pair[n]], B[pair[n]], step[pair[n]], move[pair[n]]
-        for p in range(P):
-            H[P, p] = gradient[n, p]
-        _reduced(H, P, P, P + 1)
-        for i in range(m):
-            D[m, i] = 0.0
-            for p in range(P):
-                D[m, i] += Z[i, p] * H[P, p]
-        _reduced(D, m, m, m + 1)
-        _back(D, m, m, s)
-        for i in range(m):
-            for p in range(P):
-                H[P, p] -= Z[i, p] * s[i]
-        _back(H, P, P, s)
-        for i in range(m):
-            moved[i] = 0.0
-            for p in range(P):
-                moved[i] -= Z[m + i, p] * H[P, p]
 
 
 @kernel
@@ -251,19 +187,29 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
             front[M - 1, M - 1] = math.nan  # and so in all that follows
         for i in range(N, M, 4):
             stop = min(i + 4, M)
-            for j in range(N, i if stop == i + 4 else N):
-                a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            even = N + (i - N) // 2 * 2 if stop == i + 4 else N
+            for j in range(N, even, 2):
+                a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for p in range(K.shape[1]):
-                    a += K[i, p] * K[j, p]
-                    b += K[i + 1, p] * K[j, p]
-                    c += K[i + 2, p] * K[j, p]
-                    d += K[i + 3, p] * K[j, p]
+                    v, w = K[j, p], K[j + 1, p]
+                    a += K[i, p] * v
+                    b += K[i + 1, p] * v
+                    c += K[i + 2, p] * v
+                    d += K[i + 3, p] * v
+                    e += K[i, p] * w
+                    f += K[i + 1, p] * w
+                    g += K[i + 2, p] * w
+                    h += K[i + 3, p] * w
                 front[i, j] -= a
                 front[i + 1, j] -= b
                 front[i + 2, j] -= c
                 front[i + 3, j] -= d
+                front[i, j + 1] -= e
+                front[i + 1, j + 1] -= f
+                front[i + 2, j + 1] -= g
+                front[i + 3, j + 1] -= h
             for r in range(i, stop):
-                for j in range(i if stop == i + 4 else N, r + 1):
+                for j in range(even, r + 1):
                     a = 0.0
                     for p in range(N):
                         a += K[r, p] * K[j, p]
