@@ -15,7 +15,11 @@ _SAME = 0.08
 _SHORTEST_S = 0.4
 """Tracks that are shorter say nothing of motion."""
 _SMOOTH_S = 0.05
-"""One sigma of the kernel by which tracks are smoothed: what lies between two frames is then no smoother than they."""
+"""One sigma of the kernel by which tracks are smoothed: what lies between two frames is no smoother than they."""
+FAST_S = 1.0
+"""What lasts longer than this is taken out of misses: a detector's errors last, and those of cameras."""
+_BLOCK_S = 1.0
+"""Errors of one second are one error."""
 
 _LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25
 """What is known around a frame, and how far apart in time, as parts of what they are where all is known."""
@@ -37,6 +41,11 @@ class Tracks:
     """(M, J, 3) how these change per frame."""
     size: Array
     """(M,) how large the person is, rad."""
+
+    @property
+    def lasts(self) -> Index:
+        """(K,) the last frame of each track."""
+        return self.frame[np.append(self.first[1:], len(self.frame))[: len(self.first)] - 1]
 
     def at(self, track: Index, time: Array) -> tuple[Array, Array, Array]:
         """Directions (N, J, 3), their speeds and sizes (N,) of tracks (N,) at `time` (N,), frames; NaN outside."""
@@ -121,3 +130,8 @@ def lines(values: Array, width: float) -> tuple[Array, Array]:
     spread = w0 * w2 - w1**2
     spread = np.where((w0 > _LEAST_AROUND) & (spread > _LEAST_SPREAD * width**2), spread, np.nan)
     return (w2 * y0 - w1 * y1) / spread, (w0 * y1 - w1 * y0) / spread
+
+
+def block_frames(fps: float, lasts: float) -> float:
+    """Frames whose errors are one error; fewer in recordings of few seconds, `lasts` frames."""
+    return max(1.0, min(_BLOCK_S * fps, lasts / 12))

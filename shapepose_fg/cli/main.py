@@ -30,6 +30,7 @@ from shapepose_fg.cli.report import report
 from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
+from shapepose_fg.cli.synchronise import synchronise
 from shapepose_fg.cli.terminal import note_log, say, show, use_any_streams
 from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.cli.tracks import tracks
@@ -49,7 +50,7 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
 for _panel, _commands in {
-    _RECORDING: (detect, check_calibration, refine_calibration, reconstruct, batch),
+    _RECORDING: (detect, check_calibration, refine_calibration, synchronise, reconstruct, batch),
     _RESULT: (report, overlay, view, export),
     _TRY: (train_fitter,),
 }.items():

@@ -52,7 +52,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command cli.refine",
+    " cli.train_fitter cli.batch.command cli.refine cli.synchronise",
     "cli.main",
     "__main__",
 )

@@ -1,0 +1,180 @@
+"""Offsets of three cameras or more: where the others place a joint, and how it moves, against what each sees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Views
+from shapepose_fg.setup_check.evidence import triangulate
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pairs, Sightings, centres_of
+
+_MOST_PLACED = 20_000
+"""Rows of tracks of all cameras that are placed in space."""
+_FASTEST = 2.5
+"""Statures a second: joints that move faster have changed their person."""
+
+
+@dataclass(frozen=True)
+class InSpace:
+    """People in space, and their tracks: offsets are those at which each camera sees what the others place."""
+
+    tracks: list[Tracks]
+    """Of each camera."""
+    views: Views
+    """The cameras."""
+    shift: Array
+    """(V,) frames: frame f of the first camera is frame f + shift of another."""
+    time: Index
+    """(P,) of each person, frames of the first camera."""
+    member: Index
+    """(P, V) the track of each person in each camera; -1 for none."""
+    step: int
+    """Frames from one time to the next."""
+    fps: float
+    """Frames a second."""
+
+    @classmethod
+    def of(cls, tracks: list[Tracks], views: Views, shift: Array, fps: float) -> "InSpace":
+        """People at times one after the other, as many as pay."""
+        step = max(1, round(fps / 15))
+        low = min(int((each.frame - at).min(initial=0)) for each, at in zip(tracks, shift, strict=True))
+        high = max(int((each.frame - at).max(initial=0)) for each, at in zip(tracks, shift, strict=True))
+        every = np.arange(low, high + 1, step)
+        busy = sum(len(each.frame) for each in tracks) / max(high - low, 1)
+        count = min(len(every), int(_MOST_PLACED / max(busy, 1.0)))
+        times = every[(len(every) - count) // 2 :][:count]
+        none = np.zeros(0, np.intp)
+        time, view, track, xy = [none], [none], [none], [np.zeros((0, tracks[0].rays.shape[1], 2))]
+        for v, each in enumerate(tracks):
+            stop = np.append(each.first[1:], len(each.frame)) - 1
+            inside = (times[:, None] + shift[v] >= each.frame[each.first]) & (
+                times[:, None] + shift[v] < each.frame[stop]
+            )
+            row, which = np.nonzero(inside)
+            time.append(times[row])
+            view.append(np.full(len(row), v))
+            track.append(which)
+            xy.append(_pixels(each.at(which, times[row] + shift[v])[0], views, v))
+        xy, whose = np.concatenate(xy), np.concatenate(track)
+        seen = Sightings(np.concatenate(time), np.concatenate(view), xy, np.isfinite(xy[..., 0]).astype(float))
+        enough = np.isfinite(xy[..., 0]).sum(axis=1) >= MIN_JOINTS
+        seen, whose = seen.only(enough), whose[enough]
+        groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
+        member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
+        many = (member >= 0).sum(axis=1) >= 3
+        return cls(tracks, views, shift, groups.frame[many], member[many], step, fps)
+
+    def settled(self) -> tuple[Array, Array]:
+        """(V,) shifts in frames and their covariance (V, V) as against the first camera."""
+        V, shift = len(self.tracks), self.shift.copy()
+        variance = np.full(V, np.inf)
+        for _ in range(6):
+            rays, speed, xy, size = self.seen(shift)
+            late = np.zeros(V)
+            for view in range(V):
+                late[view], variance[view] = self.late(view, rays[:, :, view], speed, xy, size)
+            late -= late.mean()
+            shift -= late
+            if np.abs(late).max() < 0.003:
+                break
+        covariance = np.diag(variance) + variance[0]
+        covariance[0], covariance[:, 0] = 0.0, 0.0
+        return shift - shift[0], covariance
+
+    def seen(self, shift: Array) -> tuple[Array, Array, Array, Array]:
+        """Directions and their speeds (P, J, V, 3), pixels (P, J, V, 2), and sizes (P, V) in rad."""
+        parts = []
+        for view, each in enumerate(self.tracks):
+            rays, speed, size = each.at(np.maximum(self.member[:, view], 0), self.time + shift[view])
+            there = self.member[:, view] >= 0
+            rays = np.where(there[:, None, None], rays, np.nan)
+            parts.append((rays, speed, _pixels(rays, self.views, view), np.where(there, size, np.nan)))
+        rays, speed, xy, size = zip(*parts, strict=True)
+        return np.stack(rays, axis=2), np.stack(speed, axis=2), np.stack(xy, axis=2), np.stack(size, axis=1)
+
+    def _moving(self, points: Array, speed: Array) -> Array:
+        """(P, J, 3) metres a frame of joints at `points`, from how directions to them change (P, J, V, 3)."""
+        away = points[:, :, None] - centres_of(self.views)
+        far = np.linalg.norm(away, axis=-1)[..., None]
+        across = (np.eye(3) - (away / far)[..., :, None] * (away / far)[..., None, :]) / far[..., None] ** 2
+        known = np.isfinite(speed) & np.isfinite(far)
+        A = np.where(known[..., :1, None], across, 0.0).sum(axis=2)
+        b = np.where(known, speed / far, 0.0).sum(axis=2)
+        enough = known[..., 0].sum(axis=2) >= 2
+        A[~enough] = np.eye(3)
+        return np.where(enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan)
+
+    def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, float]:
+        """By how many frames one camera's clock is off against what the others place, and the variance."""
+        xy = xy.copy()
+        xy[:, :, view] = np.nan
+        seen = np.isfinite(xy[..., 0])
+        placed = triangulate(xy, seen.astype(float), size * self.views.focal_px, self.views, 3)
+        away = placed.points - centres_of(self.views)[view]
+        miss = np.where(seen, placed.miss_px / (size * self.views.focal_px)[:, None], 0.0)
+        good = ((seen.sum(axis=-1) >= 2) & (miss.max(axis=-1) < GATE / 2))[..., None]
+        there = np.where(good, away / np.linalg.norm(away, axis=-1, keepdims=True), np.nan)
+        moving = self._moving(placed.points, np.where(seen[..., None], speed, np.nan))
+        theirs = _across(placed.points, moving, centres_of(self.views)[view])
+        order = np.lexsort((self.time, self.member[:, view]))
+        order = order[self.member[order, view] >= 0]
+        starts = np.flatnonzero(np.diff(self.member[order, view])) + 1
+        off, change, own, now = [], [], [], []
+        for rows in np.split(order, starts):
+            at = (self.time[rows] - self.time[rows[0]]) // self.step if len(rows) > 0 else rows
+            if len(rows) < 6:
+                continue
+            grid = np.full((4, at[-1] + 1, *there.shape[1:]), np.nan)
+            grid[0, at], grid[1, at] = there[rows], rays[rows] / np.linalg.norm(rays[rows], axis=-1, keepdims=True)
+            grid[1] -= grid[0]
+            grid[2, at], grid[3, at] = theirs[rows], speed[rows, :, view]
+            whose = float(np.median(size[rows, view]))
+            length = np.linalg.norm(grid, axis=-1) / whose
+            fastest = _FASTEST / self.fps
+            fine = (length[1] < GATE / 2) & (length[2] < fastest) & (length[3] < fastest)
+            grid[:, ~fine] = np.nan
+            miss, calm, fast = (_brisk(each, FAST_S * self.fps / self.step)[at] / whose for each in grid[1:])
+            off.append(np.nan_to_num(miss))
+            change.append(np.nan_to_num(calm))
+            own.append(np.nan_to_num(fast))
+            now.append(self.time[rows])
+        if not off:
+            return 0.0, np.inf
+        miss, calm, fast, time = (np.concatenate(each) for each in (off, change, own, now))
+        length = np.linalg.norm(miss, axis=-1)
+        width = 2.5 * 1.2 * np.median(length[length > 0]) if (length > 0).any() else 1.0
+        weight = 1 / (1 + (length / width) ** 2) ** 2
+        # The speeds of what others place have not seen this camera's errors; its own say what a frame changes.
+        gains = (weight * (calm * fast).sum(axis=-1)).sum(axis=1)
+        if (gain := float(gains.sum())) <= 0:
+            return 0.0, np.inf
+        score = (weight * (calm * miss).sum(axis=-1)).sum(axis=1)
+        late = score.sum() / gain
+        score = score - late * gains
+        block = block_frames(self.fps, float(np.ptp(time)))
+        sums = np.bincount(((time - time.min()) // block).astype(np.intp), score)
+        return float(late), float((sums**2).sum() / gain**2 * len(sums) / max(len(sums) - 1, 1))
+
+
+def _across(points: Array, moving: Array, centre: Array) -> Array:
+    """(..., 3) how directions from `centre` to points change that move so."""
+    away = points - centre
+    far = np.linalg.norm(away, axis=-1, keepdims=True)
+    return (moving - (moving * away).sum(axis=-1, keepdims=True) * away / far**2) / far
+
+
+def _brisk(values: Array, width: float) -> Array:
+    """Values (T, J, 3) less their means over the time around."""
+    there = np.isfinite(values[..., :1])
+    weight = gaussian_filter1d(there.astype(np.float64), width, axis=0, mode="constant")
+    mean = gaussian_filter1d(np.where(there, values, 0.0), width, axis=0, mode="constant")
+    return values - mean / np.maximum(weight, 1e-9)
+
+
+def _pixels(rays: Array, views: Views, view: int) -> Array:
+    """(N, J, 2) pixels of directions in the world (N, J, 3)."""
+    at = rays @ (views.K[view] @ views.cTw[view, :, :3]).T
+    return np.asarray(at[..., :2] / at[..., 2:])

@@ -1,0 +1,158 @@
+"""Offsets between pairs of cameras to a part of a frame: tracks that are one person, and how their rays meet."""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from shapepose_fg.calibration.scanning import normals
+from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Views
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
+
+_GATE = 0.06
+"""Tracks whose rays miss each other by more than this part of the person's size are not one person."""
+_MOST_SAMPLES = 3000
+"""Of each pair of cameras, frames of tracks."""
+
+
+@dataclass(frozen=True)
+class Pairwise:
+    """Tracks of all cameras, and what is thought of their clocks."""
+
+    tracks: list[Tracks]
+    """Of each camera."""
+    views: Views
+    """The cameras."""
+    shift: Array
+    """(V,) frames: frame f of the first camera is frame f + shift of another."""
+    fps: float
+    """Frames a second."""
+
+    def matched(self, a: int, b: int, gate: float = _GATE) -> tuple[Index, Index]:
+        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same person."""
+        one, other, apart = self.tracks[a], self.tracks[b], self.shift[b] - self.shift[a]
+        stride = max(1, round(0.1 * self.fps))
+        rows = np.arange(0, len(one.frame), stride)
+        found: dict[tuple[int, int], list[float]] = {}
+        begins, lasts = other.frame[other.first], other.lasts
+        at = one.frame[rows] + apart
+        row, track = np.nonzero((at[:, None] >= begins) & (at[:, None] <= lasts - 1))
+        miss, _ = self.miss(a, b, rows[row], track, apart)
+        seen = np.isfinite(miss)
+        mean = np.where(seen, np.minimum(np.abs(miss), GATE), 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+        mean[seen.sum(axis=1) < MIN_JOINTS] = GATE
+        for who, whom, each in zip(one.track[rows[row]].tolist(), track.tolist(), mean.tolist(), strict=True):
+            found.setdefault((who, whom), []).append(each)
+        error = {pair: float(np.mean(each)) for pair, each in found.items() if len(each) >= 3}
+        kept = {pair for pair, each in error.items() if each < gate}
+        spans = [(each.frame[each.first], each.lasts) for each in (one, other)]
+
+        def rival(pair: tuple[int, int], side: int) -> bool:
+            """Whether another track of the same time fits the same one better."""
+            for each in kept:
+                same, differs = each[1 - side] == pair[1 - side], each[side] != pair[side]
+                if same and differs and error[each] < error[pair]:
+                    (first, last), both = spans[side], [each[side], pair[side]]
+                    if last[both].min() > first[both].max():
+                        return True
+            return False
+
+        pairs = [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
+        stop = np.append(one.first[1:], len(one.frame))
+        rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
+        whom = [np.full(len(each), pair[1]) for each, pair in zip(rows, pairs, strict=True)]
+        every, tracks = (np.concatenate([np.zeros(0, np.intp), *each]) for each in (rows, whom))
+        thin = max(1, -(-len(every) // _MOST_SAMPLES))
+        return every[::thin], tracks[::thin]
+
+    def miss(self, a: int, b: int, rows: Index, track: Index, apart: float) -> tuple[Array, Array]:
+        """(N, J) by how much camera b's rays, `apart` frames later, miss those of `rows`; its change a frame."""
+        one, other = self.tracks[a], self.tracks[b]
+        rays, speed, size = other.at(track, one.frame[rows] + apart)
+        normal = normals(one.rays[rows], self.views, a, b)
+        miss = np.einsum("njk,njk->nj", normal, rays) / size[:, None]
+        return miss, np.einsum("njk,njk->nj", normal, speed) / size[:, None]
+
+    def nearest(self, reach: float, step: float) -> "Pairwise":
+        """The same with shifts that fit best among those within `reach` frames, camera after camera."""
+        V, shift = len(self.tracks), self.shift.copy()
+        pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
+        tried = np.arange(-reach, reach + step / 2, step)
+        cost = {}
+        wide = np.arange(-2 * reach, 2 * reach + step / 2, step)
+        for (a, b), (rows, track) in pairs.items():
+            apart = shift[b] - shift[a]
+            thin = max(1, len(rows) // 600)
+            misses = [self.miss(a, b, rows[::thin], track[::thin], apart + each)[0] for each in wide]
+            stack = np.stack(misses) if len(rows) > 0 else np.full((len(wide), 1, 1), np.nan)
+            both = np.isfinite(stack).all(axis=0)
+            width = 1.5 * np.median(np.abs(stack).min(axis=0)[both]) + 0.005 if both.any() else 1.0
+            cost[a, b] = np.log1p((stack[:, both] / width) ** 2).sum(axis=1)
+        place = np.full(V, len(tried) // 2)
+        for _ in range(3):
+            for view in range(1, V):
+                total = np.zeros(len(tried))
+                for (a, b), each in cost.items():
+                    if view in (a, b):
+                        own, its = np.arange(len(tried)), place[a if view == b else b]
+                        apart = own - its if view == b else its - own
+                        total += each[apart + len(wide) // 2]
+                place[view] = int(np.argmin(total))
+        return replace(self, shift=shift + tried[place])
+
+    def solved(self) -> tuple[Array, Array]:
+        """(V,) shifts in frames and their covariance (V, V), all pairs together."""
+        V, shift = len(self.tracks), self.shift.copy()
+        pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
+        block = block_frames(self.fps, max(float(np.ptp(each.frame)) for each in self.tracks))
+        for _ in range(8):
+            H, g = np.zeros((V, V)), np.zeros(V)
+            scores: dict[int, Array] = {}
+            for (a, b), (rows, track) in pairs.items():
+                miss, change = self.miss(a, b, rows, track, shift[b] - shift[a])
+                known = np.isfinite(miss) & np.isfinite(change)
+                if known.sum() < 20:
+                    continue
+                width = 3.8 * np.median(np.abs(miss[known]))
+                pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
+                both = np.where(known, np.clip(miss, -width, width), 0.0), np.where(known, change, 0.0)
+                smooth = FAST_S * self.fps / pace
+                miss, change = _fast(both, known, self.tracks[a].track[rows], track, smooth)
+                width = 3.8 * np.median(np.abs(miss[known]))
+                weight = np.where(known, 1 / (1 + (miss / width) ** 2), 0.0) / width**2
+                own, score = (weight * change**2).sum(), (weight * change * miss).sum(axis=1)
+                way = np.zeros(V)
+                way[a], way[b] = -1.0, 1.0
+                H += own * np.outer(way, way)
+                g += score.sum() * way
+                now = ((self.tracks[a].frame[rows] - shift[a]) // block).astype(int)
+                for each in np.unique(now).tolist():
+                    scores[each] = scores.get(each, 0) + score[now == each].sum() * way
+            free = np.diag(H)[1:] > 0
+            if not free.all():
+                break
+            step = -np.linalg.solve(H[1:, 1:], g[1:])
+            shift[1:] += np.clip(step, -1.0, 1.0)
+        covariance = np.full((V, V), np.inf)
+        covariance[0], covariance[:, 0] = 0.0, 0.0
+        if len(scores) > V and free.all():
+            S = np.stack(list(scores.values()))[:, 1:]
+            inverse = np.linalg.inv(H[1:, 1:])
+            covariance[1:, 1:] = inverse @ (S.T @ S) @ inverse * len(S) / (len(S) - V)
+        return shift, covariance
+
+
+def _fast(values: tuple[Array, ...], known: Array, one: Index, other: Index, width: float) -> tuple[Array, ...]:
+    """Values (N, J) less their means over the time around, track by track: errors that last are in these."""
+    result = tuple(each.copy() for each in values)
+    edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
+    for start, stop in zip([0, *edges], [*edges, len(one)], strict=True):
+        there = known[start:stop].astype(np.float64)
+        weight = np.maximum(gaussian_filter1d(there, width, axis=0, mode="constant"), 1e-9)
+        for each in result:
+            mean = gaussian_filter1d(each[start:stop], width, axis=0, mode="constant") / weight
+            each[start:stop] = np.where(known[start:stop], each[start:stop] - mean, 0.0)
+    return result

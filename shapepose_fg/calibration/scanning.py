@@ -1,0 +1,147 @@
+"""Two cameras compared at all offsets, and those at which all fit: whoever is whom.
+
+Two rays to one joint lie in a plane with both cameras if they were taken at one time. For everybody whom one
+camera sees, the person of another camera that fits best is taken, so that no association is needed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.compiled import kernel
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
+
+_LEAST_SPREAD = 0.004
+"""Misses, as a part of people's size, that differ by less from offset to offset are the detector's noise."""
+_ANCHORS = 150
+"""Frames of one camera that are compared with those of another, at every offset."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One camera's people at some frames, and all of another's."""
+
+    normal: Array
+    """(A, J, 3) of the plane through both cameras and a joint."""
+    frame: Index
+    """(A,)."""
+    rays: Array
+    """(S, J, 3) of the other camera, in order of frames."""
+    size: Array
+    """(S,) rad."""
+    first: Index
+    """(T + 1,) where each of the other's frames begins, from `begin` on."""
+    begin: int
+    """Its first frame."""
+
+    @classmethod
+    def of(cls, sightings: Sightings, views: Views, a: int, b: int) -> "Scan":
+        """Of the cameras `a` and `b`."""
+        one, other = (sightings.only(sightings.view == view) for view in (a, b))
+        taken = np.unique(one.frame)
+        wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
+        one = one.only(np.isin(one.frame, wanted))
+        other = other.only(np.argsort(other.frame, kind="stable"))
+        begin = int(other.frame[0])
+        first = np.searchsorted(other.frame, np.arange(begin, other.frame[-1] + 2))
+        size = other.size_px / views.focal_px[b]
+        normal = normals(rays_of(one, views), views, a, b)
+        return cls(normal, one.frame, rays_of(other, views), size, first, begin)
+
+    def over(self, lags: Index, common: float) -> Array:
+        """(L,) mean miss of all that could be somebody, a part of their size; NaN where too little is common."""
+        cost, count = np.zeros(len(lags)), np.zeros(len(lags))
+        arrays = (np.ascontiguousarray(each) for each in (self.normal, self.rays))
+        _scan(*arrays, self.frame, self.size, self.first, self.begin, lags, GATE, MIN_JOINTS, cost, count)
+        last = self.begin + len(self.first) - 2
+        both = np.minimum(self.frame.max() + lags, last) - np.maximum(self.frame.min() + lags, self.begin)
+        enough = (both >= common) & (count >= 0.2 * len(self.frame) * np.minimum(common / np.ptp(self.frame), 1))
+        return np.where(enough & (count > 0), cost / np.maximum(count, 1), np.nan)
+
+
+@kernel
+def _scan(
+    normal: Array,
+    rays: Array,
+    frame: Index,
+    size: Array,
+    first: Index,
+    begin: int,
+    lags: Index,
+    gate: float,
+    least: int,
+    cost: Array,
+    count: Array,
+) -> None:
+    """Sums into `cost` (L,), by how much the person of another camera that fits best misses, of `count` (L,)."""
+    for n in range(len(lags)):
+        for a in range(len(frame)):
+            at = frame[a] + lags[n] - begin
+            if at < 0 or at + 1 >= len(first) or first[at] == first[at + 1]:
+                continue
+            best = gate
+            for s in range(first[at], first[at + 1]):
+                total, seen = 0.0, 0
+                for j in range(normal.shape[1]):
+                    miss = normal[a, j, 0] * rays[s, j, 0] + normal[a, j, 1] * rays[s, j, 1]
+                    miss = abs(miss + normal[a, j, 2] * rays[s, j, 2]) / size[s]
+                    if miss == miss:  # not NaN
+                        total += min(miss, gate)
+                        seen += 1
+                if seen >= least and total / seen < best:
+                    best = total / seen
+            cost[n] += best
+            count[n] += 1
+
+
+def normals(rays: Array, views: Views, a: int, b: int) -> Array:
+    """(..., 3) unit normals of the planes through rays of camera `a` and the centre of camera `b`."""
+    centres = centres_of(views)
+    normal = np.cross(centres[b] - centres[a], rays)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12))
+
+
+def chosen(curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int) -> tuple[Array, Array]:
+    """(V,) shifts on the first camera's clock, and how far each stands out of all others (V,).
+
+    Cameras are added one by one, the surest first, each where it fits all those before it: frame f of the first
+    camera is frame f + shift of another.
+    """
+    step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
+    half = len(lags) // 2
+
+    def fit(one: int, other: int, apart: Index) -> Array:
+        """How well two cameras fit, `apart` by so many steps: standard deviations under the median of all."""
+        curve = curves[one, other] if one < other else curves[other, one][::-1]
+        known = np.isfinite(curve)
+        if known.sum() < 3:
+            return np.zeros(len(apart))
+        middle = np.median(curve[known])
+        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), _LEAST_SPREAD)
+        place = np.clip(apart + half, 0, len(lags) - 1)
+        inside = (np.abs(apart) <= half) & known[place]
+        return np.where(inside, (middle - curve[place]) / spread, 0.0)
+
+    def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
+        low, high = min(placed.values()) - half, max(placed.values()) + half
+        tried = np.arange(low, high + 1)
+        worth = np.sum([fit(one, view, tried - at) for one, at in placed.items()], axis=0) / np.sqrt(len(placed))
+        top = int(np.argmax(worth))
+        far = np.abs(tried - tried[top]) * step > around
+        return float(worth[top] - worth[far].max(initial=0.0)), int(tried[top])
+
+    margins = {pair: best(pair[1], {pair[0]: 0})[0] for pair in curves}
+    root = max(margins, key=lambda pair: margins[pair])[0]
+    placed = {root: 0}
+    while len(placed) < views:
+        offers = {view: best(view, placed) for view in range(views) if view not in placed}
+        view = max(offers, key=lambda each: offers[each][0])
+        placed[view] = offers[view][1]
+    for _ in range(2):
+        for view in range(views):
+            placed[view] = best(view, {one: at for one, at in placed.items() if one != view})[1]
+    sure = np.array([best(view, {o: at for o, at in placed.items() if o != view})[0] for view in range(views)])
+    shift = np.array([placed[view] for view in range(views)]) * step
+    return shift - shift[0], sure

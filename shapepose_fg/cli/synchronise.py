@@ -1,0 +1,101 @@
+"""The command `synchronise`: when each camera began, from the people; and detections of the same moments."""
+
+import json
+import shlex
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shapepose_fg.cli.options import (
+    RESULT,
+    TIME,
+    DetectionOptions,
+    check_fps,
+    frame_range,
+    frames_option,
+    grouped,
+    json_option,
+    option,
+)
+from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.core.errors import InputError
+
+if TYPE_CHECKING:
+    from shapepose_fg.calibration.synchronisation import Synchronised
+    from shapepose_fg.core.camera import Rig
+
+
+@grouped
+def synchronise(
+    seen: DetectionOptions,
+    fps: float | None = option(TIME, "Frames a second of all cameras; needed."),
+    most: float = option(TIME, "Largest offset that is looked for, seconds.", 60.0),
+    frames: str | None = frames_option(),
+    output: Path | None = option(RESULT, "Folder for detections of the same moments, and their times (BODY_25)."),
+    as_json: bool = json_option(),
+) -> None:
+    """Find when cameras of known poses were started, from the people whom they see; any offset, to milliseconds.
+
+    Exit code 1 where motion does not determine a camera's offset; nothing is written then.
+    """
+    import typer
+
+    from shapepose_fg.calibration.synchronisation import same_moments, synchronise, write_camera_times
+    from shapepose_fg.core.skeleton import BODY_25
+    from shapepose_fg.core.storage.kept_arrays import InFolder
+    from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.io.write_detections import write_association
+
+    if fps is None:
+        raise InputError("--fps: missing; say how many frames a second the cameras took")
+    check_fps(fps)
+    if not 0 < most <= 600:
+        raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
+    rig = seen.rig()
+    with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
+        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
+        note(*recording.notes)
+        if output is not None and recording.skeleton.joints != BODY_25.joints:
+            raise InputError(
+                f"--output: only BODY_25 can be written, and these are {recording.skeleton.name}; leave it out"
+                " and give the offsets that are printed to shapepose-fg detect --start"
+            )
+        span = frame_range(frames, len(recording), recording.first)
+        with progress("comparing", "pairs") as done:
+            found = synchronise(recording, rig, fps, span, most, progress=done)
+        problems = found.undetermined(rig)
+        if output is not None and not problems:
+            moments, times = same_moments(recording, found, fps)
+            write_association(moments, rig, output)
+            write_camera_times(output / "detection" / "times.csv", rig, times)
+    if as_json:
+        print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
+    else:
+        _show(found, rig)
+    note(*problems)
+    if problems:
+        raise typer.Exit(1)
+    if not as_json:
+        first = found.offset_s.min()
+        starts = zip(rig.names, found.offset_s - first, strict=True)
+        words = [word for name, start in starts for word in ("--start", f"{name}={start:.4f}s")]
+        print(
+            f"of videos: shapepose-fg detect {shlex.join(words)}, and --fps, --calibration and the rest as before"
+        )
+    if output is not None and not as_json:
+        options = {"--calibration": seen.calibration, "--detections": output / "detection", "--up": seen.up}
+        options |= {"--unit": seen.unit, "--image-size": seen.image_size, "--output": output / "results"}
+        line = [word for name, value in options.items() if value is not None for word in (name, str(value))]
+        print(f"next: {shlex.join(['shapepose-fg', 'reconstruct', *line])}")
+
+
+def _show(found: "Synchronised", rig: "Rig") -> None:
+    """The offsets."""
+    rows = []
+    for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
+        known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if np.isfinite(sigma) else "unknown"
+        rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
+    caption = "began: its frame 0, on the first camera's clock; stands out: the offset of all others"
+    show(table(("camera", "began, s", "± ms", "stands out"), rows, caption=caption))

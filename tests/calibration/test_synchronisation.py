@@ -1,0 +1,122 @@
+"""Cameras that were started by hand: found from the people, to a part of a frame, or said to be unknown."""
+
+import json
+
+import numpy as np
+import pytest
+
+from shapepose_fg.calibration.synchronisation import same_moments, synchronise
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.write_detections import write_association
+from tests.calibration.conftest import FPS
+from tests.setup_check.conftest import seen_by, walkers
+
+LATE_S = np.array([0.0, 2.513, -1.22, 4.0])
+"""When the four cameras began."""
+
+
+@pytest.fixture(scope="module")
+def late(rig, two_people) -> Recording:
+    """Twelve seconds of each camera, of people whom the others saw earlier or later."""
+    body = two_people[0] + np.array([0.45, 0.0, 0.0])
+    fine = walkers(body, 1)  # one frame, for its shape
+    frames, parts = 300, []
+    for offset in LATE_S:
+        people = np.stack([moving(body, (t / FPS + offset)) for t in range(frames)])
+        assert people.shape[1:] == fine.shape[1:]
+        parts.append(people)
+    return merged(rig, parts)
+
+
+def moving(body: np.ndarray, time: float) -> np.ndarray:
+    """(3, 25, 3) three people on ways that never come again, waving at rates of their own."""
+    people = []
+    for number in range(3):
+        place = [np.sin(0.31 * time + 2 * number) + 0.4 * np.sin(0.83 * time), np.cos(0.23 * time + number), 0.0]
+        turn = 0.5 * time + 0.7 * np.sin(0.6 * time + number)
+        R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+        one = body * (0.94 + 0.05 * number)
+        one = one.copy()
+        one[4, 2] += 0.3 * (1 + np.sin(4.1 * time + number + np.sin(0.9 * time)))
+        one[7, 1] += 0.25 * np.sin(3.3 * time + 2 * number)
+        people.append(one @ R.T + place)
+    return np.stack(people)
+
+
+def merged(rig: Rig, parts: list[np.ndarray]) -> Recording:
+    """Each camera's own recording of its people (T, 3, 25, 3) as one."""
+    seen = [seen_by(rig, people, seed=view) for view, people in enumerate(parts)]
+    frames = []
+    for each in zip(*(one.frames for one in seen), strict=True):
+        chosen = [part.only(part.view == view) for view, part in enumerate(each)]
+        begin = np.cumsum([0, *(len(part) for part in chosen)])[:-1]
+        columns = [np.concatenate([getattr(p, n) for p in chosen]) for n in ("view", "joint", "xy", "confidence")]
+        pairs = np.concatenate([part.pairs + at for part, at in zip(chosen, begin, strict=True)])
+        frames.append(type(chosen[0])(*columns, pairs, np.concatenate([part.affinity for part in chosen])))
+    return Recording(seen[0].skeleton, frames)
+
+
+@pytest.mark.slow
+def test_offsets_of_any_size_are_found_to_milliseconds(rig, late):
+    found = synchronise(late, rig, FPS, range(300), 8.0)
+    assert found.undetermined(rig) == [] and (found.drift == 0).all()
+    error = found.offset_s - LATE_S
+    assert np.abs(error).max() < 0.003
+    assert (np.abs(error[1:]) < 3.5 * found.sigma_s[1:] + 5e-4).all() and found.sigma_s.max() < 0.004
+    together, times = same_moments(late, found, FPS)
+    # What is left between cameras of one moment is half a frame at the most.
+    assert len(together) == len(times) > 120 and np.ptp(times, axis=1).max() < 1.01 / FPS
+    assert np.abs(np.diff(times, axis=0) - 1 / FPS).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_two_cameras(rig, late):
+    two = Rig(rig.cameras[:2], rig.up)
+    found = synchronise(
+        Recording(late.skeleton, [f.only(f.view < 2) for f in late.frames]), two, FPS, range(300), 8.0
+    )
+    assert abs(found.offset_s[1] - LATE_S[1]) < 0.02
+
+
+@pytest.mark.slow
+def test_people_who_stand_tell_nothing(rig, two_people):
+    still = np.repeat(moving(two_people[0], 0.0)[None], 150, axis=0)
+    found = synchronise(merged(rig, [still] * 4), rig, FPS, range(150), 3.0)
+    said = found.undetermined(rig)
+    assert len(said) == 4 and "motion does not determine" in said[0] and "camera cam0" in said[0]
+
+
+def test_a_camera_that_sees_nobody_is_named(rig, recording):
+    blind = Recording(recording.skeleton, [each.only(each.view != 2) for each in recording.frames])
+    with pytest.raises(InputError, match="camera cam2: hardly anybody is seen"):
+        synchronise(blind, rig, FPS, range(100), 1.0)
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_reconstruct_takes(rig, late, tmp_path, capsys):
+    write_rig(rig, tmp_path / "rig.json")
+    write_association(late, rig, tmp_path)
+    base = ["synchronise", "--calibration", tmp_path / "rig.json", "--detections", tmp_path / "detection"]
+    for more, code, said in (
+        (["--fps", "25", "--most", "8", "--output", tmp_path / "same"], 0, "next: shapepose-fg reconstruct"),
+        (["--fps", "25", "--most", "8", "--json"], 0, '"offset_s"'),
+        ([], 2, "--fps: missing"),
+        (["--fps", "25", "--most", "-1"], 2, "--most"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([str(each) for each in [*base, *more]])
+        out, error = capsys.readouterr()
+        assert ended.value.code == code and said in out + error
+        if "--json" in more:
+            told = json.loads(out)["cameras"]
+            assert np.abs([each["offset_s"] for each in told] - LATE_S).max() < 0.003
+        if "--output" in more:
+            assert "--start cam1=3.7" in out
+            line = next(each for each in out.splitlines() if each.startswith("next: "))
+    with pytest.raises(SystemExit) as ended:
+        main([*line.split()[2:], "--frames", "0:20", "--no-report"])
+    assert ended.value.code == 0 and (tmp_path / "same" / "results" / "people.npz").is_file()
