@@ -13,6 +13,8 @@ from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pairs, Sightings
 
 _MOST_PLACED = 20_000
 """Rows of tracks of all cameras that are placed in space."""
+_LEAST_MISS = 0.004
+"""No detector misses by less than this part of a person's size: 7 mm."""
 _FASTEST = 2.5
 """Statures a second: joints that move faster have changed their person."""
 
@@ -122,7 +124,7 @@ class InSpace:
         order = np.lexsort((self.time, self.member[:, view]))
         order = order[self.member[order, view] >= 0]
         starts = np.flatnonzero(np.diff(self.member[order, view])) + 1
-        off, change, own, now = [], [], [], []
+        off, change, own, now, weights = [], [], [], [], []
         for rows in np.split(order, starts):
             at = (self.time[rows] - self.time[rows[0]]) // self.step if len(rows) > 0 else rows
             if len(rows) < 6:
@@ -137,6 +139,12 @@ class InSpace:
             fine = (length[1] < GATE / 2) & (length[2] < fastest) & (length[3] < fastest)
             grid[:, ~fine] = np.nan
             miss, calm, fast = (_brisk(each, FAST_S * self.fps / self.step)[at] / whose for each in grid[1:])
+            length = np.linalg.norm(miss, axis=-1)
+            usual = np.array(
+                [np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0 for each in length.T]
+            )
+            width = 3.0 * np.maximum(usual, _LEAST_MISS)
+            weights.append(np.where(np.isfinite(length), 1 / (1 + (length / width) ** 2) ** 2 / width**2, 0.0))
             off.append(np.nan_to_num(miss))
             change.append(np.nan_to_num(calm))
             own.append(np.nan_to_num(fast))
@@ -144,9 +152,7 @@ class InSpace:
         if not off:
             return 0.0, np.inf
         miss, calm, fast, time = (np.concatenate(each) for each in (off, change, own, now))
-        length = np.linalg.norm(miss, axis=-1)
-        width = 2.5 * 1.2 * np.median(length[length > 0]) if (length > 0).any() else 1.0
-        weight = 1 / (1 + (length / width) ** 2) ** 2
+        weight = np.concatenate(weights)
         # The speeds of what others place have not seen this camera's errors; its own say what a frame changes.
         gains = (weight * (calm * fast).sum(axis=-1)).sum(axis=1)
         if (gain := float(gains.sum())) <= 0:

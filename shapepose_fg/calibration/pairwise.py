@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.calibration.scanning import normals
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
 
@@ -71,7 +71,7 @@ class Pairwise:
     def miss(self, a: int, b: int, rows: Index, track: Index, apart: float) -> tuple[Array, Array]:
         """(N, J) by how much camera b's rays, `apart` frames later, miss those of `rows`; its change a frame."""
         one, other = self.tracks[a], self.tracks[b]
-        rays, speed, size = other.at(track, one.frame[rows] + apart)
+        rays, speed, size = other.at(track, np.asarray(one.frame[rows] + apart, dtype=np.float64))
         normal = normals(one.rays[rows], self.views, a, b)
         miss = np.einsum("njk,njk->nj", normal, rays) / size[:, None]
         return miss, np.einsum("njk,njk->nj", normal, speed) / size[:, None]
@@ -113,7 +113,7 @@ class Pairwise:
             scores: dict[int, Array] = {}
             for (a, b), (rows, track) in pairs.items():
                 miss, change = self.miss(a, b, rows, track, shift[b] - shift[a])
-                known = np.isfinite(miss) & np.isfinite(change)
+                known = np.asarray(np.isfinite(miss) & np.isfinite(change))
                 if known.sum() < 20:
                     continue
                 width = 3.8 * np.median(np.abs(miss[known]))
@@ -145,7 +145,7 @@ class Pairwise:
         return shift, covariance
 
 
-def _fast(values: tuple[Array, ...], known: Array, one: Index, other: Index, width: float) -> tuple[Array, ...]:
+def _fast(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
     """Values (N, J) less their means over the time around, track by track: errors that last are in these."""
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1

@@ -53,8 +53,8 @@ class Scan:
     def over(self, lags: Index, common: float) -> Array:
         """(L,) mean miss of all that could be somebody, a part of their size; NaN where too little is common."""
         cost, count = np.zeros(len(lags)), np.zeros(len(lags))
-        arrays = (np.ascontiguousarray(each) for each in (self.normal, self.rays))
-        _scan(*arrays, self.frame, self.size, self.first, self.begin, lags, GATE, MIN_JOINTS, cost, count)
+        normal, rays = np.ascontiguousarray(self.normal), np.ascontiguousarray(self.rays)
+        _scan(normal, rays, self.frame, self.size, self.first, self.begin, lags, GATE, MIN_JOINTS, cost, count)
         last = self.begin + len(self.first) - 2
         both = np.minimum(self.frame.max() + lags, last) - np.maximum(self.frame.min() + lags, self.begin)
         enough = (both >= common) & (count >= 0.2 * len(self.frame) * np.minimum(common / np.ptp(self.frame), 1))

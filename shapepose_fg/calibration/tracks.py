@@ -67,7 +67,7 @@ class Tracks:
         rays, size = rays_of(seen, views), seen.size_px / views.focal_px[view]
         shortest = max(4, round(_SHORTEST_S * fps))
         parts = [rows for rows in _followed(seen) if len(rows) >= shortest]
-        frames = [np.arange(seen.frame[rows[0]], seen.frame[rows[-1]] + 1) for rows in parts]
+        frames = [np.arange(int(seen.frame[rows[0]]), int(seen.frame[rows[-1]]) + 1) for rows in parts]
         joints = seen.xy.shape[1]
         every = [_smoothed(rays[rows], seen.frame[rows], _SMOOTH_S * fps) for rows in parts]
         sizes = [np.interp(f, seen.frame[rows], size[rows]) for f, rows in zip(frames, parts, strict=True)]

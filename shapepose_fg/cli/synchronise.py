@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import typer
 
 from shapepose_fg.cli.options import (
     RESULT,
@@ -40,8 +41,6 @@ def synchronise(
 
     Exit code 1 where motion does not determine a camera's offset; nothing is written then.
     """
-    import typer
-
     from shapepose_fg.calibration.synchronisation import same_moments, synchronise, write_camera_times
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.core.storage.kept_arrays import InFolder
