@@ -56,7 +56,7 @@ class InSpace:
                 times[:, None] + shift[v] < each.frame[stop]
             )
             row, which = np.nonzero(inside)
-            time.append(times[row])
+            time.append(row)  # frames of sightings are 0 or more
             view.append(np.full(len(row), v))
             track.append(which)
             xy.append(_pixels(each.at(which, times[row] + shift[v])[0], views, v))
@@ -67,7 +67,7 @@ class InSpace:
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
         member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
         many = (member >= 0).sum(axis=1) >= 3
-        return cls(tracks, views, shift, groups.frame[many], member[many], step, fps)
+        return cls(tracks, views, shift, times[groups.frame[many]], member[many], step, fps)
 
     def settled(self) -> tuple[Array, Array]:
         """(V,) shifts in frames and their covariance (V, V) as against the first camera."""
