@@ -115,11 +115,13 @@ def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
 def missed_px(people: People, rig: Rig) -> Array:
     """(P, J, V) how far each detection is from where the *other* cameras alone put the joint, pixels.
 
-    NaN where fewer than two others see it.
+    NaN where fewer than two others see it. Of two cameras alone: from where both put it.
     """
     missed = np.full(people.sigma_px.shape, np.nan)
     weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)
     size = size_of(np.moveaxis(people.xy, 2, 1))
+    if len(rig) == 2:
+        return np.where(weight > 0, triangulate(people.xy, weight, size, Views.of(rig)).miss_px, np.nan)
     for view, camera in enumerate(rig.cameras):
         others, xy = weight.copy(), people.xy.copy()
         others[:, :, view], xy[:, :, view] = 0.0, np.nan

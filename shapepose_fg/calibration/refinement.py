@@ -141,6 +141,10 @@ def refine(
             known = np.isfinite(both[0]) & np.isfinite(both[1])
             before.append(both[0][known])
             after.append(both[1][known])
+    if sum(map(len, before)) == 0:
+        raise InputError(
+            "no joint is seen by three cameras, on frames that were not used; refining cannot be tried"
+        )
     was, now = (float(np.median(np.concatenate(each))) for each in (before, after))
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
     stature = build_of(found[0].people.points, detections.skeleton).stature

@@ -86,6 +86,23 @@ def test_people_whom_one_camera_sees_are_too_few(rig, recording):
         refine(alone, rig, TIMES, range(250))
 
 
+@pytest.mark.parametrize("frames", [range(1), range(3), range(249, 250)])
+def test_a_few_frames_are_too_few(rig, recording, frames):
+    with pytest.raises(InputError, match=r"only [0-9]+ people are seen by two cameras"):
+        refine(recording, rig, TIMES, frames)
+
+
+@pytest.mark.slow
+def test_two_cameras(rig, recording):
+    two = replace(rig, cameras=rig.cameras[:2])
+    seen = Recording(recording.skeleton, [each.only(each.view < 2) for each in recording.frames])
+    wrong = disturbed(two, 0)
+    found = refine(seen, wrong, TIMES, range(250))
+    assert found.better and found.after_px < 3
+    # How they look at each other is found; along the line between them they may both turn.
+    assert off_by(found.rig, two)[0].max() < off_by(wrong, two)[0].max()
+
+
 @pytest.mark.slow
 def test_what_motion_does_not_determine_is_said(rig, recording):
     frames = [each.only((each.view != 3) | (t < 2)) for t, each in enumerate(recording.frames)]
