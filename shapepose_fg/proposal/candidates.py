@@ -8,7 +8,6 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from scipy.spatial import KDTree
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Metres, Settings
@@ -235,58 +234,35 @@ def _reprojection_error(rig: Rig, view: Index, normalised: Array, xyz: Array) ->
     return np.where(camera[:, 2] > 0, error, np.inf).astype(np.float64)
 
 
-_POINTS_AT_ONCE = 4096
-"""Points whose neighbours among each other are looked up at once: before 30 cameras a joint has 400 of them."""
-
-
 def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
-    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence.
-
-    The most confident points are clustered first; what lies near their seeds is theirs, and the rest goes on.
+    """The seed (M,) whose cluster each point joins: points are picked one by one by confidence, and each that is
+    still left takes what is left of its joint's within the radius.
     """
-    order = np.argsort(-points.score, kind="stable")
-    # A fourth coordinate keeps different joints apart.
-    apart = points.joint * (4.0 * radius_m)
-    places = np.asarray(np.column_stack([points.xyz, apart])[order], dtype=np.float64)
-    if len(order) <= _POINTS_AT_ONCE:
-        return order[_seeds_of_ranked(places, radius_m)][np.argsort(order)]
-    every = KDTree(places, balanced_tree=False, compact_nodes=False)
-    seed = np.full(len(order), -1, dtype=np.intp)
-    left = np.arange(len(order))
-    while len(left) > 0:
-        first = left[:_POINTS_AT_ONCE]
-        seed[first] = first[_seeds_of_ranked(places[first], radius_m)]
-        seeds = np.unique(seed[first])
-        near = every.query_ball_point(places[seeds], radius_m)
-        member = np.concatenate(near).astype(np.intp)
-        of_seed = np.repeat(seeds, [len(each) for each in near])
-        new = seed[member] < 0
-        nearest = np.full(len(order), len(order), dtype=np.intp)
-        np.minimum.at(nearest, member[new], of_seed[new])
-        seed = np.where(nearest < len(order), nearest, seed)
-        left = left[_POINTS_AT_ONCE:]
-        left = left[seed[left] < 0]
-    return order[seed][np.argsort(order)]
-
-
-def _seeds_of_ranked(places: Array, radius_m: float) -> Index:
-    """The seed (M,) of each of a few points that stand in the order in which they are picked."""
-    count = len(places)
-    edges = KDTree(places).query_pairs(radius_m, output_type="ndarray")
-    better, worse = edges.min(axis=1), edges.max(axis=1)
-    is_seed = np.zeros(count, dtype=bool)
-    undecided = np.ones(count, dtype=bool)
-    live_better, live_worse = better, worse
-    while undecided.any():
-        live = undecided[live_better] & undecided[live_worse]
-        live_better, live_worse = live_better[live], live_worse[live]
-        picked = undecided.copy()
-        picked[live_worse] = False
-        is_seed |= picked
-        undecided &= ~picked
-        undecided[live_worse[picked[live_better]]] = False
-    # A point near several seeds belongs to the one that is picked first.
-    seed = np.where(is_seed, np.arange(count), count)
-    from_seed = is_seed[better]
-    np.minimum.at(seed, worse[from_seed], better[from_seed])
+    order, along = np.argsort(-points.score, kind="stable"), np.lexsort((points.xyz[:, 0], points.joint))
+    seed, place = np.full(len(order), -1, dtype=np.intp), np.empty(len(order), dtype=np.intp)
+    place[along] = np.arange(len(order))
+    joint, xyz = (np.ascontiguousarray(each) for each in (points.joint, points.xyz))
+    _pick(order, along, place, joint, xyz, radius_m, seed)
     return seed
+
+
+@kernel
+def _pick(order, along, place, joint, xyz, radius_m, seed):
+    """Fill in `greedy_seeds`, of points in `order` (M,); `along` (M,) sorts them by joint and x, where each has
+    its `place` (M,).
+    """
+    for n in range(len(order)):
+        p = order[n]
+        if seed[p] >= 0:
+            continue
+        seed[p] = p
+        for step in (-1, 1):
+            k = place[p] + step
+            while 0 <= k < len(along):
+                q = along[k]
+                x, y, z = xyz[q, 0] - xyz[p, 0], xyz[q, 1] - xyz[p, 1], xyz[q, 2] - xyz[p, 2]
+                if joint[q] != joint[p] or abs(x) > radius_m:
+                    break
+                if seed[q] < 0 and x * x + y * y + z * z <= radius_m * radius_m:
+                    seed[q] = p
+                k += step
