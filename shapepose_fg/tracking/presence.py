@@ -110,7 +110,7 @@ def _weigh(
                 if candidate[a, j, v] >= 0:
                     whose[count], which[count] = a, candidate[a, j, v]
                     count += 1
-    tie(whose, which, count, candidate, sight, tied, neighbours)
+    tie(whose[:count], which[:count], candidate, sight, tied, neighbours)
     count = 0
     for a in range(people):
         for j in range(joints):
