@@ -164,7 +164,7 @@ def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight
     other ends of the joint's limbs, and how many (N,) of these there are.
     """
     mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
-    tie(person, detection, len(person), candidate, sight, mean, neighbours)
+    tie(person, detection, candidate, sight, mean, neighbours)
     return mean, neighbours
 
 
@@ -217,11 +217,11 @@ def find_near(places, reach_m, people, sight, first, begins, person, detection, 
 
 
 @kernel
-def tie(person, detection, count, own, sight, mean, neighbours):
-    """Fill in the first `count` of the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
+def tie(person, detection, own, sight, mean, neighbours):
+    """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
     of_joint, of_view, begin, other, value = sight.of_joint, sight.of_view, sight.begin, sight.other, sight.value
     limb, limb_ends = sight.limb, sight.limb_ends
-    for e in range(count):
+    for e in range(len(person)):
         a, d = person[e], detection[e]
         j, v, total, there = of_joint[d], of_view[d], 0.0, 0
         for n in range(limb[j], limb[j + 1]):
@@ -242,9 +242,9 @@ def claim(
 ):  # fmt: skip
     """Fill in what `Nearby.claimed` returns; `key` and `queue` (N,) and `taken` (D,) are room to work in."""
     people, joints, views = chosen.shape
-    rank = sight.rank
-    tie(person, detection, first[len(first) - 1], own, sight, tied, queue)
-    for e in range(first[len(first) - 1]):
+    rank, count = sight.rank, first[len(first) - 1]
+    tie(person[:count], detection[:count], own, sight, tied, queue)
+    for e in range(count):
         neighbours = queue[e]
         # Where no neighbour is seen, the affinities say nothing: neither for nor against.
         score[e] = nearness[e] + (tied[e] if neighbours > 0 else LEAST_AFFINITY)

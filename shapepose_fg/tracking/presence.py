@@ -112,7 +112,7 @@ def _weigh(
                 if candidate[a, j, v] >= 0:
                     whose[count], which[count] = a, candidate[a, j, v]
                     count += 1
-    tie(whose, which, count, candidate, sight, tied, neighbours)
+    tie(whose[:count], which[:count], candidate, sight, tied, neighbours)
     count = 0
     for a in range(people):
         for j in range(joints):
@@ -220,7 +220,7 @@ def probability(evidence: float) -> float:
 class Account:
     """H hypotheses as detections with weights, in T frames: who of them is there is chosen from this."""
 
-    place: Index
+    place: NDArray[np.int32]
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
@@ -247,9 +247,10 @@ class Account:
         `price` (H, T) of `weighed`.
         """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
-        first, count = np.cumsum(counts) - counts, int(counts.sum())
-        place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(shape)
-        weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
+        first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())
+        place = np.where(candidate >= 0, candidate + first[:, None, None], np.int32(count)).reshape(shape)
+        weights = np.where(candidate >= 0, weight, np.float32(0)).reshape(shape)
+        place, weights = place.astype(np.int32, copy=False), weights.astype(np.float32, copy=False)
         seen = np.append(np.flatnonzero(counts), 0)
         span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
         return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
@@ -302,13 +303,13 @@ class Account:
         return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
 
     @cached_property
-    def holders(self) -> tuple[Index, Index, Array]:
+    def holders(self) -> tuple[Index, NDArray[np.int32], NDArray[np.float32]]:
         """Where those who have each detection begin, (D + 1,), who they are, and what it counts for them, one
         detection after the other.
         """
         counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
         begin = np.cumsum(np.concatenate([[0, 0], counts]))
-        who, what = np.empty(begin[-1], dtype=np.intp), np.empty(begin[-1])
+        who, what = np.empty(begin[-1], dtype=np.int32), np.empty(begin[-1], dtype=np.float32)
         _holders(self.place, self.weight, begin, who, what)
         return begin[:-1], who, what
 
