@@ -129,7 +129,8 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     """Cluster the points of each joint around its most confident ones (the paper's set S_i).
 
     The paper picks the most confident point, gives it all its neighbours within rho, removes them and starts
-    again.
+    again. All joints are done at once here and many picks in a round: a point that is more confident than all
+    its remaining neighbours would be picked before them in any case, so the result is the same.
     """
     if len(points.xyz) == 0:
         none = np.zeros(0, dtype=np.intp)
@@ -234,32 +235,34 @@ def _reprojection_error(rig: Rig, view: Index, normalised: Array, xyz: Array) ->
 
 
 def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
-    """The seed (M,) whose cluster each point joins, as points are picked one by one by confidence."""
-    order = np.argsort(-points.score, kind="stable")
-    along = np.lexsort((points.xyz[:, 0], points.joint))
-    place, seed = np.empty_like(along), np.full(len(along), -1, dtype=np.intp)
-    place[along] = np.arange(len(along))
-    _pick_seeds(order, along, place, np.ascontiguousarray(points.xyz), points.joint, radius_m, seed)
+    """The seed (M,) whose cluster each point joins: points are picked one by one by confidence, and each that is
+    still left takes what is left of its joint's within the radius.
+    """
+    order, along = np.argsort(-points.score, kind="stable"), np.lexsort((points.xyz[:, 0], points.joint))
+    seed, place = np.full(len(order), -1, dtype=np.intp), np.empty(len(order), dtype=np.intp)
+    place[along] = np.arange(len(order))
+    joint, xyz = (np.ascontiguousarray(each) for each in (points.joint, points.xyz))
+    _pick(order, along, place, joint, xyz, radius_m, seed)
     return seed
 
 
 @kernel
-def _pick_seeds(order, along, place, xyz, joint, radius_m, seed):
-    """Fill in `seed` (M,). Points are picked in `order`; `along` are those of a joint by their first coordinate,
-    and `place` where each one is there, so that only those beside it are looked at.
+def _pick(order, along, place, joint, xyz, radius_m, seed):
+    """Fill in `greedy_seeds`, of points in `order` (M,); `along` (M,) sorts them by joint and x, where each has
+    its `place` (M,).
     """
-    for i in order:
-        if seed[i] >= 0:
+    for n in range(len(order)):
+        p = order[n]
+        if seed[p] >= 0:
             continue
-        seed[i] = i
+        seed[p] = p
         for step in (-1, 1):
-            k = place[i] + step
+            k = place[p] + step
             while 0 <= k < len(along):
-                j = along[k]
-                x = xyz[j, 0] - xyz[i, 0]
-                if joint[j] != joint[i] or abs(x) > radius_m:
+                q = along[k]
+                x, y, z = xyz[q, 0] - xyz[p, 0], xyz[q, 1] - xyz[p, 1], xyz[q, 2] - xyz[p, 2]
+                if joint[q] != joint[p] or abs(x) > radius_m:
                     break
-                y, z = xyz[j, 1] - xyz[i, 1], xyz[j, 2] - xyz[i, 2]
-                if seed[j] < 0 and x * x + y * y + z * z <= radius_m * radius_m:
-                    seed[j] = i
+                if seed[q] < 0 and x * x + y * y + z * z <= radius_m * radius_m:
+                    seed[q] = p
                 k += step
