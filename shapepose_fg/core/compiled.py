@@ -38,8 +38,8 @@ def part(function: F) -> F:
 
 
 class _Cache(FunctionCache):
-    """Numba's, but for two things: a function is compiled anew also when a file has changed that it calls into; and
-    what is compiled is loaded without what only compiling needs, which takes a fifth of a second.
+    """Numba's, but for two things: a function is compiled anew also when a file has changed that it calls into,
+    and what is compiled is loaded without what only compiling needs, which takes a fifth of a second.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
