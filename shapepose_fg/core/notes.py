@@ -43,6 +43,7 @@ class _Kept(BaseModel):
     probable: dict[str, _Count]
     dropped: _Frames
     thinned_frames: _Frames
+    repeated_pictures: _Frames
     problems: list[Problem]
 
 
@@ -62,6 +63,8 @@ class Notes:
     """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
     thinned_frames: dict[str, list[int]] = field(default_factory=dict)
     """The frames of which something was left out, because it was too much."""
+    repeated_pictures: dict[str, list[int]] = field(default_factory=dict)
+    """The frames in which a camera, by its name, showed the picture before once more."""
     problems: list[Problem] = field(default_factory=list)
     """What could not be solved."""
 
@@ -70,9 +73,9 @@ class Notes:
         self.frames += other.frames
         for mine, more in ((self.seconds, other.seconds), (self.probable, other.probable)):
             mine.update(more)
-        for mine, more in ((self.dropped, other.dropped), (self.thinned_frames, other.thinned_frames)):
-            for name, frames in more.items():
-                mine.setdefault(name, []).extend(frames)
+        for kind in ("dropped", "thinned_frames", "repeated_pictures"):
+            for name, frames in getattr(other, kind).items():
+                getattr(self, kind).setdefault(name, []).extend(frames)
         for track, (evidence, rows) in other.evidence.items():
             before = self.evidence.get(track, [0.0, 0])
             self.evidence[track] = [before[0] + evidence, before[1] + rows]
@@ -112,6 +115,11 @@ class Notebook:
         if is_thinned and frame is not None:
             noted = self._notes.thinned_frames.setdefault(what, [])
             noted += [frame] if frame not in noted[-1:] else []
+
+    def repeat(self, cameras: Sequence[str], frame: int) -> None:
+        """Note down the cameras whose picture of a frame is the one before."""
+        for camera in cameras:
+            self._notes.repeated_pictures.setdefault(camera, []).append(frame)
 
     def drop(self, reason: str, count: int) -> None:
         """Note down people of the present frame who were none, or too little is seen of.

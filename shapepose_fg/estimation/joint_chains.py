@@ -13,8 +13,9 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.in_time import spanned
-from shapepose_fg.estimation.kernels import ROBUST, ready, solve_chains
+from shapepose_fg.estimation.kernels import ready, solve_chains
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting
 
@@ -39,6 +40,8 @@ class Projections:
     """(T, J, V) of what is new in every frame, pixels."""
     used: Mask
     """(T, J, V) which observations count."""
+    lead_s: Array
+    """(T, J, V) how long after the state each was exposed, seconds."""
     kernel: KernelName | None
     """The robust kernel."""
     scale: float
@@ -110,7 +113,7 @@ class Chains:
         states, seen = self._at(initial), self.seen
         solve_chains(
             states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
-            seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
+            seen.weight, seen.lead_s, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
         )  # fmt: skip
         return states
 

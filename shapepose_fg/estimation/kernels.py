@@ -9,10 +9,9 @@ import math
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
+from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
 
-ROBUST = {None: 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
-"""Robust kernels by their number in kernels."""
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-13, 1e-6, 1e-10
 """Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
@@ -28,41 +27,21 @@ def ready(values: Array) -> Array:
     return np.require(values, np.float64, ("C", "W"))
 
 
-@kernel
-def _weight(robust, ratio):
-    """`factors.kernel_weight` of the squared norm over the squared width."""
-    if robust == 0:
-        return 1.0
-    if robust == 1:
-        return 1.0 / math.sqrt(max(ratio, 1.0))
-    if robust == 2:
-        return 1.0 / (1.0 + ratio)
-    if robust == 3:
-        return 1.0 / (1.0 + ratio) ** 2
-    return max(1.0 - ratio, 0.0) ** 2
-
-
-@kernel
-def _project(camera, x):
-    """Pixel and depth of a point."""
-    depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
-    u = camera[0, 0] * x[0] + camera[0, 1] * x[1] + camera[0, 2] * x[2] + camera[0, 3]
-    v = camera[1, 0] * x[0] + camera[1, 1] * x[1] + camera[1, 2] * x[2] + camera[1, 3]
-    return u / depth, v / depth, depth
-
-
-@kernel
-def _add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
-    """Add J^T w J and J^T w r, with J the derivative of the pixel (u, v) and r = (to_u, to_v)."""
+@part
+def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
+    """Add what `add_view` leaves out where the pixel is of x + lead v: the velocity v follows the position x."""
     for a in range(3):
         ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
-        gradient[a] += weight * (ua * to_u + va * to_v)
+        gradient[3 + a] += lead * weight * (ua * to_u + va * to_v)
         for b in range(3):
             ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
-            information[a, b] += weight * (ua * ub + va * vb) / depth
+            square = lead * weight * (ua * ub + va * vb) / depth
+            information[a, 3 + b] += square
+            information[3 + a, b] += square
+            information[3 + a, 3 + b] += lead * square
 
 
-@kernel
+@part
 def _eigen(A, values, vectors):
     """Eigenvalues, rising, and eigenvectors (columns) of a symmetric (3, 3), which is lost: Jacobi's rotations."""
     for a in range(3):
@@ -98,6 +77,26 @@ def _eigen(A, values, vectors):
 
 
 @kernel
+def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, points):
+    """Fill in `points` (N, J, 3) that are NaN where two views see them and agree (`linearisation.triangulate`)."""
+    weight, x = np.empty(xy.shape[2]), np.empty(3)
+    for n in range(len(points)):
+        at = n if len(cameras) > 1 else 0
+        for j in range(points.shape[1]):
+            seen = 0
+            for v in range(xy.shape[2]):
+                if confidence[n, j, v] > 0.0:
+                    seen += 1
+            if seen < 2 or not math.isnan(points[n, j, 0] + points[n, j, 1] + points[n, j, 2]):
+                continue
+            agree = triangulated(
+                cameras[at], focal[at], xy[n, j], confidence[n, j], scale_m, reach_m, least_depth, weight, x
+            )
+            if agree >= 2:
+                points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
+
+
+@kernel
 def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
     inlier, residual, information, gradient, target, sigma_m,
@@ -116,7 +115,7 @@ def look(
                 if not sigmas[n, j, v] > 0.0:
                     continue
                 camera = cameras[n if cameras.shape[0] > 1 else 0, v]
-                at_u, at_v, depth = _project(camera, x)
+                at_u, at_v, depth = project(camera, x)
                 if not depth >= least_depth:
                     continue
                 to_u, to_v = at_u - xy[n, j, v, 0], at_v - xy[n, j, v, 1]
@@ -128,10 +127,10 @@ def look(
                 if inlier[n, j, v]:
                     weight = 1.0 / (sigmas[n, j, v] * sigmas[n, j, v])
                     if by_reach:
-                        weight *= _weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
+                        weight *= robust_weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
                     else:
-                        weight *= _weight(robust, far * weight / (width * width))
-                    _add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
+                        weight *= robust_weight(robust, far * weight / (width * width))
+                    add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
             for a in range(3):
                 target[n, j, a] = x[a]
                 for b in range(3):
@@ -147,9 +146,12 @@ def look(
             sigma_m[n, j] = 1.0 / math.sqrt(values[0]) if values[0] > _NOTHING * values[2] else np.inf
 
 
-@kernel
-def _normal(state, joint, diagonal, right, cameras, xy, weight, robust, width, H, g):
-    """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g."""
+@part
+def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, width, H, g, at):
+    """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g.
+
+    `at` (3,) is anything.
+    """
     T, d = state.shape
     for t in range(T):
         for a in range(d):
@@ -159,16 +161,24 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, robust, width, H
         for n in range(weight.shape[2]):
             camera, w = cameras[t if cameras.shape[0] > 1 else 0, n], weight[t, joint, n]
             if w > 0.0:
-                u, v, depth = _project(camera, state[t])
+                later = lead[t, joint, n]
+                for a in range(3):
+                    at[a] = state[t, a]
+                    if later != 0.0:
+                        at[a] += later * state[t, 3 + a]
+                u, v, depth = project(camera, at)
                 if depth > 0.0:
                     off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
-                    w *= _weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
+                    w *= robust_weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
                     # J x, without the product: the derivative of a quotient.
-                    at_u, at_v = u * camera[2, 3] - camera[0, 3], v * camera[2, 3] - camera[1, 3]
-                    _add_view(camera, u, v, depth, at_u / depth - off_u, at_v / depth - off_v, w, H[t], g[t])
+                    at_u = (u * camera[2, 3] - camera[0, 3]) / depth - off_u
+                    at_v = (v * camera[2, 3] - camera[1, 3]) / depth - off_v
+                    add_view(camera, u, v, depth, at_u, at_v, w, H[t], g[t])
+                    if later != 0.0:
+                        _add_velocity(camera, u, v, depth, at_u, at_v, w, later, H[t], g[t])
 
 
-@kernel
+@part
 def _factored(H, below, Z):
     """Block Cholesky down a chain, in place: H_t = L_t L_t^T, Z_t = L_t^-1 B_t^T. False where it is singular."""
     T, d = H.shape[:2]
@@ -203,7 +213,7 @@ def _factored(H, below, Z):
     return True
 
 
-@kernel
+@part
 def _solve(H, Z, g, x):
     """Put the solution of `_factored` blocks and the right side `g` (T + 1, d), which is lost, into `x` (T, d) if
     it is near; how far positions move, metres.
@@ -236,7 +246,7 @@ def _solve(H, Z, g, x):
     return farthest
 
 
-@kernel
+@part
 def _marginals(H, Z, M, G, S, covariance):
     """The blocks on the diagonal of the inverse of `_factored` ones, `covariance` (T, d, d), from the end back."""
     T, d = H.shape[:2]
@@ -271,26 +281,27 @@ def _marginals(H, Z, M, G, S, covariance):
 
 @kernel
 def solve_chains(
-    states, joints, diagonal, below, right, cameras, xy, weight, robust, width, steps, tolerance, covariance
+    states, joints, diagonal, below, right, cameras, xy, weight, lead, robust, width, steps, tolerance, covariance
 ):
     """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, d, d) where it ends,
     or of the first chains (0, ...): NaN where one is singular, which stays where it is.
 
     A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
     (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
-    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
+    1/sigma² of those that count, `lead` (T, J, V) seconds by which they are after the state, whose next three are
+    the velocity. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
     `steps`, until one moves no position by more than `tolerance` metres; without any there are covariances only.
     Robust weights are those of the step before, which no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
     # Zero at the end of Z and g, where nothing comes after the last state, nor before the first.
     H, Z, g = np.empty((T, d, d)), np.zeros((T, d, d)), np.zeros((T + 1, d))
-    M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d))
+    M, G, S, at = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d)), np.empty(3)
     for c in range(C):
         x, linked = states[c], below[c]
         moved, n, regular = 0.0, 0, True
         while regular and n <= steps and (n == 0 or moved > tolerance):
-            _normal(x, joints[c], diagonal[c], right[c], cameras, xy, weight, robust, width, H, g)
+            _normal(x, joints[c], diagonal[c], right[c], cameras, xy, weight, lead, robust, width, H, g, at)
             regular = _factored(H, linked, Z)
             if regular and n < steps:
                 moved = _solve(H, Z, g, x)
@@ -298,4 +309,7 @@ def solve_chains(
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):
-            covariance[c] = np.nan
+            for t in range(T):
+                for a in range(d):
+                    for b in range(d):
+                        covariance[c, t, a, b] = np.nan

@@ -11,6 +11,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
@@ -38,7 +39,7 @@ def estimate_offsets(
     config = config or PipelineConfig()
     fitter = fitter or make_fitter(config.body)
     config = replace(config, offsets=replace(config.offsets, source="recording"))
-    thinned = ThinnedFrames(detections, len(rig), config.candidates)
+    thinned = ThinnedFrames(WithoutRepeats(detections, len(rig)), len(rig), config.candidates)
     offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
     if offsets is None:
         raise ValueError(f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}")
@@ -72,7 +73,7 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
     with book.stage("offsets"):
         spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
-        hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).by_hips()
+        hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).of_few()
         people = [hips(detections[detections.first + t], rig) for t in spread]
         if len(people) == 0:
             return KeypointOffsets.identity()

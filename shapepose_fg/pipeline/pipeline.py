@@ -16,6 +16,7 @@ from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_graph import ExtraFactors
@@ -124,7 +125,8 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             f" got {chunk}"
         )
     book, fitter = Notebook(), task.fitter
-    detections = ThinnedFrames(task.detections, len(rig), config.candidates)
+    pictures = WithoutRepeats(task.detections, len(rig))
+    detections = ThinnedFrames(pictures, len(rig), config.candidates)
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
@@ -136,7 +138,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     parts = Parts(kept)
     parts.check(skeleton.joints, rig.names, frames, times.frame_s)
     done = parts.notes().frames
-    windows = SolvedWindows(setup, detections, times, frames, cuts, book)
+    windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, book)
     with execution.pool(setup, len(frames)) as pool:
         beginning = book.torn_off()
         nobody = setup.engine(book).tracker.nobody()
@@ -228,4 +230,5 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
         "probability": probable if config.temporal else dict(sorted(notes.probable.items())),
         "dropped_frames": spans(dropped),
         "thinned_frames": spans(notes.thinned_frames),
+        "repeated_pictures": spans(notes.repeated_pictures),
     }

@@ -2,15 +2,17 @@
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.notes import Notebook, Notes
+from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
@@ -27,6 +29,8 @@ class SolvedWindows:
     """What all processes share."""
     detections: ThinnedFrames
     """What the cameras saw."""
+    pictures: WithoutRepeats
+    """The same before it was thinned."""
     times: FrameTimes
     """When."""
     frames: range
@@ -35,6 +39,8 @@ class SolvedWindows:
     """First frames of what follows a cut."""
     book: Notebook
     """Where this process takes its notes."""
+    _rigs: dict[tuple[int, ...], Rig] = field(default_factory=dict, init=False)
+    """The cameras, by which of them have no picture."""
 
     @cached_property
     def _time_s(self) -> Array:
@@ -45,7 +51,11 @@ class SolvedWindows:
         """What the cameras give of a frame."""
         with self.book.stage("read"):
             self.book.thin("detections", self.detections.is_thinned(frame), frame)
-            return Input(frame, self._time_s[frame], self.detections[frame], self.setup.rig)
+            dark = self.pictures.repeated(frame)
+            self.book.repeat([self.setup.rig.names[view] for view in dark], frame)
+            if dark not in self._rigs:
+                self._rigs[dark] = replace(self.setup.rig, dark=dark)
+            return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[dark])
 
     def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
         """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""

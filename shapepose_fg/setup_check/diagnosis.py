@@ -164,6 +164,8 @@ _TURN_DEG = 0.6
 """Less is said of the principal point: of a calibration, and not of a camera that was knocked."""
 _NOBODY = 0.05
 """With fewer people than this for each sighting, cameras see no people in common."""
+_STOPPED = 0.02
+"""Share of pictures shown twice from which on a camera is named: fewer fill up dropped frames."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
 _SHORTEST, _TALLEST = 0.9, 2.4
 """Median statures, metres, outside of which it is the calibration's unit and not the people."""
@@ -186,10 +188,10 @@ class Diagnosis:
 
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
     """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
-    evidence = gather(detections, range(len(detections)) if frames is None else frames)
+    evidence = gather(detections, range(len(detections)) if frames is None else frames, len(rig))
     given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
-    findings += _blind(given)
+    findings += _blind(given) + _stopped(given)
     look = given if evidence is given.evidence else replace(given, evidence=evidence)  # what it found stays
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
@@ -238,8 +240,15 @@ def _blind(look: Look) -> list[Finding]:
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
     if seen.sum() == 0:
         return _nobody(look)
-    gone = [] if seen.sum() < MIN_SIGHTINGS else np.flatnonzero(seen == 0).tolist()
+    gone = (seen == 0) & (look.evidence.stopped < _STOPPED) & (seen.sum() >= MIN_SIGHTINGS)
+    gone = np.flatnonzero(gone).tolist()
     return [Finding(Kind.NOBODY, tuple(gone))] if gone else []
+
+
+def _stopped(look: Look) -> list[Finding]:
+    """Cameras whose recording stops."""
+    share = look.evidence.stopped
+    return [Finding(Kind.STOPPED, (v,), float(share[v])) for v in np.flatnonzero(share >= _STOPPED).tolist()]
 
 
 def _nobody(look: Look) -> list[Finding]:

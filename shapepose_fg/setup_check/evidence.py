@@ -11,6 +11,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
 from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
 
@@ -42,14 +43,16 @@ class Evidence:
     """At these frames, and at their neighbours."""
     most_lag: int
     """Largest offset in time that can be told."""
+    stopped: Array
+    """(V,) in what part of these frames each camera shows the picture before once more."""
 
     def thinned(self, frames: int) -> "Evidence":
         """The same with fewer frames that are looked at."""
         return replace(self, anchors=self.anchors[:: max(1, len(self.anchors) // frames)])
 
 
-def gather(detections: DetectionSequence, frames: range) -> Evidence:
-    """The people seen at frames spread over a recording."""
+def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence:
+    """The people that V cameras, `views`, saw at frames spread over a recording; no picture counts twice."""
     count = len(frames)
     if count <= _WHOLE:
         wanted = np.arange(frames.start, frames.stop)
@@ -60,13 +63,16 @@ def gather(detections: DetectionSequence, frames: range) -> Evidence:
         spread = np.unique(np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp))
         around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
         wanted = np.unique(np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)]))
-    sightings = Sightings.of(detections, wanted.tolist())
+    pictures, stopped = WithoutRepeats(detections, views), np.zeros(views)
+    sightings = Sightings.of(pictures, wanted.tolist())
+    for frame in wanted.tolist():
+        stopped[list(pictures.repeated(frame))] += 1 / len(wanted)
     here = sightings.only(np.isin(sightings.frame, spread))
     _, each = np.unique(here.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]
-    return Evidence(spread, sightings, most)
+    return Evidence(spread, sightings, most, stopped)
 
 
 @dataclass(frozen=True)
@@ -186,7 +192,8 @@ def _triangulate(
                     _solve(A, b, gu)
                     for i in range(3):
                         x[i] -= gu[i]
-            points[p, j] = x
+            for i in range(3):
+                points[p, j, i] = x[i]
 
 
 @kernel

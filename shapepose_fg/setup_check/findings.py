@@ -26,6 +26,7 @@ class Kind(StrEnum):
     UNIT = "unit"
     UP = "up axis"
     NOBODY = "nobody"
+    STOPPED = "stopped"
     UNFIT = "does not fit"
     PICTURE_SIZE = "size of the pictures"
 
@@ -65,7 +66,7 @@ def sentence(finding: Finding, rig: Rig) -> str:
         sees="sees" if len(names) == 1 else "see",
         amount=amount,
         degrees=f"{amount:.1f}" if amount < 10 else f"{amount:.0f}",
-        percent=100 * abs(amount - 1),
+        percent=100 * abs(amount - (finding.kind != Kind.STOPPED)),
         frames=f"{count} frame{'s' if count != 1 else ''}",
         at=100 + round(amount),
         moved=_length(finding.moved),
@@ -177,6 +178,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.UP: "people stand along {axis}, and the calibration says that {up} is up; give --up {axis}"
     " unless they lie",
     Kind.NOBODY: _nobody,
+    Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
+    " what it sees there is left out: look at its recording",
     Kind.UNFIT: "{who} fits the others in nothing that was tried; check that its calibration and its detections"
     " are its own",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"

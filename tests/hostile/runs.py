@@ -18,6 +18,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import COCO_17
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
@@ -147,8 +148,9 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
         joints, (frames, times, cuts) = own.detections.skeleton.joints, own.whole()
         assert own.fitter is not None
         setup = Setup(own.rig, own.detections.skeleton, own.config, own.fitter)
-        detections = ThinnedFrames(own.detections, len(own.rig), own.config.candidates)
-        windows = SolvedWindows(setup, detections, times, frames, cuts, Notebook())
+        pictures = WithoutRepeats(own.detections, len(own.rig))
+        detections = ThinnedFrames(pictures, len(own.rig), own.config.candidates)
+        windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, Notebook())
         nobody = setup.engine(Notebook()).tracker.nobody()
 
         def result() -> Reconstruction:

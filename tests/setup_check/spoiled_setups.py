@@ -118,14 +118,15 @@ def resized(detections: DetectionSequence, views: tuple[int, ...], factor: float
 
 
 def delayed(detections: DetectionSequence, view: int, frames: int) -> Recording:
-    """What one camera saw, so many frames later; at the ends it stands still."""
+    """What one camera saw, so many frames later; at one end it sees nothing."""
     every = [detections[frame] for frame in range(len(detections))]
-    shifted = np.clip(np.arange(len(every)) - frames, 0, len(every) - 1)
+    every, shifted = [*every, Detections.empty()], np.arange(len(every)) - frames
+    shifted[(shifted < 0) | (shifted >= len(detections))] = len(detections)
     return Recording(
         detections.skeleton,
         [
             _together(now.only(now.view != view), every[then].only(every[then].view == view))
-            for now, then in zip(every, shifted.tolist(), strict=True)
+            for now, then in zip(every[:-1], shifted.tolist(), strict=True)
         ],
     )
 

@@ -60,7 +60,7 @@ def _product(A, B, C):
 
 @part
 def _bent(slope, L, T, q, c):
-    """What turning joint q about its axis c does to something of this `slope` (207,) by the pose blend shapes."""
+    """What turning joint q about its axis c does by the pose blend shapes: `slope` (207,) is along these."""
     x, y, z, at, total = T[0, c], T[1, c], T[2, c], 9 * q - 9, 0.0
     for i in range(3):
         total += slope[at + 3 * i] * (L[i, 1] * z - L[i, 2] * y)

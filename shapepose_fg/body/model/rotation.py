@@ -29,6 +29,13 @@ def exp_so3(axis_angle: Array) -> Array:
     return R
 
 
+def quaternion(R: Array) -> Array:
+    """Unit quaternions (w, x, y, z) with w >= 0 of rotation matrices; (..., 3, 3) -> (..., 4)."""
+    turn = log_so3(R)
+    half = np.linalg.norm(turn, axis=-1, keepdims=True) / 2
+    return np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * turn], axis=-1)
+
+
 def log_so3(R: Array) -> Array:
     """Axis-angle vectors of rotation matrices, norm at most pi; (..., 3, 3) -> (..., 3).
 

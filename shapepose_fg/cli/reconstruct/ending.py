@@ -81,6 +81,9 @@ def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds:
         table.add_row("lost", "; ".join(lost), style="yellow")
     for what, spans in run.get("thinned_frames", {}).items():
         table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
+    for camera, spans in run.get("repeated_pictures", {}).items():
+        words = f"{camera} shows one picture again, which is left out{_frames_words(spans)}"
+        table.add_row("", words, style="yellow")
     if len(people) > 0:
         table.add_row("joints", _joints(counts["joints"], people))
     # Loading the body takes a third of a second, once; it says nothing about the time of a frame.
