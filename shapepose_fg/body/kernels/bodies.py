@@ -358,14 +358,15 @@ def seen(limbs, own, betas, local, place, target, information, kernel_scale, ste
         for i in range(len(g)):
             g[i] = 0.0
         for k in range(K):
-            t, at, R, o, x = own.target[k], 7 * k, w.world[own.bone[k]], own.offset[k], w.xyz[3 * k : 3 * k + 3]
+            t, at, R, o = own.target[k], 7 * k, w.world[own.bone[k]], own.offset[k]
             for y in range(3):
-                row[at + y] = x[y] - R[y, 0] * o[0] - R[y, 1] * o[1] - R[y, 2] * o[2]
+                row[at + y] = w.xyz[3 * k + y] - R[y, 0] * o[0] - R[y, 1] * o[1] - R[y, 2] * o[2]
                 row[at + 3 + y] = 0.0
             row[at + 6] = 0.0
             if t >= 0:
                 M = information[b, t]
-                a0, a1, a2 = target[b, t, 0] - x[0], target[b, t, 1] - x[1], target[b, t, 2] - x[2]
+                a0, a1, a2 = w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
+                a0, a1, a2 = target[b, t, 0] - a0, target[b, t, 1] - a1, target[b, t, 2] - a2
                 _share(M, TRUST_M, S)
                 row[at + 6] = (S[0, 0] + S[1, 1] + S[2, 2]) / 3
                 _share(M, REACH_M, S)
