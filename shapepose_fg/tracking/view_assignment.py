@@ -98,7 +98,8 @@ def probabilities(near: Scored, detections: int) -> Array:
     weight = np.where(near.possible, np.exp(_ODDS * (near.score - _EVEN)), 0.0)
     probable = np.empty_like(weight)
     people = int(near.person.max(initial=-1)) + 1
-    _marginals(near.first, near.person, near.detection, weight, people, detections, _MESSAGES, probable)
+    room = np.zeros(people), np.zeros(detections), np.ones_like(weight)
+    _marginals(near.first, near.person, near.detection, weight, _MESSAGES, *room, probable)
     return probable
 
 
@@ -161,9 +162,10 @@ def _assign(
 
 
 @kernel
-def _marginals(first, person, detection, weight, people, detections, rounds, probable):
-    """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view."""
-    of_person, of_detection, unclaimed = np.zeros(people), np.zeros(detections), np.ones(len(weight))
+def _marginals(first, person, detection, weight, rounds, of_person, of_detection, unclaimed, probable):
+    """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view; zeros by person and detection
+    and ones (N,) to begin with.
+    """
     for slot in range(len(first) - 1):
         span = range(first[slot], first[slot + 1])
         for _ in range(rounds):
