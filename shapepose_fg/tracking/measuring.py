@@ -38,9 +38,15 @@ class Trust(NamedTuple):
     @classmethod
     def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "Trust":
         """The settings, for `joints` of these names."""
-        robust = ROBUST[config.kernel], DEFAULT_WIDTH_SIGMA.get(config.kernel, 1.0)
-        numbers = config.sigma_m, config.floor_rad, config.rho_2d_m, config.fixed_depth_m or 0.0
-        return cls(config.scatter(joints), *map(float, numbers), *robust)
+        return cls(
+            scatter=config.scatter(joints),
+            sigma_m=float(config.sigma_m),
+            floor_rad=float(config.floor_rad),
+            rho_2d_m=float(config.rho_2d_m),
+            fixed_depth_m=float(config.fixed_depth_m),
+            robust=ROBUST[config.kernel],
+            width=DEFAULT_WIDTH_SIGMA.get(config.kernel, 1.0),
+        )
 
 
 def measured(

@@ -89,9 +89,7 @@ class Bones(NamedTuple):
         """A detector's."""
         core, order = np.zeros(len(skeleton), dtype=bool), np.concatenate(skeleton.tree_levels).astype(np.intp)
         core[list(skeleton.core)] = True
-        return cls(
-            core, order, np.array(skeleton.parents), np.array(skeleton.hips), np.array(longest_m, dtype=float)
-        )
+        return cls(core, order, np.array(skeleton.parents), skeleton.hips, np.array(longest_m, dtype=float))
 
 
 def predicted(

@@ -78,10 +78,10 @@ def weighed(
     unknown are thought to be where the others are in the mean.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
-    room = *np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size), np.empty((A, J, 3))
-    room = *room, np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
-    weight, price = np.zeros(candidate.shape), np.zeros(A)
-    _weigh(candidate, places, known, world, sight, limbs_of(skeleton), *room, weight, price)
+    weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
+    lists, tied = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
+    room = np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
+    _weigh(candidate, places, known, world, sight, limbs, lists, tied, *room, weight, price)
     return weight, price
 
 
@@ -94,8 +94,7 @@ def limbs_of(skeleton: Skeleton) -> Index:
 
 @kernel
 def _weigh(
-    candidate, places, known, world, sight, limbs, whose, which, neighbours, tied, at, seen, box, expected, weight,
-    price,
+    candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight, price
 ):  # fmt: skip
     """Fill in what `weighed` returns, zeros before; `expected` (A,) is how many places there are.
 
@@ -103,7 +102,7 @@ def _weigh(
     (A, 3): left, right and the nearest. Joints are `at` (A, J, 3), or where the others are in the mean.
     """
     people, joints, views = weight.shape
-    cameras, count = sight.cameras, 0
+    cameras, count, whose, which, neighbours = sight.cameras, 0, lists[0], lists[1], lists[2]
     for a in range(people):
         for j in range(joints):
             for v in range(views):

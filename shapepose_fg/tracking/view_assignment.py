@@ -113,19 +113,26 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
     while near is None or count > len(near.person):
         whole, real, flag = np.empty((3, count), np.intp), np.empty((5, count)), np.empty((2, count), dtype=bool)
         near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
-        room = np.empty((2, A, J)), first[1], whole[2], np.empty(len(sight.of_view), np.intp), *real[2:], flag[1]
-        count = _assign(given, predicted.sigma_m, predicted.lost, world, people, sight, near, *room, *chosen)
-    return chosen[0], Scored(near.first, *(each[:count] for each in near[1:]))
+        gates, taken = np.empty((2, A, J)), np.empty(len(sight.of_view), np.intp)
+        count = _assign(
+            given, predicted.sigma_m, predicted.lost, world, people, sight, near, gates, first[1], whole[2], taken,
+            real[2:], flag[1], chosen,
+        )  # fmt: skip
+    begins, person, detection, distance_m, score, possible = near
+    ends = distance_m[:count], score[:count], possible[:count]
+    return chosen[0], Scored(begins, person[:count], detection[:count], *ends)
 
 
 @kernel
 def _assign(
-    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, nearness, tied, key, sought,
-    chosen, before,
+    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought, both
 ):  # fmt: skip
-    """Fill in `near` and `chosen`, as far as there is room for what is near; returns how much there is."""
+    """Fill in `near`, and the first of `both` (2, A, J, V), as far as there is room for what is near; returns how
+    much there is.
+    """
+    gate_m, reach_m, chosen, before = gates[0], gates[1], both[0], both[1]
+    nearness, tied, key = reals[0], reals[1], reals[2]
     people_count, joints, views = chosen.shape
-    gate_m, reach_m = gates[0], gates[1]
     for a in range(people_count):
         for j in range(joints):
             gate_m[a, j] = _REACH_M if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
