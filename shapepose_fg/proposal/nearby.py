@@ -160,6 +160,13 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
     return np.searchsorted(joint, np.arange(len(skeleton) + 1)), other
 
 
+@cache
+def limbs_of(skeleton: Skeleton) -> Index:
+    """(L, 2) the limbs of core joints, and the spine: what hides others."""
+    core = set(skeleton.core)
+    return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
+
+
 @kernel
 def find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m):
     """Fill in what `nearby` returns, as far as there is room; returns how much there is.
