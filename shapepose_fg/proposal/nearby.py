@@ -99,25 +99,10 @@ class Nearby:
         joints that are `lost` (N,) only affinity tells, and so much of it must be there.
         """
         N, chosen = len(self.person), np.empty(own.shape, dtype=np.intp)
-        claims, taken = (
-            Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool)),
-            np.empty(len(sight.of_view), np.intp),
-        )
-        room = np.empty(N), np.empty(N, dtype=np.intp), taken
-        claim(
-            self.first,
-            self.person,
-            self.detection,
-            nearness,
-            lost,
-            sure,
-            own,
-            world,
-            sight,
-            *claims,
-            *room,
-            chosen,
-        )
+        claims = Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool))
+        room = np.empty(N), np.empty(N, dtype=np.intp), np.empty(len(sight.of_view), dtype=np.intp)
+        near = self.first, self.person, self.detection
+        claim(*near, nearness, lost, sure, own, world, sight, *claims, *room, chosen)
         return chosen, claims
 
     def with_tied(self, own: Index, unplaced: Mask, sight: Sight) -> "Nearby":
@@ -164,7 +149,7 @@ def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight
     other ends of the joint's limbs, and how many (N,) of these there are.
     """
     mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
-    tie(person, detection, len(person), candidate, sight, mean, neighbours)
+    tie(person, detection, candidate, sight, mean, neighbours)
     return mean, neighbours
 
 
@@ -173,6 +158,13 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
     """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin."""
     joint, other = np.nonzero(skeleton.adjacency)
     return np.searchsorted(joint, np.arange(len(skeleton) + 1)), other
+
+
+@cache
+def limbs_of(skeleton: Skeleton) -> Index:
+    """(L, 2) the limbs of core joints, and the spine: what hides others."""
+    core = set(skeleton.core)
+    return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
 
 
 @kernel
@@ -217,11 +209,11 @@ def find_near(places, reach_m, people, sight, first, begins, person, detection, 
 
 
 @kernel
-def tie(person, detection, count, own, sight, mean, neighbours):
-    """Fill in the first `count` of the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
+def tie(person, detection, own, sight, mean, neighbours):
+    """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
     of_joint, of_view, begin, other, value = sight.of_joint, sight.of_view, sight.begin, sight.other, sight.value
     limb, limb_ends = sight.limb, sight.limb_ends
-    for e in range(count):
+    for e in range(len(person)):
         a, d = person[e], detection[e]
         j, v, total, there = of_joint[d], of_view[d], 0.0, 0
         for n in range(limb[j], limb[j + 1]):
@@ -242,9 +234,9 @@ def claim(
 ):  # fmt: skip
     """Fill in what `Nearby.claimed` returns; `key` and `queue` (N,) and `taken` (D,) are room to work in."""
     people, joints, views = chosen.shape
-    rank = sight.rank
-    tie(person, detection, first[len(first) - 1], own, sight, tied, queue)
-    for e in range(first[len(first) - 1]):
+    rank, count = sight.rank, first[len(first) - 1]
+    tie(person[:count], detection[:count], own, sight, tied, queue)
+    for e in range(count):
         neighbours = queue[e]
         # Where no neighbour is seen, the affinities say nothing: neither for nor against.
         score[e] = nearness[e] + (tied[e] if neighbours > 0 else LEAST_AFFINITY)
