@@ -9,11 +9,12 @@ import numpy as np
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.setup_check.diagnosis import build_of
+from shapepose_fg.setup_check.diagnosis import build_of, diagnose
+from shapepose_fg.setup_check.findings import Kind
 from shapepose_fg.setup_check.fit import difference
 
 _ROUNDS = 4
@@ -27,6 +28,9 @@ _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
 detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
 _UNKNOWN = 0.8
 """A parameter whose sigma is still this part of what it was beforehand is not determined."""
+
+_BUMPED_DEG = 2.5
+"""A camera that is turned by more was bumped: what is said of it beforehand is not where it stands."""
 
 PARTS = {"turn": TURN, "move": MOVE, "focal": FOCAL, "centre": CENTRE, "lens": LENS}
 """What of a camera may change."""
@@ -123,7 +127,7 @@ def refine(
     The scale is that of the cameras' places beforehand. InputError where hardly anybody is seen by two cameras.
     """
     freedom = Freedom() if freedom is None else freedom
-    footage = Footage.of(detections, rig, times, frames)
+    footage, start = Footage.of(detections, rig, times, frames), _found_again(detections, rig, frames)
     taken = np.unique(footage.sightings.frame)
     halves = np.array_split(taken, 2)
     spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
@@ -134,7 +138,7 @@ def refine(
         def told(step: int, number: int = number) -> None:
             progress(number * _ROUNDS + step + 1, len(spans) * _ROUNDS)
 
-        found.append(_fitted(part, rig, times, freedom, reference, told))
+        found.append(_fitted(part, start, times, freedom, reference, told))
         if number > 0:
             people = footage.at(left).people(found[-1].rig)
             both = [missed_px(people, each) for each in (rig, found[-1].rig)]
@@ -150,6 +154,22 @@ def refine(
     stature = build_of(found[0].people.points, detections.skeleton).stature
     notes = tuple(_undetermined(found[0], freedom, counts))
     return Refinement(rig, found[0], freedom, was, now, counts, notes, stature)
+
+
+def _found_again(detections: DetectionSequence, rig: Rig, frames: range) -> Rig:
+    """The rig with cameras that look somewhere else, by degrees, turned to where they see the others' people."""
+    diagnosis = diagnose(detections, rig, frames)
+    turned = {
+        view for each in diagnosis.findings if each.kind in (Kind.TURNED, Kind.MOVED) for view in each.cameras
+    }
+    cameras = list(rig.cameras)
+    for view in turned:
+        cTw, camera = diagnosis.corrected.views.cTw[view], rig.cameras[view]
+        if difference(cTw, camera.cTw)[0] > _BUMPED_DEG:
+            new = (camera.name, camera.K, cTw, camera.image_size, camera.distortion.tolist(), camera.lens)
+            wTc = Camera.from_camera_from_world(*new).wTc
+            cameras[view] = replace(camera, wTc=wTc)
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _fitted(

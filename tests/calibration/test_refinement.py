@@ -73,6 +73,14 @@ def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
     assert max(np.degrees(np.arccos((np.trace(each) - 1) / 2)) for each in apart) < 0.5
 
 
+@pytest.mark.slow
+def test_a_camera_that_was_knocked_far_off_is_found_again(rig, recording):
+    knocked = replace(rig, cameras=(disturbed(rig, 1, degrees=15).cameras[0], *rig.cameras[1:]))
+    found = refine(recording, knocked, TIMES, range(250))
+    assert found.better and off_by(found.rig, rig)[0].max() < 0.3 and off_by(found.rig, rig)[1].max() < 0.03
+    assert found.change()["turn"][0] == pytest.approx(15, abs=1) and found.change()["turn"][1:].max() < 1
+
+
 def test_the_reference_camera_keeps_its_pose(rig, recording):
     wrong, footage = disturbed(rig, 2), Footage.of(recording, rig, TIMES, range(250))
     adjusted = adjust(wrong, wrong, footage.people(wrong), Freedom(), 12.0, reference=1)
