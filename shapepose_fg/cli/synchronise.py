@@ -1,12 +1,12 @@
 """The command `synchronise`: when each camera began, from the people; and detections of the same moments."""
 
 import json
+import math
 import shlex
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import typer
 
 from shapepose_fg.cli.options import (
@@ -94,7 +94,7 @@ def _show(found: "Synchronised", rig: "Rig") -> None:
     """The offsets."""
     rows = []
     for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
-        known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if np.isfinite(sigma) else "unknown"
+        known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"
         rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
     caption = "began: its frame 0, on the first camera's clock; stands out: the offset of all others"
     show(table(("camera", "began, s", "± ms", "stands out"), rows, caption=caption))

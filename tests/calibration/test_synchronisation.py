@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from shapepose_fg.calibration import synchronisation
 from shapepose_fg.calibration.synchronisation import same_moments, synchronise
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Rig
@@ -13,7 +14,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_association
 from tests.calibration.conftest import FPS
-from tests.setup_check.conftest import seen_by, walkers
+from tests.setup_check.conftest import seen_by
 
 LATE_S = np.array([0.0, 2.513, -1.22, 4.0])
 """When the four cameras began."""
@@ -22,14 +23,13 @@ LATE_S = np.array([0.0, 2.513, -1.22, 4.0])
 @pytest.fixture(scope="module")
 def late(rig, two_people) -> Recording:
     """Twelve seconds of each camera, of people whom the others saw earlier or later."""
-    body = two_people[0] + np.array([0.45, 0.0, 0.0])
-    fine = walkers(body, 1)  # one frame, for its shape
-    frames, parts = 300, []
-    for offset in LATE_S:
-        people = np.stack([moving(body, (t / FPS + offset)) for t in range(frames)])
-        assert people.shape[1:] == fine.shape[1:]
-        parts.append(people)
-    return merged(rig, parts)
+    return merged(rig, [filmed(two_people[0], offset) for offset in LATE_S])
+
+
+def filmed(body: np.ndarray, offset: float, drift: float = 0.0) -> np.ndarray:
+    """(300, 3, 25, 3) people before a camera that began so late, and falls behind."""
+    times = np.arange(300) / FPS
+    return np.stack([moving(body + np.array([0.45, 0.0, 0.0]), t) for t in offset + times * (1 + drift)])
 
 
 def moving(body: np.ndarray, time: float) -> np.ndarray:
@@ -71,6 +71,19 @@ def test_offsets_of_any_size_are_found_to_milliseconds(rig, late):
     # What is left between cameras of one moment is half a frame at the most.
     assert len(together) == len(times) > 120 and np.ptp(times, axis=1).max() < 1.01 / FPS
     assert np.abs(np.diff(times, axis=0) - 1 / FPS).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_clocks_that_run_apart(rig, two_people, monkeypatch):
+    monkeypatch.setattr(synchronisation, "_WHOLE_S", 6.0)
+    monkeypatch.setattr(synchronisation, "_END_S", 5.0)
+    drift = np.array([0.0, 0.0, 0.003, 0.0])
+    seen = merged(rig, [filmed(two_people[0], *each) for each in zip([0, 0.7, -0.3, 0.2], drift, strict=True)])
+    found = synchronise(seen, rig, FPS, range(300), 2.0)
+    assert np.abs(found.drift - drift).max() < 0.001
+    assert (np.abs(found.drift - drift)[1:] < 4 * found.drift_sigma[1:]).all()
+    # Frame 250 of the third camera was exposed after 10 s of a clock that is 3 in 1,000 slow.
+    assert found.at(10.0)[2] == pytest.approx(10.03 - 0.3, abs=0.008)
 
 
 @pytest.mark.slow
