@@ -7,6 +7,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.trust import BELIEVED, Trust
 
 _LEAST = 4
 """Detections that two pictures must have in common: the odd one may be of something that stands still."""
@@ -24,6 +25,8 @@ class WithoutRepeats:
     """The recording as it is."""
     views: int
     """V, its cameras."""
+    trust: Trust = BELIEVED
+    """Which cameras are left out besides, and when."""
     _before: dict[int, Detections] = field(default_factory=dict, init=False, repr=False, compare=False)
     """The frame that was read last, by its number."""
 
@@ -42,8 +45,9 @@ class WithoutRepeats:
 
     def __getitem__(self, frame: int, /) -> Detections:
         every = self.frames[frame]
-        repeated = self._repeated(frame, every)
-        return every.only(~repeated[every.view]) if repeated.any() else every
+        gone = self._repeated(frame, every)
+        gone[list(self.trust.dark(frame))] = True
+        return every.only(~gone[every.view]) if gone.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
         """The views that show in a frame what they showed in the frame before."""

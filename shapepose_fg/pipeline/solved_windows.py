@@ -39,8 +39,8 @@ class SolvedWindows:
     """First frames of what follows a cut."""
     book: Notebook
     """Where this process takes its notes."""
-    _rigs: dict[tuple[int, ...], Rig] = field(default_factory=dict, init=False)
-    """The cameras, by which of them have no picture."""
+    _rigs: dict[tuple[tuple[int, ...], ...], Rig] = field(default_factory=dict, init=False)
+    """The cameras, by which of them have no picture, and which are doubted."""
 
     @cached_property
     def _time_s(self) -> Array:
@@ -51,11 +51,12 @@ class SolvedWindows:
         """What the cameras give of a frame."""
         with self.book.stage("read"):
             self.book.thin("detections", self.detections.is_thinned(frame), frame)
-            dark = self.pictures.repeated(frame)
-            self.book.repeat([self.setup.rig.names[view] for view in dark], frame)
-            if dark not in self._rigs:
-                self._rigs[dark] = replace(self.setup.rig, dark=dark)
-            return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[dark])
+            repeated, trust = self.pictures.repeated(frame), self.pictures.trust
+            self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
+            said = tuple(sorted({*repeated, *trust.dark(frame)})), trust.in_doubt(frame)
+            if said not in self._rigs:
+                self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
+            return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[said])
 
     def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
         """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""

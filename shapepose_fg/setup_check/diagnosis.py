@@ -14,14 +14,17 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.trust import BELIEVED, Trust
 from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
+from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import Lag, gross_mistake, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import Change, Lag, gross_mistake, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
+from shapepose_fg.setup_check.over_time import stories
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
 
 _SAME_PX = 0.6
@@ -184,6 +187,8 @@ class Diagnosis:
     """Each camera's offset in time that remains; none with too few people."""
     build: Build | None = None
     """The people, in the corrected set-up."""
+    trust: Trust = BELIEVED
+    """Which cameras a reconstruction is better without."""
 
 
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
@@ -196,12 +201,14 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS and (change := gross_mistake(look, rng)) is not None:
+    while len(findings) < _MOST_FINDINGS and (change := _next(look, rng)) is not None:
         findings.append(change.finding)
-        look = replace(change.look, evidence=evidence)
+        look = change.look
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
-        return Diagnosis((*findings, *(_nobody(look) if none else [])), given, look)
+        findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
+        trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
+        return Diagnosis(tuple(findings), given, look, trust=trust)
     problem = Problem.of(look)
     small = problem.small_errors()
     remaining = lags(refined := replace(look, views=small.views))
@@ -219,7 +226,22 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     findings += _unfit(look, known)
     build = build_of(refined.structure()[1].points, detections.skeleton)
     findings += _of_people(build, rig)
-    return Diagnosis(tuple(findings), given, look, tuple(remaining), build)
+    trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
+    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, trust)
+
+
+def _next(look: Look, rng: np.random.Generator) -> Change | None:
+    """The mistake that explains most: of a camera all the time, or from some time on."""
+    gross = gross_mistake(look, rng)
+    views = range(look.view_count if look.cameras_used > 2 else 0)
+    over_time = [story for view in views for story in stories(look, view, rng)]
+    if len(over_time) == 0:
+        return gross
+    best = max(over_time, key=lambda story: story.gain)
+    elsewhere = gross is not None and gross.finding.cameras != best.finding.cameras
+    if gross is not None and elsewhere and gross.look.total > best.look.total:
+        return gross
+    return Change(best.finding, best.look, 0.0)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:

@@ -1,6 +1,6 @@
 """How well one camera fits the people that the others see, and which change of it would fit them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -51,6 +51,10 @@ class Pinhole:
     """(3, 3)."""
     cTw: Array
     """(3, 4)."""
+
+
+Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
+"""What fits a camera to joints in the world (N, 3) and in its picture (N, 2) exactly."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,19 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
     K[:2, :2] *= factor
     K[:2, 2] = centre + factor * (K[:2, 2] - centre)
     return Pinhole(K, camera.cTw)
+
+
+def best_of(
+    others: Others, seen: Sightings, camera: Pinhole, pairs: Sequence[tuple[Array, Array]], fitted: Fitted
+) -> Pinhole | None:
+    """Of the cameras that fit one person exactly, the one that fits all people best."""
+    step = max(1, len(others) // 40)
+    few = Others(others.frame[::step], others.points[::step])
+    tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
+    score, best = max(
+        ((match(few, seen, each).score, each) for each in tried), key=lambda pair: pair[0], default=(0, None)
+    )
+    return best if score > 0 else None
 
 
 def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]) -> Pinhole:

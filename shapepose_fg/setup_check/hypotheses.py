@@ -198,7 +198,10 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
     best = max((gain for gain, _ in found), default=0.0) + look.total
     if len(weak) > look.view_count / 2 and best < _EXPLAINED:
         few = replace(look, evidence=look.evidence.thinned(_FEW))
-        found += [(change.score - few.total, change) for change in _of_all(few)]
+        found += [
+            (change.score - few.total, replace(change, look=replace(change.look, evidence=look.evidence)))
+            for change in _of_all(few)
+        ]
     found = [(gain, change) for gain, change in found if gain > _GAIN / look.view_count]
     return max(found, key=lambda pair: pair[0])[1] if found else None
 
@@ -217,12 +220,15 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
         other = misread(kind, camera)
         score = match(others, seen, other).score
         yield Change(Finding(kind, (view,)), look.with_cameras({view: other}), score)
+    for swapped in (True, False):
+        mirror = look.seeing(view, lambda each, s=swapped: _mirrored(each, look, view, s))
+        yield Change(Finding(Kind.MIRRORED, (view,)), mirror, match(others, mirror.seen_by(view), camera).score)
     lag = lag_of(look, view).frames
     score = match(others, look.seen_by(view, every_frame=True), camera, lag).score
     yield Change(Finding(Kind.LATE, (view,), lag), look.later(view, lag), score, 1)
     pairs = list(fit.tries(others, seen, rng))
     for kind, fitted, columns in _FITTED:
-        best = _best(others, seen, camera, pairs, fitted)
+        best = fit.best_of(others, seen, camera, pairs, fitted)
         if best is None:
             continue
         best = fit.refined(others, seen, best, columns) if columns else best
@@ -235,17 +241,12 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
         yield Change(finding, look.with_cameras({view: best}), score, max(len(columns), 1))
 
 
-def _best(
-    others: Others, seen: Sightings, camera: Pinhole, pairs: list[tuple[Array, Array]], fitted: Fit
-) -> Pinhole | None:
-    """Of the cameras that fit one person exactly, the one that fits all people best."""
-    step = max(1, len(others) // 40)
-    few = Others(others.frame[::step], others.points[::step])
-    tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
-    score, best = max(
-        ((match(few, seen, each).score, each) for each in tried), key=lambda pair: pair[0], default=(0, None)
-    )
-    return best if score > 0 else None
+def _mirrored(seen: Sightings, look: Look, view: int, swapped: bool) -> Sightings:
+    """What a camera would see in a mirrored picture; `swapped` if joints were detected in the mirrored one."""
+    xy, width = seen.xy.copy(), np.broadcast_to(look.views.image_sizes, (look.view_count, 2))[view, 0]
+    xy[..., 0] = width - 1 - xy[..., 0]
+    joints = look.evidence.other_side if swapped else slice(None)
+    return replace(seen, xy=xy[:, joints], confidence=seen.confidence[:, joints])
 
 
 def _of_two(look: Look, first: int, second: int) -> Change:

@@ -14,7 +14,8 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.trust import BELIEVED, Spell, Trust
 from shapepose_fg.setup_check.diagnosis import Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
@@ -79,6 +80,23 @@ class SetupReport:
     """Frames that were looked at."""
     stature_m: float | None
     """How tall the people come out, median; None without people."""
+    trust: Trust = BELIEVED
+    """Which cameras a reconstruction is better without: for `reconstruct`."""
+
+    def with_consequences(self, rig: Rig) -> list[str]:
+        """The warnings, and what a reconstruction makes of them."""
+        out = {view for view, _, _ in self.trust.left_out}
+        words = [
+            f"{said}. It is left out there (--no-check keeps it)" if out & set(found.cameras) else said
+            for found, said in zip(self.findings, self.warnings, strict=True)
+        ]
+        if len(self.trust.doubted) > 0:
+            names = ", ".join(rig.names[view] for view in sorted({view for view, _, _ in self.trust.doubted}))
+            words.append(
+                f"nothing says which of {names} is wrong: rows that rest on them have the status"
+                f" {Status.CONTRADICTED!r}, not 'ok'"
+            )
+        return words
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json holds under `setup`."""
@@ -90,6 +108,8 @@ class SetupReport:
             ],
             "cameras": [rounded(asdict(each)) for each in self.cameras],
             "pairs": [rounded(asdict(each)) for each in self.pairs],
+            "left_out": _spells(self.trust.left_out, names),
+            "doubted": _spells(self.trust.doubted, names),
             "frames_looked_at": self.frames,
             "stature_m": None if self.stature_m is None else round(self.stature_m, 4),
         }
@@ -112,7 +132,12 @@ def check_setup(
         tuple(_pair_figures(diagnosis.look, rig, *pair) for pair in combinations(range(len(rig)), 2)),
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
+        diagnosis.trust,
     )
+
+
+def _spells(spells: Sequence[Spell], names: Sequence[str]) -> list[dict[str, Any]]:
+    return [{"camera": names[view], "frames": [first, last]} for view, first, last in spells]
 
 
 def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
@@ -244,7 +269,7 @@ def result_check(
 ) -> ResultCheck:
     """The check of a set-up with what the reconstruction adds to it."""
     uses = tuple(camera_use(people, detections, rig, frames))
-    warnings = list(report.warnings)
+    warnings = report.with_consequences(rig)
     if len(people) == 0 and Kind.NOBODY not in {finding.kind for finding in report.findings}:
         warnings.append(
             "Nobody was found; see what the check of the set-up says"
