@@ -39,6 +39,8 @@ benchmark: $(VENV)/installed
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_ARGS) -e ".[dev]"
+	# Done at the first start otherwise, or at every one where Python may write nothing beside the sources.
+	$(BIN)/python -m compileall -q shapepose_fg factors
 	touch $@
 
 clean:

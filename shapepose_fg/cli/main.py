@@ -25,6 +25,7 @@ from shapepose_fg.cli.options import (
 )
 from shapepose_fg.cli.overlay import overlay
 from shapepose_fg.cli.reconstruct.command import reconstruct
+from shapepose_fg.cli.refine import refine_calibration
 from shapepose_fg.cli.report import report
 from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
@@ -48,7 +49,7 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
 for _panel, _commands in {
-    _RECORDING: (detect, check_calibration, reconstruct, batch),
+    _RECORDING: (detect, check_calibration, refine_calibration, reconstruct, batch),
     _RESULT: (report, overlay, view, export),
     _TRY: (train_fitter,),
 }.items():

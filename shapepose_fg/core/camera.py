@@ -25,6 +25,8 @@ _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
 _COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
 """How many coefficients OpenCV's functions take for each kind of lens."""
+LONGEST_READOUT_S = 0.1
+"""Rolling shutters take 5 to 30 ms."""
 _UNDONE_PX = 0.5
 """A point that comes back farther than this from where it was has no place without distortion: the polynomial of
 the lens does not reach it. Where there is one, OpenCV's iteration ends within 1e-6 px of it."""
@@ -47,6 +49,9 @@ class Camera:
     or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
     lens: Lens = "perspective"
     """Which of OpenCV's families the coefficients belong to."""
+    readout_s: float = 0.0
+    """How long a rolling shutter takes from the first row of a picture to the last, seconds; times of pictures are
+    of their middle row."""
 
     def __post_init__(self) -> None:
         def refuse(problem: str) -> ValueError:
@@ -73,6 +78,8 @@ class Camera:
         width, height = self.image_size
         if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
             raise refuse(f"image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}")
+        if not 0 <= self.readout_s <= LONGEST_READOUT_S:
+            raise refuse(f"readout_s must be 0 to {LONGEST_READOUT_S:g} seconds, got {self.readout_s}")
         if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
             raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")
         way = PurePath(self.name)
@@ -277,6 +284,8 @@ class Views:
     """(V, 3, 4) camera from world of cameras that stand still, or (N, V, 3, 4), metres."""
     image_sizes: Array | float = np.inf
     """(V, 2) width and height, pixels; infinite where they are not known."""
+    readout_s: Array | float = 0.0
+    """(V,) from the first row of a picture to the last, seconds."""
 
     def __post_init__(self) -> None:
         K, cTw = self.K, self.cTw
@@ -290,7 +299,7 @@ class Views:
     @classmethod
     def of(cls, rig: Rig) -> "Views":
         """The cameras of a rig that stands still."""
-        return cls(rig.K, rig.cTw, rig.image_sizes)
+        return cls(rig.K, rig.cTw, rig.image_sizes, np.array([camera.readout_s for camera in rig.cameras]))
 
     def __len__(self) -> int:
         """V, the number of views."""
@@ -321,7 +330,7 @@ class Views:
     def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""
         K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))
-        return Views(K, cTw, self.image_sizes)
+        return Views(K, cTw, self.image_sizes, self.readout_s)
 
     def pixels(self, points: Array) -> tuple[Array, Array]:
         """The first two of `project`."""
@@ -335,8 +344,12 @@ class Views:
 
         Undistorted pixels; they and the derivatives are NaN where the depth is not positive.
         """
+        return self.project_apart(points[:, :, None])
+
+    def project_apart(self, points: Array) -> tuple[Array, Array, Array]:
+        """The same of `points` (N, J, V, 3) that differ from view to view."""
         K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
-        return project_with_jacobian(points[:, :, None], K, cTw)
+        return project_with_jacobian(points, K, cTw)
 
 
 def beside_segment(x: Real, y: Real, first: Sequence[Real], second: Sequence[Real]) -> tuple[Real, Real]:

@@ -12,6 +12,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -21,12 +23,23 @@ _OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": {"contract", "rea
 
 def kernel(function: F) -> F:
     """The function, compiled at its first call. Sums may be taken in another order, NaN and infinity are kept."""
-    return cast(F, cast(Any, numba.njit)(cache=True, **_OPTIONS)(function))
+    compiled = cast(Any, numba.njit)(**_OPTIONS)(function)
+    compiled._cache = _Cache(function)  # what `cache=True` does, with Numba's own class
+    return cast(F, compiled)
 
 
 def part(function: F) -> F:
     """A piece of kernels, which Python cannot call: compiled with them, sooner than a kernel is."""
     return cast(F, cast(Any, numba.njit)(no_cpython_wrapper=True, **_OPTIONS)(function))
+
+
+class _Cache(FunctionCache):
+    """Loads what is compiled without what only compiling needs, which takes a fifth of a second."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        rtsys.initialize(target_context)  # for kernels that make arrays
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 class _Compiling(event.Listener):

@@ -62,8 +62,10 @@ class ObservationTable(Table):
     probability: Annotated[NDArray[np.float32], Column("N J V", np.float32, missing=1.0)] = None  # type: ignore[assignment]
     """(N, J, V) how probable it is that the detection is this person's; 0 where there is none.
     1 where it is not said, as in files of before."""
+    lead_s: Annotated[NDArray[np.float32], Column("N V", np.float32, "s", missing=0.0)] = None  # type: ignore[assignment]
+    """(N, V) how long after the row's time each view was exposed, seconds; 0 in older files."""
 
-    ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability".split()
+    ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability lead_s".split()
 
     def __post_init__(self) -> None:
         """Check shapes and types, that values make sense, and that columns agree on what was seen."""
@@ -78,6 +80,8 @@ class ObservationTable(Table):
             raise ValueError("probability must be 0 to 1")
         if np.isinf(self.residual_px).any():
             raise ValueError("residual_px must be finite, or NaN where there is none")
+        if not np.isfinite(self.lead_s).all():
+            raise ValueError("lead_s must be finite")
         for name in self.shared():
             if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
                 raise ValueError(f"{name} must differ from each other")
@@ -106,13 +110,16 @@ class ObservationTable(Table):
         gate: NDArray[np.uint8],
         rig: Rig,
         joint_names: Sequence[str],
+        carried: Observations | None = None,
     ) -> "ObservationTable":
         """The table of N solved rows: what they observed, and where their `joints` (N, J, 3) came to lie.
 
         The rows are of the observations' `frame`, and of the person `track`. `place` (N, J, V) is each one's
         `Detections.place`, `gate` (N, J, V) the codes of `Gate`; what was not seen is recorded as that, whatever
-        is there, and what was not used because the joint is not placed, or behind the camera, as that.
+        is there, and what was not used because the joint is not placed, or behind the camera, as that. `carried`
+        are the same observations as they would be at the frames' time, where views are out of step.
         """
+        here = observations if carried is None else carried
         seen = observations.seen
         projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
         gate = np.where(seen, gate, Gate.NOT_SEEN)
@@ -128,9 +135,10 @@ class ObservationTable(Table):
             candidate=np.where(seen, place, -1),
             xy=np.where(seen[..., None], observations.xy, np.nan),
             confidence=np.where(seen, observations.confidence, 0.0),
-            residual_px=np.where(ahead, projected - observations.xy, np.nan),
+            residual_px=np.where(ahead, projected - here.xy, np.nan),
             gate=gate,
             probability=np.where(seen, observations.probability, 0.0),
+            lead_s=observations.time_s - observations.time_s.mean(axis=1, keepdims=True),
         )
 
     @classmethod
@@ -156,7 +164,7 @@ class ObservationTable(Table):
             initial=initial,
             track=self.person.astype(np.intp),
             frame=self.frame.astype(np.intp),
-            time_s=np.repeat(time_s[:, None], len(self.view_names), axis=1),
+            time_s=time_s[:, None] + self.lead_s,
             probability=np.where(seen, self.probability, 1.0).astype(np.float64),
         )
 

@@ -29,7 +29,8 @@ class Observations(Table):
     frame: Annotated[Index, Column("N", np.intp, missing=0)] = _LATER
     """(N,) frame of the row; 0 where it is not said."""
     time_s: Annotated[Array, Column("N V", unit="s", missing=0.0)] = _LATER
-    """(N, V) when each view was exposed, seconds: equal in a row if cameras are synchronised. 0 by default."""
+    """(N, V) when each view was exposed, seconds, the middle of its picture: equal in a row if
+    cameras are synchronised. 0 by default."""
     candidate: Annotated[Index, Column("N J V", np.intp, missing=-1)] = _LATER
     """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
     probability: Annotated[Array, Column("N J V", missing=1.0)] = _LATER

@@ -15,6 +15,14 @@ def speeds(points: Array, times_s: Array) -> Array:
     return np.linalg.norm(points[last] - points[first], axis=2) / (times_s[last] - times_s[first])[:, None]
 
 
+def velocities(points: Array, times_s: Array) -> Array:
+    """(T, J, 3) how points (T, J, 3) move, m/s, over `SPEED_S` before and after; NaN in a single frame."""
+    first = np.searchsorted(times_s, times_s - SPEED_S, side="left")
+    last = np.searchsorted(times_s, times_s + SPEED_S, side="right") - 1
+    lasts = np.where(last > first, times_s[last] - times_s[first], np.nan)
+    return (points[last] - points[first]) / lasts[:, None, None]
+
+
 def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
     """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
     first = np.searchsorted(times_s, times_s - within_s, side="left")

@@ -39,6 +39,8 @@ class Projections:
     """(T, J, V) of what is new in every frame, pixels."""
     used: Mask
     """(T, J, V) which observations count."""
+    lead_s: Array
+    """(T, J, V) how long after the state each was exposed, seconds."""
     kernel: KernelName | None
     """The robust kernel."""
     scale: float
@@ -110,7 +112,7 @@ class Chains:
         states, seen = self._at(initial), self.seen
         solve_chains(
             states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
-            seen.weight, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
+            seen.weight, seen.lead_s, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
         )  # fmt: skip
         return states
 

@@ -52,14 +52,25 @@ def _project(camera, x):
 
 
 @kernel
-def _add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
-    """Add J^T w J and J^T w r, with J the derivative of the pixel (u, v) and r = (to_u, to_v)."""
+def _add_view(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
+    """Add J^T w J and J^T w r, with J the derivative of the pixel (u, v) and r = (to_u, to_v).
+
+    With a `lead`, seconds, the pixel is of x + lead v, and the velocity v follows the position x.
+    """
     for a in range(3):
         ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
-        gradient[a] += weight * (ua * to_u + va * to_v)
+        slope = weight * (ua * to_u + va * to_v)
+        gradient[a] += slope
+        if lead != 0.0:
+            gradient[3 + a] += lead * slope
         for b in range(3):
             ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
-            information[a, b] += weight * (ua * ub + va * vb) / depth
+            square = weight * (ua * ub + va * vb) / depth
+            information[a, b] += square
+            if lead != 0.0:
+                information[a, 3 + b] += lead * square
+                information[3 + a, b] += lead * square
+                information[3 + a, 3 + b] += lead * lead * square
 
 
 @kernel
@@ -131,7 +142,7 @@ def look(
                         weight *= _weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
                     else:
                         weight *= _weight(robust, far * weight / (width * width))
-                    _add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
+                    _add_view(camera, at_u, at_v, depth, to_u, to_v, weight, 0.0, H, g)
             for a in range(3):
                 target[n, j, a] = x[a]
                 for b in range(3):
@@ -148,8 +159,11 @@ def look(
 
 
 @kernel
-def _normal(state, joint, diagonal, right, cameras, xy, weight, robust, width, H, g):
-    """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g."""
+def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, width, H, g, at):
+    """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g.
+
+    `at` (3,) is anything.
+    """
     T, d = state.shape
     for t in range(T):
         for a in range(d):
@@ -159,13 +173,19 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, robust, width, H
         for n in range(weight.shape[2]):
             camera, w = cameras[t if cameras.shape[0] > 1 else 0, n], weight[t, joint, n]
             if w > 0.0:
-                u, v, depth = _project(camera, state[t])
+                later = lead[t, joint, n]
+                for a in range(3):
+                    at[a] = state[t, a]
+                    if later != 0.0:
+                        at[a] += later * state[t, 3 + a]
+                u, v, depth = _project(camera, at)
                 if depth > 0.0:
                     off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
                     w *= _weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
                     # J x, without the product: the derivative of a quotient.
-                    at_u, at_v = u * camera[2, 3] - camera[0, 3], v * camera[2, 3] - camera[1, 3]
-                    _add_view(camera, u, v, depth, at_u / depth - off_u, at_v / depth - off_v, w, H[t], g[t])
+                    at_u = (u * camera[2, 3] - camera[0, 3]) / depth - off_u
+                    at_v = (v * camera[2, 3] - camera[1, 3]) / depth - off_v
+                    _add_view(camera, u, v, depth, at_u, at_v, w, later, H[t], g[t])
 
 
 @kernel
@@ -271,26 +291,27 @@ def _marginals(H, Z, M, G, S, covariance):
 
 @kernel
 def solve_chains(
-    states, joints, diagonal, below, right, cameras, xy, weight, robust, width, steps, tolerance, covariance
+    states, joints, diagonal, below, right, cameras, xy, weight, lead, robust, width, steps, tolerance, covariance
 ):
     """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, d, d) where it ends,
     or of the first chains (0, ...): NaN where one is singular, which stays where it is.
 
     A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
     (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
-    1/sigma² of those that count. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
+    1/sigma² of those that count, `lead` (T, J, V) seconds by which they are after the state, whose next three are
+    the velocity. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
     `steps`, until one moves no position by more than `tolerance` metres; without any there are covariances only.
     Robust weights are those of the step before, which no step makes worse but for the curvature of the projection.
     """
     C, T, d = states.shape
     # Zero at the end of Z and g, where nothing comes after the last state, nor before the first.
     H, Z, g = np.empty((T, d, d)), np.zeros((T, d, d)), np.zeros((T + 1, d))
-    M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d))
+    M, G, S, at = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d)), np.empty(3)
     for c in range(C):
         x, linked = states[c], below[c]
         moved, n, regular = 0.0, 0, True
         while regular and n <= steps and (n == 0 or moved > tolerance):
-            _normal(x, joints[c], diagonal[c], right[c], cameras, xy, weight, robust, width, H, g)
+            _normal(x, joints[c], diagonal[c], right[c], cameras, xy, weight, lead, robust, width, H, g, at)
             regular = _factored(H, linked, Z)
             if regular and n < steps:
                 moved = _solve(H, Z, g, x)

@@ -19,6 +19,7 @@ from shapepose_fg.estimation.linearisation import (
     mean_confidence,
     weakest_sigma,
 )
+from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import SEEN_M, State
 from shapepose_fg.estimation.state_covariances import state_covariances
@@ -49,7 +50,8 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
             covariance[person.rows] = with_lasting(state, person, of_positions)
     X = limbs_kept(state, covariance, fitter) if state.config.motion.keep_limbs else state.joints
     fit = final_bodies(state, covariance, fitter)
-    final = linearise(rows, state.sigmas, X, state.views, state.config.observations)
+    carried = carried_to_frames(rows, X, np.nan_to_num(velocity), state.views)
+    final = linearise(carried, state.sigmas, X, state.views, state.config.observations)
     covariance = _calibrated(state, X, covariance, final)
     reported = strong(state)
     hiding = limbs_that_hide(state.config.joints)

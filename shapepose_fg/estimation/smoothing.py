@@ -37,7 +37,7 @@ def smoothed(
     information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(C, T)
     density = np.tile(motion.density(np.full(J, SPEED_M_S)), (T - 1, len(people)))
     moving, below = motion_information(motion.law, np.diff(times), density)
-    unseen = np.zeros((1, 0, 3, 4)), np.zeros((T, 1, 0, 2)), np.zeros((T, 1, 0)), 0, 1.0
+    unseen = np.zeros((1, 0, 3, 4)), np.zeros((T, 1, 0, 2)), np.zeros((T, 1, 0)), np.zeros((T, 1, 0)), 0, 1.0
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information
     for _ in range(_ROUNDS):
         diagonal, right = moving.copy(), np.zeros((3, C, T, n))

@@ -17,6 +17,7 @@ from factors import (
     diagonal,
     lasting_prior_factors,
     make_camera,
+    moving_projection_factors,
     offset_factors,
     offset_keys,
     projection_factors,
@@ -34,6 +35,7 @@ from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.out_of_step import leads
 
 _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
@@ -199,6 +201,8 @@ class WindowGraph:
         self._start(states)
         self.graph = gtsam.NonlinearFactorGraph()
         self._add(self._seen(problem.seen))
+        if problem.seen.lead_s.any():
+            self._add(self._seen_between(problem.seen, states))
         self._add(self._pulled(problem.pulls))
         for source, said in enumerate(problem.said):
             self._add(self._lasting(said, source))
@@ -225,12 +229,13 @@ class WindowGraph:
         # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
         # wide as before either changed the sigma.
         scale, weight, xy = np.sqrt(share / self.config.weight_2d), self.config.weight_shape, self._observations.xy
+        lead = leads(self._observations, self._views) if self.temporal else np.zeros(inlier.shape)
         used = inlier & (self._sigmas_px > 0) & (self.present & ~of_views)[..., None]
         return Problem(
             times_s=self.times_s,
             law=self._motion.law,
             density=density,
-            seen=Projections(self._views, xy, self._sigmas_px * scale, used, self._kernel, scale),
+            seen=Projections(self._views, xy, self._sigmas_px * scale, used, lead, self._kernel, scale),
             pulls=body.where(self.present & ~of_body, weight / share),
             said=(
                 Said(views, 1.0 / self.config.weight_2d, self._motion.views, of_views),
@@ -280,8 +285,8 @@ class WindowGraph:
         deque(map(self.graph.add, factors), maxlen=0)
 
     def _seen(self, seen: Projections) -> Sequence[gtsam.NonlinearFactor]:
-        """The observations that count."""
-        frame, joint, view = chosen = np.nonzero(seen.used)
+        """The observations that count and are of the time of a state."""
+        frame, joint, view = chosen = np.nonzero(seen.used & (seen.lead_s == 0.0))
         return projection_factors(
             self._cameras,
             frame * len(self._views) + view if self._views.rows_known is not None else view,
@@ -290,6 +295,19 @@ class WindowGraph:
             seen.sigmas_px[chosen],
             robust_kernel(seen.kernel, None if seen.kernel is None else seen.width),
         )
+
+    def _seen_between(self, seen: Projections, states: Array) -> list[gtsam.NonlinearFactor]:
+        """Those of other times, linear around `states` (T, J, S, 3): all of a joint and frame are one factor."""
+        used = seen.used & (seen.lead_s != 0.0)
+        position, velocity = np.nan_to_num(states[:, :, 0]), np.nan_to_num(states[:, :, 1])
+        moved = position[:, :, None] + seen.lead_s[..., None] * velocity[:, :, None]
+        at, _, slope = seen.views.project_apart(moved)
+        frame, joint, _ = chosen = np.nonzero(used & np.isfinite(at).all(axis=-1))
+        return moving_projection_factors(
+            self.keys[frame, joint], self.velocity_keys[frame, joint], seen.lead_s[chosen],
+            moved[chosen], slope[chosen], at[chosen] - seen.xy[chosen], seen.sigmas_px[chosen],
+            seen.kernel, seen.width,
+        )  # fmt: skip
 
     def _pulled(self, pulls: Message) -> list[gtsam.NonlinearFactor]:
         """The body's pull on joints."""

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.motion_model import Lasting
+from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 LEAST_M = 1e-4
@@ -86,13 +87,14 @@ class WindowSolution:
             values[~self.fit.ok] = np.nan
         dropped = np.where(self.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
         gate = np.where(self.inlier, Gate.USED, dropped)
+        carried = carried_to_frames(rows, self.joints, np.nan_to_num(self.velocity), Views.of(rig))
         names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
         return Reconstruction(
             frame=rows.frame,
             person=rows.track,
             time_s=rows.time_s.mean(axis=1),
             joint_names=np.array(joint_names),
-            observations=ObservationTable.of(rows, place, self.joints, gate, rig, joint_names),
+            observations=ObservationTable.of(rows, place, self.joints, gate, rig, joint_names, carried),
             **{name: getattr(self, name) for name in names},
             **body,
         )

@@ -18,6 +18,7 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.joint_step import solve_joints
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.out_of_step import carried_to_frames, spread, velocities_of
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
@@ -81,6 +82,7 @@ def solve_window(
         if assigning.over_time:
             times_s = observations.time_s.mean(axis=1)
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
+            covariance = covariance + spread(observations, velocities_of(observations, places), views)
         least = None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
         before = observations
         observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, least)
@@ -90,11 +92,11 @@ def solve_window(
 
     # Draft: X_0, the observations' sigmas there, and everybody's graph.
     state = State.start(observations, views, fitter, config, motion, extra_factors)
-    moving = state.people
+    moving, velocity = state.people, velocities_of(observations, state.joints)
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
         rows = np.concatenate([person.rows for person in moving])
-        observed, cameras = observations.rows(rows), views.rows(rows)
-        sigma, X = state.sigmas[rows], state.joints[rows]
+        cameras, sigma, X = views.rows(rows), state.sigmas[rows], state.joints[rows]
+        observed = carried_to_frames(observations.rows(rows), X, velocity[rows], cameras)
 
         # Gate: what the views say around X, delta of Eq. 2.
         evidence = linearise(observed, sigma, X, cameras, config.observations)
@@ -123,6 +125,8 @@ def solve_window(
         parts = parts_of(moving)
         X_new = np.concatenate([solve_joints(person, evidence, of_body, part, config) for person, part in parts])
         state.put(rows, X_new, evidence, wrong, of_body, body)
+        for person, _ in parts:
+            velocity[person.rows] = np.nan_to_num(person.velocity)
 
         # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
         before = np.where((of_body.known | wrong)[..., None], X, fitted)

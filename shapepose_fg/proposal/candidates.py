@@ -8,7 +8,6 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from scipy.spatial import KDTree
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Metres, Settings
@@ -130,8 +129,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     """Cluster the points of each joint around its most confident ones (the paper's set S_i).
 
     The paper picks the most confident point, gives it all its neighbours within rho, removes them and starts
-    again. All joints are done at once here and many picks in a round: a point that is more confident than all
-    its remaining neighbours would be picked before them in any case, so the result is the same.
+    again.
     """
     if len(points.xyz) == 0:
         none = np.zeros(0, dtype=np.intp)
@@ -235,58 +233,33 @@ def _reprojection_error(rig: Rig, view: Index, normalised: Array, xyz: Array) ->
     return np.where(camera[:, 2] > 0, error, np.inf).astype(np.float64)
 
 
-_POINTS_AT_ONCE = 4096
-"""Points whose neighbours among each other are looked up at once: before 30 cameras a joint has 400 of them."""
-
-
 def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
-    """The seed (M,) whose cluster each point joins, as if points were picked one by one by confidence.
-
-    The most confident points are clustered first; what lies near their seeds is theirs, and the rest goes on.
-    """
+    """The seed (M,) whose cluster each point joins, as points are picked one by one by confidence."""
     order = np.argsort(-points.score, kind="stable")
-    # A fourth coordinate keeps different joints apart.
-    apart = points.joint * (4.0 * radius_m)
-    places = np.asarray(np.column_stack([points.xyz, apart])[order], dtype=np.float64)
-    if len(order) <= _POINTS_AT_ONCE:
-        return order[_seeds_of_ranked(places, radius_m)][np.argsort(order)]
-    every = KDTree(places, balanced_tree=False, compact_nodes=False)
-    seed = np.full(len(order), -1, dtype=np.intp)
-    left = np.arange(len(order))
-    while len(left) > 0:
-        first = left[:_POINTS_AT_ONCE]
-        seed[first] = first[_seeds_of_ranked(places[first], radius_m)]
-        seeds = np.unique(seed[first])
-        near = every.query_ball_point(places[seeds], radius_m)
-        member = np.concatenate(near).astype(np.intp)
-        of_seed = np.repeat(seeds, [len(each) for each in near])
-        new = seed[member] < 0
-        nearest = np.full(len(order), len(order), dtype=np.intp)
-        np.minimum.at(nearest, member[new], of_seed[new])
-        seed = np.where(nearest < len(order), nearest, seed)
-        left = left[_POINTS_AT_ONCE:]
-        left = left[seed[left] < 0]
-    return order[seed][np.argsort(order)]
-
-
-def _seeds_of_ranked(places: Array, radius_m: float) -> Index:
-    """The seed (M,) of each of a few points that stand in the order in which they are picked."""
-    count = len(places)
-    edges = KDTree(places).query_pairs(radius_m, output_type="ndarray")
-    better, worse = edges.min(axis=1), edges.max(axis=1)
-    is_seed = np.zeros(count, dtype=bool)
-    undecided = np.ones(count, dtype=bool)
-    live_better, live_worse = better, worse
-    while undecided.any():
-        live = undecided[live_better] & undecided[live_worse]
-        live_better, live_worse = live_better[live], live_worse[live]
-        picked = undecided.copy()
-        picked[live_worse] = False
-        is_seed |= picked
-        undecided &= ~picked
-        undecided[live_worse[picked[live_better]]] = False
-    # A point near several seeds belongs to the one that is picked first.
-    seed = np.where(is_seed, np.arange(count), count)
-    from_seed = is_seed[better]
-    np.minimum.at(seed, worse[from_seed], better[from_seed])
+    along = np.lexsort((points.xyz[:, 0], points.joint))
+    place, seed = np.empty_like(along), np.full(len(along), -1, dtype=np.intp)
+    place[along] = np.arange(len(along))
+    _pick_seeds(order, along, place, np.ascontiguousarray(points.xyz), points.joint, radius_m, seed)
     return seed
+
+
+@kernel
+def _pick_seeds(order, along, place, xyz, joint, radius_m, seed):
+    """Fill in `seed` (M,). Points are picked in `order`; `along` are those of a joint by their first coordinate,
+    and `place` where each one is there, so that only those beside it are looked at.
+    """
+    for i in order:
+        if seed[i] >= 0:
+            continue
+        seed[i] = i
+        for step in (-1, 1):
+            k = place[i] + step
+            while 0 <= k < len(along):
+                j = along[k]
+                x = xyz[j, 0] - xyz[i, 0]
+                if joint[j] != joint[i] or abs(x) > radius_m:
+                    break
+                y, z = xyz[j, 1] - xyz[i, 1], xyz[j, 2] - xyz[i, 2]
+                if seed[j] < 0 and x * x + y * y + z * z <= radius_m * radius_m:
+                    seed[j] = i
+                k += step

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
@@ -205,7 +205,7 @@ def difference(cTw: Array, other: Array) -> tuple[float, float]:
 
 def changed(views: Views, change: Array) -> Views:
     """The cameras with `change` (V, Q) made to their parameters."""
-    cTw = Rotation.from_rotvec(change[:, 0:3]).as_matrix() @ views.cTw
+    cTw = exp_so3(change[:, 0:3]) @ views.cTw
     cTw[:, :, 3] += change[:, 3:6]
     K = views.K.copy()
     K[:, :2, :2] *= np.exp(np.clip(change[:, 8], -_MOST_ZOOM, _MOST_ZOOM))[:, None, None]

@@ -11,7 +11,6 @@ from functools import partial
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import C, K, P
-from scipy.linalg import block_diag
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
@@ -83,7 +82,9 @@ def normal_equations(structure: Structure, views: Views) -> Normal:
         rest.push_back(lens)
     _, cameras = graph.linearize(values).eliminatePartialMultifrontal(order)
     H, eta = cameras.hessian(rest)
-    T: Array = np.asarray(block_diag(*map(_tangent, views.K)))
+    T, every = np.zeros((len(views.K), 11, len(views.K), Q)), np.arange(len(views.K))
+    T[every, :, every] = [_tangent(K) for K in views.K]
+    T = T.reshape(len(H), -1)
     return Normal(T.T @ H @ T, -T.T @ eta)
 
 

@@ -6,8 +6,6 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
@@ -164,6 +162,11 @@ def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
 
 def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
     """For tracks that are joined the one before, of pairs (K,) that may be: as many as can be, the likeliest."""
+    if len(before) == 0:
+        return {}
+    from scipy.sparse import csr_array  # with all of SciPy that it needs: a sixth of a second
+    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
+
     rows, row = np.unique(before, return_inverse=True)
     columns, column = np.unique(after, return_inverse=True)
     count, nobody = len(rows), len(columns) + np.arange(len(rows))  # each track may have nobody after it
@@ -172,6 +175,6 @@ def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
     costs = np.concatenate([1.0 + cost, np.full(count, alone)])
     places = np.concatenate([row, np.arange(count)]), np.concatenate([column, nobody])
     matrix = csr_array((costs, places), shape=(count, len(columns) + count))
-    first, second = min_weight_full_bipartite_matching(matrix) if count > 0 else (rows, rows)
+    first, second = min_weight_full_bipartite_matching(matrix)
     joined = second < len(columns)
     return dict(zip(columns[second[joined]].tolist(), rows[first[joined]].tolist(), strict=True))

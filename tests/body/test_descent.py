@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, believed, gradient_scale
+from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale
 from shapepose_fg.body.fitting.network import NUM_PARAMETERS, NetworkConfig, UpdateNetwork, layer_shapes
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.rotation import exp_so3, six_d
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
 
 ALL = tuple(range(len(BODY_POINTS)))
@@ -152,11 +153,34 @@ def test_networks_know_their_step_and_refuse_nonsense():
         NetworkConfig(dropout=1.0)
 
 
-def test_targets_are_believed_by_their_information():
-    root = np.random.default_rng(0).normal(0, 30, (50, 3, 3))
-    information = root @ root.swapaxes(-1, -2)
-    matrix, share = believed(information)
-    np.testing.assert_allclose(matrix, information @ np.linalg.inv(information + np.eye(3) / 0.1**2), atol=1e-9)
-    inside = information @ np.linalg.inv(information + np.eye(3) / 0.03**2)
-    np.testing.assert_allclose(share, np.trace(inside, axis1=1, axis2=2) / 3, atol=1e-9)
-    assert not np.any(believed(np.zeros((1, 3, 3)))[0])
+@pytest.mark.parametrize("name", ["BODY_25", "COCO_17"])
+def test_what_the_network_sees(any_body, name):
+    """Against dense inverses and the Jacobian of the points; the detector's joints lie elsewhere than the body's."""
+    offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LWrist": (0.0, 0.0, -0.05)})
+    model, places = any_body.with_keypoints(TARGET_SKELETONS[name]), slots(TARGET_SKELETONS[name])
+    model = model.with_keypoint_offsets(offsets)
+    rest, state = [place for place in ALL if place not in places], states()
+    see = Sight(model.keypoint_points, places, 60.0, any_body.points.part(rest), model.offsets_of_keypoints)
+    xyz, information = (each[:, list(places)] for each in targets_of(places))
+    information[:, 3] = 0
+    inputs = see(state, xyz, information, np.full(79, 1e-4))
+    given = state.local, state.betas, state.transl
+    placed, jacobian = model.keypoint_points.positions_with_jacobian(*given)
+    reach, trust = (information @ np.linalg.inv(information + np.eye(3) / sigma**2) for sigma in (0.1, 0.03))
+    away = (reach @ (xyz - placed)[..., None])[..., 0]
+    away /= 1 + np.linalg.norm(away, axis=-1, keepdims=True) / 0.5
+    seen = inputs[:, :350].reshape(ROWS, 50, 7)
+    expected = any_body.points.positions(*given)
+    expected[:, list(places)] += away
+    np.testing.assert_allclose(seen[..., :3], expected, atol=1e-6)
+    np.testing.assert_allclose(seen[:, list(places), 3:6], 5 * away, atol=1e-6)
+    np.testing.assert_allclose(seen[:, list(places), 6], np.trace(trust, axis1=2, axis2=3) / 3, atol=1e-6)
+    assert not seen[:, rest, 3:].any() and not seen[:, places[3], 3:].any()
+    np.testing.assert_allclose(inputs[:, 350:360], state.betas / 3, atol=1e-6)
+    np.testing.assert_allclose(inputs[:, 360:492], six_d(state.local[:, :22]).reshape(ROWS, -1), atol=1e-6)
+    np.testing.assert_allclose(inputs[:, 492:495], state.transl, atol=1e-6)
+    force = (information @ (xyz - placed)[..., None])[..., 0]
+    force *= ((3600 / (3600 + ((xyz - placed) * force).sum(-1))) ** 2)[..., None]
+    slope = np.einsum("bkxp,bkx->bp", jacobian, force)[:, [*range(76), *range(82, 85)]]
+    np.testing.assert_allclose(inputs[:, 495:], np.clip(1e-4 * slope, -3, 3), rtol=1e-5, atol=1e-6)
+    assert 0.01 < np.abs(inputs[:, 495:]).max() <= 3

@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.energy import BodyEnergy
 from shapepose_fg.body.fitting.evidence import weigh
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter, evenly, make_fitter
-from shapepose_fg.body.fitting.left_out import Pairs, left_out_sets
+from shapepose_fg.body.fitting.left_out import Passes, left_out_sets
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import TARGET_SKELETONS
@@ -74,12 +74,11 @@ def test_a_joints_own_target_does_not_come_back_to_it(fitter, people, fit, name)
     followed = np.linalg.norm((pushed.joints - fit.joints)[:, joint], axis=-1)
     assert np.median(followed) > 0.01  # the body goes along
     both = pushed.ok & fit.ok
-    # Fits without it start from the fit with it, and end within half a standard deviation of their optimum.
-    moved = (pushed.prior_xyz - fit.prior_xyz)[both, joint]
-    assert abs(moved[:, 0].mean()) < 0.03 * 0.15
-    sigma = np.sqrt(np.trace(fit.prior_covariance[both, joint], axis1=1, axis2=2) / 3)
-    length = np.linalg.norm(moved, axis=1)
-    assert np.median(length / sigma) < 0.15 and np.quantile(length / sigma, 0.9) < 0.5
+    # Nothing by construction: only the row's origin moves, which rounds.
+    assert np.abs(pushed.prior_xyz - fit.prior_xyz)[both, joint].max() < 1e-6
+    np.testing.assert_allclose(
+        pushed.prior_covariance[both, joint], fit.prior_covariance[both, joint], rtol=1e-3, atol=1e-9
+    )
 
 
 def test_nor_does_it_by_way_of_the_shape_that_frames_share(fitter):
@@ -91,8 +90,7 @@ def test_nor_does_it_by_way_of_the_shape_that_frames_share(fitter):
     one, two = (fitter.fit(make_targets(each), groups=groups) for each in (xyz, moved))
     both = one.ok & two.ok
     assert both.mean() > 0.9
-    moved = (two.prior_xyz - one.prior_xyz)[both, joint]
-    assert np.abs(moved.mean(axis=0)).max() < 0.03 * 0.15 and np.quantile(np.abs(moved), 0.9) < 0.01
+    assert np.abs(two.prior_xyz - one.prior_xyz)[both, joint].max() < 1e-6
     other = BODY_25.index("LWrist")
     assert np.abs(two.prior_xyz - one.prior_xyz)[both, other].max() > 0.03  # others are right to follow
 
@@ -118,14 +116,13 @@ def test_gain_on_own_noise_is_nothing(fitter, people, fit):
     ],
 )
 def test_the_prior_is_a_refit_without_the_joint(fitter, people, fit, name, median_m):
-    """By the priors, to the optimum. Others of its set are left out too: they are to tell little of it."""
-    joint, plain = BODY_25.index(name), SmplFitter()
-    refit = plain.fit(make_targets(people[1], without=(joint,)))
+    """Others of its set are left out too: they are to tell little of it."""
+    joint = BODY_25.index(name)
+    refit = fitter.fit(make_targets(people[1], without=(joint,)))
     apart = np.linalg.norm(refit.joints[:, joint] - fit.prior_xyz[:, joint], axis=-1)[refit.ok & fit.ok]
     assert np.median(apart) < median_m and np.quantile(apart, 0.9) < 0.1
     ours, theirs = (np.trace(each.prior_covariance[:, joint], axis1=-2, axis2=-1) for each in (fit, refit))
-    if fitter.weights is None:  # learned: measured, and multiplied by that
-        assert 0.99 < np.nanmedian(ours / theirs) < 1.1  # as unsure, or a little more
+    assert 0.99 < np.nanmedian(ours / theirs) < 1.1  # as unsure, or a little more
 
 
 def test_nothing_jumps_where_information_goes_to_zero(fitter, people):
@@ -137,8 +134,7 @@ def test_nothing_jumps_where_information_goes_to_zero(fitter, people):
         targets = make_targets(xyz)
         targets.information[:, joint] = np.eye(3) / sigma_m**2
         priors.append(fitter.fit(targets).prior_xyz[:, joint])
-    away = np.linalg.norm(np.array(priors) - priors[-1], axis=-1)  # a wrist is known to 13 cm
-    assert np.median(away) < 0.01 and np.quantile(away, 0.9) < 0.05
+    np.testing.assert_allclose(np.array(priors), np.broadcast_to(priors[0], np.shape(priors)), atol=1e-6)
 
 
 def test_a_joint_that_no_pass_must_leave_out_is_where_the_body_has_it(fitter, people):
@@ -164,8 +160,7 @@ def test_few_joints_are_left_out_one_by_one(fitter, people):
     moved[:, kept[0]] += [0.0, 0.1, 0.0]
     again = fitter.fit(make_targets(moved, without=without))
     both = fit.ok & again.ok
-    away = (again.prior_xyz - fit.prior_xyz)[both, kept[0]]
-    assert abs(away[:, 1].mean()) < 0.03 * 0.1 and np.quantile(np.abs(away), 0.9) < 0.01
+    assert np.abs(again.prior_xyz - fit.prior_xyz)[both, kept[0]].max() < 1e-6
     inside = mahalanobis((fit.prior_xyz - truth)[fit.ok][:, kept], fit.prior_covariance[fit.ok][:, kept]) < 7.81
     assert inside.mean() > 0.8
 
@@ -206,31 +201,36 @@ def test_sets_hold_joints_that_tell_little_of_each_other():
             assert place[one] != place[other], (skeleton, one, other)
 
 
-def test_pairs_are_what_rows_need(people):
+def test_passes_are_what_rows_need(people):
     sets = np.arange(25) % 5
     targets = make_targets(people[1][:4])
     targets.information[0, sets == 2] = 0  # row 0 has nothing of set 2
     targets.information[1, sets == 2] = 0  # nor has row 1, of the same person
     few = np.setdiff1d(np.arange(25), [*np.flatnonzero(sets == 3)[:3].tolist(), 0, 1])
     targets.information[1, few] = 0  # row 1 would not do without set 3
-    pairs = Pairs.of(weigh(targets, MODEL_SIGMA_M), sets, np.array([5, 5, 7, 8]))
+    passes = Passes.of(weigh(targets, MODEL_SIGMA_M), sets, np.array([5, 5, 7, 8]))
+    assert passes.row[:4].tolist() == [0, 1, 2, 3] and not passes.without[:4].any() and passes.votes[:4].all()
     left_out = {(row, number): [] for row in range(4) for number in range(5)}
-    for row, number, joints in zip(pairs.row, pairs.group, pairs.without, strict=True):
-        left_out[row, number].append(joints[joints >= 0].tolist())
+    for row, without, votes in zip(passes.row[4:], passes.without[4:], passes.votes[4:], strict=True):
+        (number,) = set(sets[without].tolist())
+        left_out[row, number].append((np.flatnonzero(without).tolist(), bool(votes)))
     for (row, number), found in left_out.items():
         joints = np.flatnonzero(sets == number).tolist()
         if number == 2 and row < 2:
             assert found == []
         elif (row, number) == (1, 3):
-            assert sorted(found) == [[joint] for joint in joints]  # one by one
+            assert sorted(found) == [([joint], False) for joint in joints]  # one by one
         else:
-            assert found == [joints]
-    assert pairs.together.sum() == len(pairs.row) - 5
-    some = pairs.of_rows(np.array([3, 1]))
-    assert set(some.row.tolist()) == {0, 1} and (some.row == 0).sum() == 5
-    held = pairs.at_shape(4, np.ones((4, 10)), np.array([True, False, True, True]))
-    there = (pairs.group == 4) & (pairs.row != 1)
-    assert (held.betas[there] == 1).all() and not held.betas[~there].any() and (held.stiffness[~there] == 1).all()
+            assert found == [(joints, True)]
+    # One group, one pool for each set; another group, another pool; nobody shares with the pass that saw all.
+    of_set = np.array([-1] * 4 + [sets[np.flatnonzero(without)[0]] for without in passes.without[4:]])
+    pools = {(row, each): pool for row, each, pool in zip(passes.row, of_set, passes.pool, strict=True)}
+    assert pools[0, 3] == pools[1, 3] and pools[0, 3] != pools[2, 3] != pools[3, 3]
+    assert len({pools[0, each] for each in (-1, 0, 1, 3, 4)}) == 5
+    part = np.array([4, 5])
+    given, variance = passes.given(part)
+    assert not given.root[passes.without[part]].any() and np.isinf(variance[passes.without[part]]).all()
+    assert given.root[~passes.without[part]].any(axis=(1, 2)).mean() > 0.7
 
 
 @pytest.mark.slow
@@ -242,7 +242,7 @@ def test_priors_are_calibrated_on_bodies_from_the_priors(people):
     assert 1.9 < np.median(squared) < 2.8
     by_joint = np.median(squared, axis=0)
     # Wrists are given twice the variance that these bodies, whose angles are Gaussian, would need.
-    assert (by_joint > 0.9).all() and (by_joint < 4.0).all()
+    assert (by_joint > 1.0).all() and (by_joint < 4.0).all()
 
 
 @pytest.mark.slow

@@ -144,6 +144,8 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
     assert run(*recording, "--overwrite", "--fps", "25", "--cuts", "2,4", "--no-temporal") == 0
     np.testing.assert_allclose(pipeline["times"].frame_s, [0, 0.04, 0.08, 0.12, 0.16])
     assert pipeline["cuts"] == (2, 4) and not pipeline["config"].temporal
+    assert run(*recording, "--overwrite", "--fps", "25", "--readout", "0.02") == 0
+    assert [camera.readout_s for camera in pipeline["rig"].cameras] == [0.02, 0.02]
     stamps = tmp_path / "times.csv"
     stamps.write_text("right,left\n" + "".join(f"{0.05 * t},{0.05 * t + 0.01}\n" for t in range(5)))
     (tmp_path / "settings.toml").write_text("temporal = false\n")
@@ -297,6 +299,7 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--frames", "-2:"], "--frames -2:: must be A:B, two frame numbers with a colon between, such as 0:100"),
         (["--frames", "all"], "--frames all: must be A:B"),
         (["--fps", "0"], "--fps 0: must be a number of frames a second, such as 25"),
+        (["--readout", "20"], "--readout 20: must be 0 to 0.1 seconds, such as 0.02"),
         (["--fps", "nan"], "--fps nan: must be a number of frames a second"),
         (["--cuts", "3,2"], "--cuts 3,2: must be rising frame numbers between 1 and 4, such as 300,600"),
         (["--cuts", "5"], "--cuts 5: must be rising frame numbers between 1 and 4"),

@@ -23,7 +23,8 @@ def linear(diagonal, below, right) -> Chains:
     """Chains without observations."""
     C, T, d = right.shape
     nobody = Views(np.eye(3)[None], np.eye(3, 4)[None])
-    seen = Projections(nobody, np.zeros((T, C, 1, 2)), np.zeros((T, C, 1)), np.zeros((T, C, 1), bool), None, 1.0)
+    none = np.zeros((T, C, 1))
+    seen = Projections(nobody, np.zeros((T, C, 1, 2)), none, none.astype(bool), none, None, 1.0)
     return Chains(np.arange(C), (0, 1), diagonal, below, right, np.ones((T, C, d // 3), dtype=bool), seen)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from factors import project_with_jacobian
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.observations import Observations
@@ -65,6 +66,11 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
     np.testing.assert_array_equal(table.candidate, np.where(seen, place, -1))
     np.testing.assert_allclose(table.xy[seen], observations.xy[seen], rtol=1e-6)
     np.testing.assert_allclose(table.confidence, observations.confidence, rtol=1e-6)
-    projected = np.moveaxis(five_cameras.project(joints)[0], 0, 2)
     there = seen & placed
-    np.testing.assert_allclose(table.residual_px[there], (projected - observations.xy)[there], rtol=1e-4)
+    moved = joints[:, :, None] + 0.01 * (np.arange(V) - 2)[:, None] * solution.velocity[:, :, None]
+    then, _, _ = project_with_jacobian(moved, five_cameras.K, five_cameras.cTw)
+    there &= np.isfinite(then).all(axis=-1)
+    np.testing.assert_allclose(table.residual_px[there], (then - observations.xy)[there], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(table.lead_s, np.tile(0.01 * (np.arange(V) - 2), (N, 1)), atol=1e-6)
+    again = table.observations(joints, rows.time_s)
+    np.testing.assert_allclose(again.time_s, observations.time_s, atol=1e-6)

@@ -93,7 +93,9 @@ def test_own_format_comes_back_to_the_last_digit(tmp_path):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = R, rng.normal(size=3)
         intrinsics = np.array([[900 + rng.random(), 0, 500.1], [0, 901, 400.7], [0, 0, 1]])
-        cameras.append(Camera(name, intrinsics, pose, (1000, 800), rng.normal(size=5) / 10))
+        shutter_s = 0.0171 if name == "top" else 0.0
+        bend = rng.normal(size=5) / 10
+        cameras.append(Camera(name, intrinsics, pose, (1000, 800), bend, readout_s=shutter_s))
     rig = Rig(tuple(cameras), "-y")
     write_rig(rig, tmp_path / "rig.json")
     back = read_rig(tmp_path / "rig.json")
@@ -103,7 +105,7 @@ def test_own_format_comes_back_to_the_last_digit(tmp_path):
         np.testing.assert_array_equal(same.wTc, camera.wTc)
         np.testing.assert_array_equal(same.K, camera.K)
         np.testing.assert_array_equal(same.distortion, camera.distortion)
-        assert same.image_size == camera.image_size
+        assert same.image_size == camera.image_size and same.readout_s == camera.readout_s
 
 
 def test_own_format_in_millimetres_camera_from_world(tmp_path):

@@ -43,7 +43,7 @@ LEVELS = (
     "pipeline.solving",
     "simulation viz.bodies detection2d",
     "viz.overlay setup_check",
-    "viz.viewer",
+    "viz.viewer calibration",
     "io.export",
     "viz.report",
     "evaluation",
@@ -52,7 +52,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command",
+    " cli.train_fitter cli.batch.command cli.refine",
     "cli.main",
     "__main__",
 )
@@ -174,6 +174,17 @@ def test_loads_no_torch(code):
     code = f"import sys\n{code}\nassert 'torch' not in sys.modules, 'torch was loaded'"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT)
     assert done.returncode == 0, done.stderr
+
+
+def test_reconstruct_loads_only_what_every_run_needs():
+    code = "import sys\nimport shapepose_fg.cli.reconstruct.run\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT)
+    loaded = set(done.stdout.split())
+    assert {"numpy", "gtsam", "numba"} <= loaded, done.stderr
+    assert not loaded & {"torch", "matplotlib", "distributed", "jinja2", "rerun", "PIL"}
+    assert not {name for name in loaded if name.startswith("scipy.")} & {
+        f"scipy.{part}" for part in ("linalg", "optimize", "sparse", "spatial", "special", "stats")
+    }
 
 
 def test_the_package_s_front_offers_what_it_names():

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import Motion
-from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets, nothing
 from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
@@ -197,7 +197,7 @@ class _Normal:
     energy: float
     """In squared standard deviations."""
     system: Array
-    """(T, 1 + P, P) of each row (`body/kernels/solving.py`)."""
+    """(T, M, P) of each row (`body/kernels/solving.py`)."""
     pull: Array
     """(T, N) half the gradient of the links."""
     away: Array
@@ -236,7 +236,7 @@ class _Chain:
     def _normal(self, state: _State) -> _Normal:
         """Energy and normal equations."""
         T, scale = len(state.root), self._rows.kernel_scale
-        linear = self._rows.energy.linearise(state.free(), self._targets, scale, self._held, vectors=False)
+        linear = self._rows.energy.linearise(state.free(), self._targets, scale, self._held, nothing(T))
         ends = max(len(self._links.diagonal) - T, 0)
         root, others = (
             np.concatenate((each, each[-1:].repeat(ends, axis=0))) for each in (state.root, state.others)

@@ -7,6 +7,7 @@ of `BodyEnergy`, its gradient analytic. Training (`simulation/training/different
 inputs, and has the network's layers and the bodies' points once more, differentiable.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,18 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.network import NUM_ROTATIONS, UpdateNetwork
-from shapepose_fg.body.model.body_model import accumulate
-from shapepose_fg.body.model.rotation import from_six_d, six_d
-from shapepose_fg.body.model.skinned_points import SkinnedPoints
+from shapepose_fg.body.kernels.bodies import seen
+from shapepose_fg.body.kernels.rows import Own, Work
+from shapepose_fg.body.model.skinned_points import NUM_COLUMNS, SkinnedPoints
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.compiled import kernel
 
-_REACH_M = 0.1
-"""A target is believed against where the body is now as if that were known to this, metres."""
-_TRUST_M = 0.03
-"""Sigma of a target that is half trusted, metres."""
-_FAR_M = 0.5
-"""Residuals above this are seen by the network compressed, metres."""
 _TANGENT = np.append(np.arange(10 + 3 * NUM_ROTATIONS), np.arange(10 + 72, 10 + 75))
 """Columns of the body's Jacobian that the network is told: all but the hands'."""
 _SEEN_M, _TURN_RAD = 0.02, 0.3
@@ -70,10 +66,10 @@ class LearnedDescent:
         """The states after each update, given targets (B, K, 3) in the person's own frame, metres, finite, and
         their information (B, K, 3, 3), 1/m², the model's error included; zero for a joint never seen.
         """
-        trusted = believed(information)
         for step in range(self.network.config.steps):
-            inputs = self._see(state, xyz, information, trusted, self.network.gradient_scale)
-            state = _moved(state, self.network(inputs, step))
+            inputs = self._see(state, xyz, information, self.network.gradient_scale)
+            state = BodyState(*(np.array(part, order="C") for part in vars(state).values()))
+            moved(self.network(inputs, step), STEP, state.betas, state.local, state.transl)
             yield state
 
 
@@ -91,54 +87,46 @@ class Sight:
         rest = tuple(sorted(set(range(len(BODY_POINTS))) - set(slots)))
         if len(rest) != (0 if others is None else len(others.root)):
             raise ValueError(f"others must be the {len(rest)} points of the body that are not among the targets")
-        self._points, self._others, self._offsets = points, others, offsets
-        self._slots, self._rest, self._kernel_scale = list(slots), list(rest), kernel_scale
+        every = (points if others is None else points.joined(others)).part(np.argsort(slots + rest).tolist())
+        own = Own(np.full(len(BODY_POINTS), -1), np.zeros((50, 3)), np.zeros(50, dtype=np.intp))
+        own.target[list(slots)] = np.arange(len(slots))
+        if offsets is not None:  # the network knows the body's own points
+            own.offset[list(slots)], own.bone[list(slots)] = offsets
+        self._own, self._limbs, self._kernel_scale = own, every.limbs(), kernel_scale
 
-    def __call__(
-        self, state: BodyState, target: Array, information: Array, trusted: tuple[Array, Array], scale: Any
-    ) -> NDArray[np.float32]:
-        """(B, `UpdateNetwork.num_inputs`); `trusted` is `believed(information)`, gradients are multiplied by
-        `scale`.
-        """
-        local, betas, transl, B = state.local, state.betas, state.transl, len(state.betas)
-        matrix, trust = trusted
-        xyz, _, gradient = self._points.pulled(local, betas, transl, target, information, self._kernel_scale)
-        shrunk = (matrix @ (target - xyz)[..., None])[..., 0]
-        shrunk = shrunk / (1 + np.sqrt(np.square(shrunk).sum(-1, keepdims=True)) / _FAR_M)
-        if self._offsets is not None:  # the network knows the body's own points
-            xyz = xyz - (accumulate(local)[:, self._offsets[1]] @ self._offsets[0][..., None])[..., 0]
-        seen = np.zeros((B, len(BODY_POINTS), 7))
-        seen[:, self._slots] = np.concatenate((xyz + shrunk, 5 * shrunk, trust[..., None]), -1)
-        if self._others is not None:  # as those whose targets are missing
-            seen[:, self._rest, :3] = self._others.positions(local, betas, transl)
-        rotations = six_d(local[:, :NUM_ROTATIONS]).reshape(B, -1)
-        slope = np.clip(-gradient[:, _TANGENT] * scale, -3, 3)
-        parts = (seen.reshape(B, -1), betas / 3, rotations, transl, slope)
-        return np.concatenate(parts, 1, dtype=np.float32)
+    def __call__(self, state: BodyState, target: Array, information: Array, scale: Any) -> NDArray[np.float32]:
+        """(B, `UpdateNetwork.num_inputs`); gradients are multiplied by `scale` (79,)."""
+        given = (state.betas, state.local, state.transl, target, information)
+        inputs = np.empty((len(state.betas), UpdateNetwork.num_inputs), dtype=np.float32)
+        seen(
+            self._limbs, self._own, *(np.require(part, float, ["C", "W"]) for part in given), self._kernel_scale,
+            np.asarray(scale, dtype=np.float64), inputs, Work.of(self._limbs, NUM_COLUMNS),
+        )  # fmt: skip
+        return inputs
 
 
-def _moved(state: BodyState, change: NDArray[np.float32]) -> BodyState:
-    """The state after a change (B, `NUM_PARAMETERS`) of betas, 6D rotations, translation."""
-    step, local = STEP * change.astype(np.float64), state.local.copy()
-    turned = six_d(local[:, :NUM_ROTATIONS]) + step[:, 10:-3].reshape(-1, NUM_ROTATIONS, 6)
-    local[:, :NUM_ROTATIONS] = from_six_d(turned)
-    return BodyState(state.betas + 10 * step[:, :10], local, state.transl + step[:, -3:])
-
-
-def believed(information: Array) -> tuple[Array, Array]:
-    """How far each target is believed: as a matrix (B, K, 3, 3) for its residual, and a number (B, K), 0 to 1."""
-    share = _share(information, _TRUST_M)
-    return _share(information, _REACH_M), np.trace(share, axis1=-2, axis2=-1) / 3
-
-
-def _share(information: Array, sigma_m: float) -> Array:
-    """L (L + I / sigma²)^-1 = I - (I + sigma² L)^-1 of symmetric L (..., 3, 3), by its minors."""
-    M = np.eye(3) + sigma_m**2 * information
-    a, b, c, d, e, f = (M[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
-    minors = np.stack((p, q, r, q, s, t, r, t, u), -1).reshape(M.shape)
-    return np.eye(3) - minors / (a * p + b * q + c * r)[..., None, None]
+@kernel
+def moved(change, size, betas, local, transl):
+    """Move B bodies, in place, by `size` times a `change` (B, 145): betas in tens, the first two columns of 22
+    rotations, which are made orthogonal again (`body/model/rotation.py`), and the place.
+    """
+    for b in range(len(change)):
+        for n in range(10):
+            betas[b, n] += 10 * size * change[b, n]
+        for x in range(3):
+            transl[b, x] += size * change[b, 142 + x]
+        for q in range(22):
+            R, c, at = local[b, q], change[b], 10 + 6 * q
+            a0, a1, a2 = R[0, 0] + size * c[at], R[1, 0] + size * c[at + 1], R[2, 0] + size * c[at + 2]
+            b0, b1, b2 = R[0, 1] + size * c[at + 3], R[1, 1] + size * c[at + 4], R[2, 1] + size * c[at + 5]
+            v = 1 / math.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
+            a0, a1, a2 = v * a0, v * a1, v * a2
+            v = a0 * b0 + a1 * b1 + a2 * b2
+            b0, b1, b2 = b0 - v * a0, b1 - v * a1, b2 - v * a2
+            v = 1 / math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
+            b0, b1, b2 = v * b0, v * b1, v * b2
+            R[0, 0], R[1, 0], R[2, 0], R[0, 1], R[1, 1], R[2, 1] = a0, a1, a2, b0, b1, b2
+            R[0, 2], R[1, 2], R[2, 2] = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
 
 
 def gradient_scale(points: SkinnedPoints, slots: tuple[int, ...]) -> Array:

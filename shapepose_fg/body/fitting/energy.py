@@ -80,7 +80,7 @@ class Evaluated(FitRows):
     gradient: Array
     """(B, P) half the gradient."""
     system: Array
-    """(B, P + 1 + 3 K + 10, P) as `body/kernels/solving.py` has it, Hessian and gradient reduced."""
+    """(B, P + 1 + 3 N + 10, P) as `body/kernels/solving.py` has it, Hessian and gradient reduced; N keypoints."""
     step: Array
     """(B, P) the Newton step."""
     left: Array
@@ -95,10 +95,11 @@ class Evaluated(FitRows):
         solved(self.system, np.full(len(self), -1.0), self.step, self.left)
 
     def covariances(self) -> tuple[Array, Array]:
-        """Of the keypoints (B, K, 3, 3), m², and of the betas (B, 10, 10): Laplace. Reduces the rest of the
-        systems.
+        """Of the keypoints of the systems (B, N, 3, 3), m², and of the betas (B, 10, 10): Laplace. Reduces the
+        rest of the systems.
         """
-        covariance, shape = np.zeros((*self.xyz.shape, 3)), np.zeros((len(self), 10, 10))
+        B, M, P = self.system.shape
+        covariance, shape = np.zeros((B, (M - P - 11) // 3, 3, 3)), np.zeros((B, 10, 10))
         known(self.system, covariance, shape)
         return covariance, shape
 
@@ -157,25 +158,35 @@ class BodyEnergy:
         return Held(np.zeros((count, 10)), np.ones(count), np.tile(self.priors.mean, (count, 1)))
 
     def linearise(
-        self, free: Array, targets: WhitenedTargets, scale: Array | float, held: Held, *, slope_only: bool = False,
-        vectors: bool = True,
+        self, free: Array, targets: WhitenedTargets, scale: Array | float, held: Held, asked: Index | None = None,
+        *, slope_only: bool = False,
     ) -> Linear:  # fmt: skip
         """The energy at free parameters (B, P), the robust kernel having this scale, or one for each row (B,).
 
-        Without `vectors` systems end after the gradient.
+        Systems hold the Jacobian of the keypoints that are `asked` (B, N) for; None: of all.
         """
         (B, P), K = free.shape, len(self.model.keypoint_names)
-        shapes = ((B,), (B, K, 3), (B, K), (B, P), (0 if slope_only else B, P + 1 + vectors * (3 * K + 10), P))
-        linear = Linear(*map(np.empty, shapes))
+        asked = np.broadcast_to(np.arange(K), (B, K)) if asked is None else asked
+        size = (0 if slope_only else B, P + 1 + 3 * asked.shape[1] + 10, P)
+        linear = Linear(*map(np.empty, ((B,), (B, K, 3), (B, K), (B, P), size)))
         scales, work = _plain(np.broadcast_to(scale, (B,))), Work.of(self._limbs, P)
-        linearised(self._limbs, self.priors, _plain(free), _rows(targets, held), scales, linear, work)
+        asked = np.require(asked, np.intp, ["C", "W"])
+        linearised(self._limbs, self.priors, _plain(free), _rows(targets, held), scales, asked, linear, work)
         return linear
 
-    def evaluate(self, free: Array, targets: WhitenedTargets, scale: float, held: Held) -> Evaluated:
-        """Bodies at free parameters (B, P), and the energy around them."""
-        linear, step, left = self.linearise(free, targets, scale, held), np.empty(free.shape), np.empty(len(free))
+    def evaluate(
+        self, free: Array, targets: WhitenedTargets, scale: float, held: Held, asked: Index | None = None
+    ) -> Evaluated:
+        """Bodies at free parameters (B, P), and the energy around them; `asked` as in `linearise`."""
+        linear = self.linearise(free, targets, scale, held, asked)
+        step, left = np.empty(free.shape), np.empty(len(free))
         solved(linear.system, np.zeros(len(free)), step, left)
         return Evaluated(_plain(free).copy(), *linear, step, left)
+
+
+def nothing(count: int) -> Index:
+    """No keypoints of `count` rows."""
+    return np.zeros((count, 0), dtype=np.intp)
 
 
 def _contiguous(parts: Sequence[Any]) -> Iterator[Any]:

@@ -1,12 +1,13 @@
 """The body fitter: judge targets, plan passes, fit them, share shapes, fit again; with the network on or off."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.body.fitting.body_sequence import SequenceFitter
-from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets
+from shapepose_fg.body.fitting.energy import BodyEnergy, Held, nothing
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
     BodyConfig,
@@ -18,9 +19,9 @@ from shapepose_fg.body.fitting.fitter import (
     Shapes,
     check_groups,
 )
-from shapepose_fg.body.fitting.left_out import Pairs, fitted_without, left_out_sets
+from shapepose_fg.body.fitting.left_out import Passes, left_out_sets
 from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt, NetworkDescent
-from shapepose_fg.body.fitting.posterior import pooled_betas, shared
+from shapepose_fg.body.fitting.posterior import JointPosterior, pooled_betas, shared
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
@@ -90,7 +91,7 @@ class SmplFitter(BodyFitter):
         self.energy = BodyEnergy(self.model, self.prior)
         self.sets = left_out_sets(self.energy, self.prior)
         """(J,) which joints are left out together."""
-        self._plain = plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
+        plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
         names = self.model.keypoint_names
         if weights is None:
             self.optimiser, self._fallback, self._unfinished = plain, None, _CONVERGED
@@ -108,8 +109,8 @@ class SmplFitter(BodyFitter):
     def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
 
-        OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing. The network
-        needs none: two fits to the same targets are the same fit.
+        OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing; passes that
+        leave targets out start cold. The network needs none: two fits to the same targets are the same fit.
         """
         return self._fit(targets, initial, groups, leave_out=True)
 
@@ -163,114 +164,85 @@ class SmplFitter(BodyFitter):
             return fit
         evidence, groups = evidence.rows(rows), groups[rows]
         start = None if initial is None else self._start(initial.rows(rows), evidence.centre)
-        free, held = self._arrive(evidence, start)
-        pairs, votes = Pairs.of(evidence, self.sets, groups) if leave_out else None, evenly(groups, _VOTERS)
-        fitted = self.optimiser.evaluated
-        if shared(groups, votes).any():
-            fitted = self.optimiser.again
-            free, held, pairs = self._one_shape(evidence, groups, votes, free, held, pairs)
-        unsettled = np.zeros(len(rows), dtype=bool)
-        for part in _parts(np.arange(len(rows)), _CHUNK):
-            body = fitted(free[part], _centred(evidence, part), held.rows(part))
-            if self._fallback is not None:
-                unsettled[part] = ~(body.left < self._unfinished)  # NaN is unsettled
-                if unsettled[part].any():
-                    body, part = body.rows(~unsettled[part]), part[~unsettled[part]]
-            self._fill(fit, rows, evidence, part, body, held.rows(part), pairs)
-        for part in _parts(np.flatnonzero(unsettled), _CHUNK):
-            given = _centred(evidence, part)
-            arrived, held = self._plain.arrive(given, evidence.variance_m2[part])
-            body = self._plain.evaluated(arrived, given, held)
-            self._fill(fit, rows, evidence, part, body, held, pairs)
+        passes = Passes.of(evidence, self.sets, groups) if leave_out else Passes.whole(evidence, groups)
+        votes = passes.votes & evenly(groups, _VOTERS)[passes.row]
+        self._fill(fit, rows, passes, self._posterior(replace(passes, votes=votes), start))
         return fit
 
-    def _arrive(self, evidence: Evidence, start: Array | None) -> tuple[Array, Held]:
-        """Where fits with all targets start, (R, P) around `evidence.centre`, and what holds them."""
-        found = [
-            self.optimiser.arrive(
-                _centred(evidence, part), evidence.variance_m2[part], None if start is None else start[part]
-            )
-            for part in _parts(np.arange(len(evidence.xyz)), _ARRIVE)
-        ]
+    def _posterior(self, passes: Passes, start: Array | None) -> list[JointPosterior]:
+        """What all passes (M) say: in order, part by part."""
+        free, held = self._arrive(passes, start)
+        fitted = self.optimiser.evaluated
+        if shared(passes.pool, passes.votes).any():
+            fitted = self.optimiser.again
+            free, held = self._one_shape(passes, free, held)
+        parts: list[JointPosterior] = []
+        for index in passes.chunks(_CHUNK):
+            asked = passes.asked(index)
+            body = fitted(free[index], passes.given(index)[0], held.rows(index), asked)
+            part = JointPosterior.of(body)
+            # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
+            unsettled = np.flatnonzero(~(part.left < self._unfinished))  # NaN is unsettled
+            if self._fallback is not None and len(unsettled) > 0:
+                (targets, variance), asked = passes.given(index[unsettled]), asked[unsettled]
+                arrived, by_priors = self._fallback.arrive(targets, variance)
+                body = self._fallback.evaluated(arrived, targets, by_priors, asked)
+                part.put(unsettled, JointPosterior.of(body))
+            parts.append(part)
+        return parts
+
+    def _arrive(self, passes: Passes, start: Array | None) -> tuple[Array, Held]:
+        """Where passes (M) start, (M, P) around the centres of their rows, and what holds them. Only those with
+        all targets may begin at `start` (R, P): an earlier body has seen what the others leave out.
+        """
+        found = []
+        for index in passes.chunks(_ARRIVE):
+            first = None if start is None or index[0] >= len(start) else start[index]
+            found.append(self.optimiser.arrive(*passes.given(index), first))
         held = zip(*(vars(each).values() for _, each in found), strict=True)
         return np.concatenate([free for free, _ in found]), Held(*map(np.concatenate, held))
 
-    def _one_shape(
-        self, evidence: Evidence, groups: Index, votes: Mask, free: Array, held: Held, pairs: Pairs | None
-    ) -> tuple[Array, Held, Pairs | None]:
-        """The same starts, and what holds rows and pairs, at the shapes upon which the rows of each group agree.
+    def _one_shape(self, passes: Passes, free: Array, held: Held) -> tuple[Array, Held]:
+        """The same starts, and what holds passes (M), at the shapes upon which those of each pool agree.
 
-        Rows that vote are fitted by themselves first; without a set of targets, they vote as they are without it.
+        The passes that vote are fitted by themselves first.
         """
-        S, scale = 1 + self.sets.max(), self.config.kernel_scale
-        alone, precision = np.zeros((len(groups), S + 1, 10)), np.zeros((len(groups), S + 1, 10, 10))
-        voting = np.zeros((len(groups), S + 1), dtype=bool)  # all targets come last
-        free, by_priors = free.copy(), self.energy.held_by_priors(len(groups))
-        for part in _parts(np.flatnonzero(votes), _CHUNK):
-            targets, own = _centred(evidence, part), held.rows(part)
-            body = self.optimiser.evaluated(free[part], targets, own)
-            if pairs is not None:
-                body = self.energy.evaluate(body.free, targets, scale, own)
-            _, covariance = body.covariances()
-            free[part], alone[part, S], precision[part, S] = (
-                body.free,
-                body.free[:, :10],
-                np.linalg.inv(covariance),
-            )
-            voting[part, S] = body.left < self._unfinished
-            if pairs is not None:
-                mine = pairs.of_rows(part)
-                mine = mine.part(mine.together)
-                found = fitted_without(self.energy, body, targets, scale, mine, self._plain)
-                place = part[mine.row], mine.group
-                alone[place], precision[place] = found.betas, np.linalg.inv(found.betas_covariance)
-                voting[place] = voting[place[0], S]
-        for number in range(S):
-            if pairs is None:
-                break
-            betas = pooled_betas(alone[:, number], precision[:, number], groups, voting[:, number], by_priors)
-            pairs = pairs.at_shape(number, betas, shared(groups, voting[:, number]))
-        settled = shared(groups, voting[:, S])
-        betas = pooled_betas(alone[:, S], precision[:, S], groups, voting[:, S], held)
-        free[settled, :10] = betas[settled]
-        return free, held.at_shape(betas, settled), pairs
+        free, precision, settled = free.copy(), np.zeros((len(free), 10, 10)), np.zeros(len(free), dtype=bool)
+        for index in _parts(np.flatnonzero(passes.votes), _CHUNK):
+            targets, none = passes.given(index)[0], nothing(len(index))
+            body = self.optimiser.evaluated(free[index], targets, held.rows(index), none)
+            free[index], settled[index] = body.free, body.left < self._unfinished
+            precision[index] = np.linalg.inv(body.covariances()[1])
+        agreed = shared(passes.pool, settled)
+        betas = pooled_betas(free[:, :10], precision, passes.pool, settled, held)
+        return np.concatenate((betas, free[:, 10:]), 1), held.at_shape(betas, agreed)
 
-    def _fill(
-        self,
-        fit: BodyFit,
-        rows: Index,
-        evidence: Evidence,
-        part: Index,
-        body: Evaluated,
-        held: Held,
-        pairs: Pairs | None,
-    ) -> None:
-        """Fill `fit`'s `rows` (R,) of a `part` of the evidence with its bodies, and what they say without some
-        targets.
+    def _fill(self, fit: BodyFit, rows: Index, passes: Passes, parts: list[JointPosterior]) -> None:
+        """Fill `fit`'s `rows` (R,) with what the passes found.
 
         Rows whose energy a Newton step would still lower, or that are not finite, become NOT_CONVERGED.
         """
-        scale, done = self.config.kernel_scale, body.left < self._unfinished  # NaN is not
-        if pairs is not None:
-            body = self.energy.evaluate(body.free, _centred(evidence, part), scale, held)
-        covariance, _ = body.covariances()
-        prior_xyz, prior_covariance = body.xyz.copy(), covariance.copy()
-        if pairs is not None:
-            mine = pairs.of_rows(part)
-            found = fitted_without(self.energy, body, _centred(evidence, part), scale, mine, self._plain)
-            left_out = mine.without >= 0
-            place = np.broadcast_to(mine.row[:, None], left_out.shape)[left_out], mine.without[left_out]
-            prior_xyz[place], prior_covariance[place] = found.xyz[left_out], found.covariance[left_out]
+        wider, evidence, chunks = self._spread[:, None, None], passes.evidence, passes.chunks(_CHUNK)
+        whole = [part for part, index in zip(parts, chunks, strict=True) if index[0] < len(rows)]
+        found = JointPosterior.joined(whole)
+        unseen = np.all(evidence.root == 0, axis=(-1, -2))[..., None, None]
+        prior_xyz, prior_covariance = found.xyz.copy(), found.covariance.copy()
+        for part, index in zip(parts[len(whole) :], chunks[len(whole) :], strict=True):
+            asked = passes.asked(index)
+            left_out = np.take_along_axis(passes.without[index], asked, axis=1)  # others fill up a smaller set
+            into = np.broadcast_to(passes.row[index, None], asked.shape)[left_out], asked[left_out]
+            prior_xyz[into] = np.take_along_axis(part.xyz, asked[..., None], axis=1)[left_out]
+            prior_covariance[into] = part.covariance[left_out]
+        done = found.left < self._unfinished  # NaN is not
         done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
-        fit.status[rows[part[~done]]] = FitStatus.NOT_CONVERGED
-        into, part, wider = rows[part[done]], part[done], self._spread[:, None, None]
-        origin, unseen = evidence.centre[part], np.all(evidence.root[part] == 0, axis=(-1, -2))[..., None, None]
-        fit.put_bodies(into, self.energy.complete(body.free[done]), origin)
-        fit.joints[into] = body.xyz[done] + origin[:, None]
-        fit.covariance[into] = np.where(unseen, wider * covariance[done], covariance[done])
-        fit.prior_xyz[into] = prior_xyz[done] + origin[:, None]
-        fit.prior_covariance[into] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
-        fit.residual_m[into] = np.sqrt(body.squared[done].sum(axis=1) / evidence.total_information[part])
+        fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
+        rows, origin = rows[done], evidence.centre[done]
+        fit.put_bodies(rows, self.energy.complete(found.free[done]), origin)
+        fit.joints[rows] = found.xyz[done] + origin[:, None]
+        fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
+        fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
+        fit.prior_covariance[rows] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
+        fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)[done]
 
     def _starts(self, evidence: Evidence) -> tuple[Array, Array, Mask]:
         """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
@@ -278,16 +250,17 @@ class SmplFitter(BodyFitter):
         Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held, and
         which (R,) are finished.
         """
-        free, held = self._arrive(evidence, None)
+        passes = Passes.whole(evidence, np.arange(len(evidence.xyz)))
+        free, held = self._arrive(passes, None)
         done = np.zeros(len(free), dtype=bool)
-        for part in _parts(np.arange(len(free)), _CHUNK):
-            body = self.optimiser.evaluated(free[part], _centred(evidence, part), held.rows(part))
+        for part in passes.chunks(_CHUNK):
+            body = self.optimiser.evaluated(free[part], passes.given(part)[0], held.rows(part), nothing(len(part)))
             free[part], done[part] = body.free, body.left < self._unfinished
         unsettled = np.flatnonzero(~done)
         if self._fallback is not None and len(unsettled) > 0:
-            targets = _centred(evidence, unsettled)
-            found, by_priors = self._plain.arrive(targets, evidence.variance_m2[unsettled])
-            body = self._plain.evaluated(found, targets, by_priors)
+            targets, variance = passes.given(unsettled)
+            found, by_priors = self._fallback.arrive(targets, variance)
+            body = self._fallback.evaluated(found, targets, by_priors, nothing(len(unsettled)))
             free[unsettled], done[unsettled] = body.free, body.left < self._unfinished
             held.angles[unsettled] = body.free[:, 13:-3]
         return free, held.angles, done
@@ -302,11 +275,6 @@ class SmplFitter(BodyFitter):
 def _parts(rows: Index, size: int) -> list[Index]:
     """Rows in parts of at most `size`."""
     return [rows[at : at + size] for at in range(0, len(rows), size)]
-
-
-def _centred(evidence: Evidence, rows: Index) -> WhitenedTargets:
-    """The targets of some rows, around each row's own centre."""
-    return WhitenedTargets(evidence.xyz[rows] - evidence.centre[rows, None], evidence.root[rows])
 
 
 def evenly(groups: Index, count: int) -> Mask:

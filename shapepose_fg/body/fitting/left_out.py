@@ -1,160 +1,91 @@
-"""Leave-one-out: which targets are taken out together, and the fits that do not see them.
+"""Leave-one-out: which targets are taken out together, and the passes of a fit that never see them."""
 
-A fit without a set is held by the priors, not by where the network arrived, which had seen the set. It starts
-from the fit with all targets, whose factor serves for it, too: taking a few targets out changes a Hessian by
-little. Where a further step would still move some joint by half of its standard deviation, it is linearised
-anew, to the optimum.
-"""
-
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Evaluated, Held, WhitenedTargets, robust_weight
+from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets
 from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
 from shapepose_fg.body.fitting.fitter import BodyConfig
-from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt
 from shapepose_fg.body.fitting.priors import PosePrior
-from shapepose_fg.body.kernels.solving import lessened, stepped
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SETS = 6
-"""So many sets: more cost more fits, and leave fewer joints out at a time."""
+"""So many sets: more cost more passes, and leave fewer joints out at a time."""
 _POSES = 8
 """Poses of the prior at which the coupling of joints is linearised."""
 _ROOT_INFORMATION = 1e-2
 """Of the root's rotation and place in that linearisation, 1/rad² and 1/m²: next to nothing."""
-NEAR = 0.5
-"""A fit without a set is linearised anew where another step would still move a joint of the set by more, in
-standard deviations. On Shelf that is one in five; the others are 0.08 from the optimum (median), 0.28 (95 %)."""
-
-_SETTLED = 0.1
-"""That is done when a step lowers its energy by less: no joint moves by a third of its standard deviation."""
 
 
 @dataclass(frozen=True)
-class Pairs:
-    """N fits, each to the targets of a row but some."""
+class Passes:
+    """M fits to the targets of R rows: first each row with all its targets, then with some of them left out.
 
+    A joint's prior is taken from a pass that saw none of its targets: the gain on its own noise is 0 by
+    construction, not to first order.
+    """
+
+    evidence: Evidence
+    """(R) the targets."""
     row: Index
-    """(N,) whose."""
-    group: Index
-    """(N,) the set that they are of."""
-    without: Index
-    """(N, M) joints that are left out, then -1."""
-    together: Mask
-    """(N,) whether these are all of the set: what is left determines the pose."""
-    betas: Array
-    """(N, 10) around which shape the fit is held: 0 is the prior's."""
-    stiffness: Array
-    """(N,) precision of each beta: 1 is the prior's."""
+    """(M,) whose targets; the first R are 0 to R - 1."""
+    without: Mask
+    """(M, J) targets that are left out."""
+    pool: Index
+    """(M,) passes with the same number get one shape: rows of one group, with the same targets left out of all."""
+    votes: Mask
+    """(M,) whether a pass has a part in its pool's shape."""
 
     @classmethod
-    def of(cls, evidence: Evidence, sets: Index, groups: Index) -> "Pairs":
-        """One for each row (R) and set of joints (J,).
+    def whole(cls, evidence: Evidence, groups: Index) -> "Passes":
+        """One pass with all targets for each row of `groups` (R,), and nothing left out."""
+        R, J = evidence.xyz.shape[:2]
+        return cls(evidence, np.arange(R), np.zeros((R, J), dtype=bool), groups, np.ones(R, dtype=bool))
 
-        A set without a target in any row of a group (R,) needs none. Where what is left would not determine the
-        pose, the joints of the set are left out one by one.
+    @classmethod
+    def of(cls, evidence: Evidence, sets: Index, groups: Index) -> "Passes":
+        """One pass with all targets for each row (R), one more for every set of joints (J,) to leave out.
+
+        A set without a target in any row of a group (R,) needs no pass. Where what is left would not determine the
+        pose, the joints of the set are left out one by one; these passes take the shape of their group's others.
         """
         seen, full = evidence.root.any(axis=(2, 3)), np.isfinite(evidence.variance_m2)
-        member = sets == np.arange(sets.max() + 1)[:, None]  # (S, J)
+        R, J, S = *seen.shape, sets.max() + 1
+        member = sets == np.arange(S)[:, None]  # (S, J)
         _, group = np.unique(groups, return_inverse=True)
-        asked = np.zeros((group.max() + 1, len(member)), dtype=bool)
+        asked = np.zeros((group.max() + 1, S), dtype=bool)
         np.logical_or.at(asked, group, seen @ member.T)
         determined = determine_pose(evidence.xyz[:, None], full[:, None] & ~member)  # (R, S)
-        together, singly = (
-            np.argwhere(asked[group] & determined),
-            np.argwhere((asked[group] & ~determined)[:, sets]),
-        )
-        joints = np.full((len(member), member.sum(axis=1).max()), -1)
-        for number, one in enumerate(member):
-            joints[number, : one.sum()] = np.flatnonzero(one)
-        alone = np.full((len(singly), joints.shape[1]), -1)
-        alone[:, 0] = singly[:, 1]
-        return cls(
-            np.concatenate([together[:, 0], singly[:, 0]]),
-            np.concatenate([together[:, 1], sets[singly[:, 1]]]),
-            np.concatenate([joints[together[:, 1]], alone]),
-            np.arange(len(together) + len(singly)) < len(together),
-            np.zeros((len(together) + len(singly), 10)),
-            np.ones(len(together) + len(singly)),
-        )
+        together = np.argwhere(asked[group] & determined)
+        singly = np.argwhere((asked[group] & ~determined)[:, sets])
+        of_set = np.concatenate([np.full(R, -1), together[:, 1], sets[singly[:, 1]]])
+        row = np.concatenate([np.arange(R), together[:, 0], singly[:, 0]])
+        alone = np.eye(J, dtype=bool)[singly[:, 1]]
+        without = np.concatenate([np.zeros((R, J), dtype=bool), member[together[:, 1]], alone])
+        votes = np.arange(len(row)) < R + len(together)
+        return cls(evidence, row, without, group[row] * (S + 1) + of_set + 1, votes)
 
-    def part(self, chosen: Index | Mask) -> "Pairs":
-        """Some of them."""
-        return Pairs(*(value[chosen] for value in vars(self).values()))
+    def chunks(self, size: int) -> list[Index]:
+        """Passes with all targets, then those without some, in parts of at most `size`."""
+        R, M = len(self.evidence.xyz), len(self.row)
+        ends = [(0, R), (R, M)]
+        return [np.arange(at, min(at + size, end)) for start, end in ends for at in range(start, end, size)]
 
-    def at_shape(self, group: int, betas: Array, settled: Mask) -> "Pairs":
-        """The same, those of a set next to immovable at shapes `betas` (R, 10) where these are `settled` (R,)."""
-        mine = (self.group == group) & settled[self.row]
-        held = np.where(mine[:, None], betas[self.row], self.betas)
-        return replace(self, betas=held, stiffness=np.where(mine, SETTLED, self.stiffness))
+    def asked(self, index: Index) -> Index:
+        """(B, N) joints that some passes are for: all, or those left out, of some sets others too."""
+        without = self.without[index]
+        if not without.any():
+            return np.broadcast_to(np.arange(without.shape[1]), without.shape)
+        return np.argsort(~without, axis=1, kind="stable")[:, : self.without.sum(axis=1).max()]
 
-    def of_rows(self, rows: Index) -> "Pairs":
-        """Those of some rows (K,), which are numbered from 0 then."""
-        place = np.full(max(self.row.max(initial=0), rows.max(initial=0)) + 1, -1)
-        place[rows] = np.arange(len(rows))
-        chosen = self.part(place[self.row] >= 0)
-        return replace(chosen, row=place[chosen.row])
-
-
-@dataclass(frozen=True)
-class Without:
-    """What N pairs say."""
-
-    xyz: Array
-    """(N, M, 3) the joints that were left out, metres."""
-    covariance: Array
-    """(N, M, 3, 3) of these (Laplace), m²."""
-    betas: Array
-    """(N, 10) shape."""
-    betas_covariance: Array
-    """(N, 10, 10) of it."""
-
-
-def fitted_without(
-    energy: BodyEnergy,
-    body: Evaluated,
-    targets: WhitenedTargets,
-    scale: float,
-    pairs: Pairs,
-    plain: LevenbergMarquardt,
-) -> Without:
-    """Fit the `pairs` (N) of rows (B) whose fits with all `targets` are `body`, linearised where they are, and
-    reduced (`Evaluated.covariances`). `plain` fits those that are far.
-    """
-    (N, M), P, place = pairs.without.shape, energy.num_free, np.arange(len(pairs.row))[:, None]
-    held = Held(pairs.betas, pairs.stiffness, np.tile(energy.priors.mean, (N, 1)))
-    root, free = targets.root[pairs.row], body.free[pairs.row]
-    out = np.zeros((N, M, 3, 3))
-    known = pairs.without >= 0
-    weight = np.sqrt(robust_weight(body.squared, scale))[pairs.row[:, None], pairs.without]
-    out[known] = (weight[..., None, None] * root[place, pairs.without])[known]
-    root[np.nonzero(known)[0], pairs.without[known]] = 0.0
-    given, xyz = WhitenedTargets(targets.xyz[pairs.row], root), np.zeros((N, *body.xyz.shape[1:]))
-    Y, B, C = np.empty((N, 6 * M + 10, P)), np.empty((N, 6 * M + 11, 3 * M)), np.empty((N, 3 * M + 10, 3 * M + 10))
-    good = np.zeros(N, dtype=bool)
-    lessened(body.system, pairs.row, pairs.without, out, Y, B, C, good)
-    covariance = np.stack([C[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(M)], axis=1)
-    sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 3)
-    going, step, move = np.flatnonzero(good), np.zeros((N, P)), np.zeros((N, 3 * M))
-    row, before, better = pairs.row[going], np.full(N, np.inf), np.ones(len(going), dtype=bool)
-    for _ in range(2):  # the second time only to see how far that was
-        free[going] = energy.retract(free[going], step[going])
-        slope = energy.linearise(free[going], given.rows(going), scale, held.rows(going), slope_only=True)
-        better, before[going] = np.asarray(slope.energy < before[going]), slope.energy
-        stepped(body.system, row, going, Y, B, slope.gradient, step, move)
-    xyz[going] = slope.xyz
-    free[going[~better]] = body.free[row[~better]]
-    good[going] = better
-    close = np.linalg.norm(move.reshape(N, M, 3), axis=2) < NEAR * sigma  # NaN is not
-    shape, far = C[:, -10:, -10:], np.flatnonzero(~(good & (close | ~known).all(axis=1)))
-    if len(far) > 0:
-        anew = plain.again(free[far], given.rows(far), held.rows(far), _SETTLED)
-        free[far], xyz[far] = anew.free, anew.xyz
-        joints, shape[far] = anew.covariances()
-        covariance[far] = joints[np.arange(len(far))[:, None], pairs.without[far]]
-    return Without(xyz[place, pairs.without], covariance, free[:, :10], shape)
+    def given(self, index: Index) -> tuple[WhitenedTargets, Array]:
+        """The targets of some passes around their rows' centres, and the variance of each (B, J): infinite where a
+        target is left out.
+        """
+        evidence, row, without = self.evidence, self.row[index], self.without[index]
+        xyz, root = evidence.xyz[row] - evidence.centre[row, None], evidence.root[row] * ~without[..., None, None]
+        return WhitenedTargets(xyz, root), np.where(without, np.inf, evidence.variance_m2[row])
 
 
 def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> Index:

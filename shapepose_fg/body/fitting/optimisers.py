@@ -6,7 +6,14 @@ Both have `arrive`, from which `evaluated` is short, and `again`, held by someth
 import numpy as np
 
 from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent
-from shapepose_fg.body.fitting.energy import BodyEnergy, Evaluated, Held, WhitenedTargets, robust_weight
+from shapepose_fg.body.fitting.energy import (
+    BodyEnergy,
+    Evaluated,
+    Held,
+    WhitenedTargets,
+    nothing,
+    robust_weight,
+)
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
@@ -15,7 +22,7 @@ from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 STALE = 0.3
 """Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
@@ -74,18 +81,20 @@ class NetworkDescent:
         free[~(np.abs(arrived.betas).max(axis=1) < _NOBODY)] = np.nan
         return free, Held(arrived.betas, np.ones(count), angles)
 
-    def evaluated(self, free: Array, targets: WhitenedTargets, held: Held) -> Evaluated:
-        """The bodies of `arrive` (B, P), polished."""
-        return self.again(free, targets, held)
+    def evaluated(
+        self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None
+    ) -> Evaluated:
+        """The bodies of `arrive` (B, P), polished, and the energy around them for the keypoints `asked` or all."""
+        return self.again(free, targets, held, asked)
 
-    def again(self, free: Array, targets: WhitenedTargets, held: Held) -> Evaluated:
+    def again(self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None) -> Evaluated:
         """Gauss-Newton steps from `free` (B, P); one that does not lower a row's energy is not taken.
 
         The energy is linearised before each step. After the last, only rows are in which the weight of some joint
         changed: covariances hardly change otherwise, and a linearisation is a third of the whole cost.
         """
         scale, energy = self._scale, self._energy
-        body = energy.evaluate(free, targets, scale, held)
+        body = energy.evaluate(free, targets, scale, held, asked)
         for _ in range(self._polish_steps):
             before = robust_weight(body.squared, scale)
             there = energy.retract(body.free, body.step)
@@ -93,7 +102,8 @@ class NetworkDescent:
             body.move(slope.energy < body.energy, there, slope)  # a step into NaN is not better
             stale = np.flatnonzero(np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE)
             if len(stale) > 0:
-                body.put(stale, energy.evaluate(body.free[stale], targets.rows(stale), scale, held.rows(stale)))
+                given = targets.rows(stale), scale, held.rows(stale), None if asked is None else asked[stale]
+                body.put(stale, energy.evaluate(body.free[stale], *given))
         return body
 
 
@@ -119,30 +129,30 @@ class LevenbergMarquardt:
         held = self._energy.held_by_priors(count)
         return self.solve(free, targets, warm, held), held
 
-    def evaluated(self, free: Array, targets: WhitenedTargets, held: Held) -> Evaluated:
-        """The bodies of `arrive` (B, P), and the energy around them."""
-        return self._energy.evaluate(free, targets, self._scale, held)
+    def evaluated(
+        self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None
+    ) -> Evaluated:
+        """The bodies of `arrive` (B, P), and the energy around them for the keypoints `asked` or all."""
+        return self._energy.evaluate(free, targets, self._scale, held, asked)
 
-    def again(self, free: Array, targets: WhitenedTargets, held: Held, tolerance: float = TOLERANCE) -> Evaluated:
+    def again(self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None) -> Evaluated:
         """The optimum from `free` (B, P) on, held by something else."""
-        free = self.solve(free, targets, np.ones(len(free), dtype=bool), held, tolerance)
-        return self.evaluated(free, targets, held)
+        free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
+        return self.evaluated(free, targets, held, asked)
 
-    def solve(
-        self, free: Array, targets: WhitenedTargets, warm: Mask, held: Held, tolerance: float = TOLERANCE
-    ) -> Array:
+    def solve(self, free: Array, targets: WhitenedTargets, warm: Mask, held: Held) -> Array:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         energy, rows = self._energy, np.arange(len(free))
         result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)
         widening = np.where(warm, 0, ANNEAL_STEPS)
-        here = energy.linearise(free, targets, self._scale * 2.0**widening, held, vectors=False)
+        here = energy.linearise(free, targets, self._scale * 2.0**widening, held, nothing(len(free)))
         for _ in range(MAX_ITERATIONS):
             step, promised = np.empty(free.shape), np.empty(len(free))
             solved(here.system.copy(), damping, step, promised)
             promised += damping * (np.diagonal(here.system, axis1=1, axis2=2) * step**2).sum(axis=1)
             trial = energy.retract(free, step)
             scale, annealed = self._scale * 2.0**widening, widening == 0
-            there = energy.linearise(trial, targets, scale, held, vectors=False)
+            there = energy.linearise(trial, targets, scale, held, nothing(len(trial)))
             gain = here.energy - there.energy
             better = gain > 0  # a step into NaN is not
             if not better.all():
@@ -150,13 +160,14 @@ class LevenbergMarquardt:
                     new[~better] = old[~better]
             free, here = trial, there
             damping = _next_damping(damping, better, gain / promised)
-            settled = np.where(better, gain, promised) < tolerance
+            settled = np.where(better, gain, promised) < TOLERANCE
             going = ~(annealed & settled) & (damping < _DAMPING_MAX)
             narrower = np.flatnonzero(going & (widening > 0))
             if len(narrower) > 0:
                 widening[narrower] -= 1
                 some = targets.rows(narrower), self._scale * 2.0 ** widening[narrower], held.rows(narrower)
-                for old, new in zip(here, energy.linearise(free[narrower], *some, vectors=False), strict=True):
+                narrowed = energy.linearise(free[narrower], *some, nothing(len(narrower)))
+                for old, new in zip(here, narrowed, strict=True):
                     old[narrower] = new
             if going.all():
                 continue

@@ -1,9 +1,38 @@
-"""What rows say of a shape that they share."""
+"""What passes say: of joints, given all targets and without each joint's own; and of shapes, put together."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import Held
+from shapepose_fg.body.fitting.energy import Evaluated, Held
+from shapepose_fg.body.fitting.fitter import Rows
 from shapepose_fg.core.arrays import Array, Index, Mask
+
+
+@dataclass(frozen=True)
+class JointPosterior(Rows):
+    """What B passes say of their joints."""
+
+    free: Array
+    """(B, P) parameters of the body."""
+    xyz: Array
+    """(B, J, 3) joints, metres."""
+    covariance: Array
+    """(B, N, 3, 3) of the joints that were asked for (`Passes.asked`), m² (Laplace)."""
+    squared: Array
+    """(B, J) squared Mahalanobis distance of each joint to its target."""
+    left: Array
+    """(B,) by how much a Newton step would still lower the energy."""
+
+    @classmethod
+    def of(cls, body: Evaluated) -> "JointPosterior":
+        """From bodies whose systems hold the joints that are asked for."""
+        return cls(body.free, body.xyz, body.covariances()[0], body.squared, body.left)
+
+    @classmethod
+    def joined(cls, parts: "list[JointPosterior]") -> "JointPosterior":
+        """The rows of all, in order."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def pooled_betas(alone: Array, precision: Array, pool: Index, votes: Mask, held: Held) -> Array:

@@ -1,11 +1,23 @@
-"""Bodies row by row, compiled: points, their Jacobian, and the energy of `body/fitting/energy.py` around them.
+"""Bodies row by row, compiled: points, their Jacobian, the energy of `body/fitting/energy.py` around them, and
+what the update network sees of them.
 
-A row's unknowns are betas 10, three for each rotation that has a column in `Limbs`, place 3; P in all.
+A row's unknowns are betas 10, three for each rotation that has a column in `Limbs`, place 3; P in all. Gradients
+are accumulated from the points backwards: a force on a point turns every bone that it hangs on, by the sum of the
+torques on the terms (`Limbs`) of that bone and of those below it.
 """
 
 import math
 
 from shapepose_fg.core.compiled import kernel, part
+
+REACH_M = 0.1
+"""A target is believed against where the body is now as if that were known to this, metres."""
+TRUST_M = 0.03
+"""Sigma of a target that is half trusted, metres."""
+FAR_M = 0.5
+"""Residuals above this are seen by the network compressed, metres."""
+STEEP = 3.0
+"""Scaled slopes above this are cut off."""
 
 
 @part
@@ -47,12 +59,33 @@ def _product(A, B, C):
 
 
 @part
-def _put(limbs, betas, place, jacobian, w):
-    """World rotations and axes from `local` and `tangent`, points, and their Jacobian.
+def _bent(slope, L, T, q, c):
+    """What turning joint q about its axis c does by the pose blend shapes, along which this is the `slope` (207,)."""
+    x, y, z, at, total = T[0, c], T[1, c], T[2, c], 9 * q - 9, 0.0
+    for i in range(3):
+        total += slope[at + 3 * i] * (L[i, 1] * z - L[i, 2] * y)
+        total += slope[at + 3 * i + 1] * (L[i, 2] * x - L[i, 0] * z)
+        total += slope[at + 3 * i + 2] * (L[i, 0] * y - L[i, 1] * x)
+    return total
 
-    An arm is what of a point a bone turns: turning it about an axis a moves the point by a x arm.
-    """
-    blend = len(limbs.by_pose) > 0
+
+@part
+def _share(M, sigma_m, S):
+    """S = I - (I + sigma² M)^-1 of a symmetric M (3, 3), by its minors."""
+    v = sigma_m * sigma_m
+    a, b, c, d, e, f = v * M[0, 0] + 1, v * M[0, 1], v * M[0, 2], v * M[1, 1] + 1, v * M[1, 2], v * M[2, 2] + 1
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1 / (a * p + b * q + c * r)
+    S[0, 0], S[1, 1], S[2, 2] = 1 - scale * p, 1 - scale * (a * f - c * c), 1 - scale * (a * d - b * b)
+    S[0, 1] = S[1, 0] = -scale * q
+    S[0, 2] = S[2, 0] = -scale * r
+    S[1, 2] = S[2, 1] = -scale * (b * c - a * e)
+
+
+@part
+def _laid(limbs, betas, place, w):
+    """World rotations and axes from `local` and `tangent`, the terms of all points, and these; no forces."""
+    d, v, xyz = w.inside, w.term, w.xyz
     for q in range(24):
         if q == 0:
             for x in range(3):
@@ -60,77 +93,129 @@ def _put(limbs, betas, place, jacobian, w):
         else:
             _product(w.world[limbs.parent[q]], w.local[q], w.world[q])
         _product(w.world[q], w.tangent[q], w.axes[q])
-    for k in range(len(limbs.root)):
-        J, first, end, m = w.J[k], limbs.first[k], limbs.first[k + 1], len(betas)
         for x in range(3):
-            for n in range(10):
-                J[x, n] = limbs.root_by_shape[k, x, n]
-            for e in range(207 if blend else 0):
-                w.entry[x, e] = 0.0
-            for p in range(first, end):
-                w.arm[p, x] = 0.0
+            w.torque[q, x] = 0.0
+    for i in range(len(d)):
+        d[i] = limbs.offset[i]
+        w.force[i] = 0.0
+    for i in range(len(xyz)):
+        xyz[i], w.push[i] = limbs.root[i], 0.0
+    for n in range(10):
+        for i in range(len(d)):
+            d[i] += betas[n] * limbs.by_shape[n, i]
+        for i in range(len(xyz)):
+            xyz[i] += betas[n] * limbs.root_by_shape[n, i]
+    if len(limbs.by_pose) > 0:
+        for e in range(207):
+            w.entry[0, e] = w.local[1 + e // 9, e % 9 // 3, e % 3] - (1.0 if e % 9 % 4 == 0 else 0.0)
+        for i in range(len(d)):
+            for e in range(207):
+                d[i] += limbs.by_pose[i, e] * w.entry[0, e]
+    for k in range(len(limbs.share)):
+        x, y, z = limbs.share[k] * place[0], limbs.share[k] * place[1], limbs.share[k] * place[2]
+        for p in range(limbs.first[k], limbs.first[k + 1]):
+            R, i = w.world[limbs.bone[p]], 3 * p
+            v[i] = R[0, 0] * d[i] + R[0, 1] * d[i + 1] + R[0, 2] * d[i + 2]
+            v[i + 1] = R[1, 0] * d[i] + R[1, 1] * d[i + 1] + R[1, 2] * d[i + 2]
+            v[i + 2] = R[2, 0] * d[i] + R[2, 1] * d[i + 1] + R[2, 2] * d[i + 2]
+            x += v[i]
+            y += v[i + 1]
+            z += v[i + 2]
+        xyz[3 * k] += x
+        xyz[3 * k + 1] += y
+        xyz[3 * k + 2] += z
+
+
+@part
+def _pulled(limbs, k, f0, f1, f2, w):
+    """A force on point k, as torques and forces on its terms, and on the place."""
+    v, u, at = w.term, w.force, len(w.gradient) - 3
+    for p in range(limbs.first[k], limbs.first[k + 1]):
+        R, T, i = w.world[limbs.bone[p]], w.torque[limbs.bone[p]], 3 * p
+        T[0] += v[i + 1] * f2 - v[i + 2] * f1
+        T[1] += v[i + 2] * f0 - v[i] * f2
+        T[2] += v[i] * f1 - v[i + 1] * f0
+        u[i] = R[0, 0] * f0 + R[1, 0] * f1 + R[2, 0] * f2
+        u[i + 1] = R[0, 1] * f0 + R[1, 1] * f1 + R[2, 1] * f2
+        u[i + 2] = R[0, 2] * f0 + R[1, 2] * f1 + R[2, 2] * f2
+    w.push[3 * k], w.push[3 * k + 1], w.push[3 * k + 2] = f0, f1, f2
+    w.gradient[at] += limbs.share[k] * f0
+    w.gradient[at + 1] += limbs.share[k] * f1
+    w.gradient[at + 2] += limbs.share[k] * f2
+
+
+@part
+def _gathered(limbs, w):
+    """The gradient of betas and rotations, from the forces on all points."""
+    u, g = w.force, w.gradient
+    for n in range(10):
+        total = 0.0
+        for i in range(len(u)):
+            total += limbs.by_shape[n, i] * u[i]
+        for i in range(len(w.push)):
+            total += limbs.root_by_shape[n, i] * w.push[i]
+        g[n] += total
+    if len(limbs.by_pose) > 0:
+        for e in range(207):
+            w.entry[0, e] = 0.0
+        for i in range(len(u)):
+            for e in range(207):
+                w.entry[0, e] += limbs.by_pose[i, e] * u[i]
+    for q in range(23, -1, -1):
+        A, T, at = w.axes[q], w.torque[q], limbs.column[q]
+        for c in range(3 if at >= 0 else 0):
+            g[at + c] += A[0, c] * T[0] + A[1, c] * T[1] + A[2, c] * T[2]
+            if len(limbs.by_pose) > 0 and q > 0:
+                g[at + c] += _bent(w.entry[0], w.local[q], w.tangent[q], q, c)
+        for x in range(3 if q > 0 else 0):
+            w.torque[limbs.parent[q], x] += T[x]
+
+
+@part
+def _slopes(limbs, w):
+    """The Jacobian of all points. An arm is what of a point a bone turns: turning it about an axis a moves the
+    point by a x arm. Arms take the place of the terms.
+    """
+    blend = len(limbs.by_pose) > 0
+    for k in range(len(limbs.share)):
+        J, first, end, m = w.J[k], limbs.first[k], limbs.first[k + 1], 10
+        for n in range(10):
+            w.column[k, n] = n
+            for x in range(3):
+                J[x, n] = limbs.root_by_shape[n, 3 * k + x]
+        for e in range(207 if blend else 0):
+            w.entry[0, e] = w.entry[1, e] = w.entry[2, e] = 0.0
         for p in range(end - 1, first - 1, -1):  # a bone's arm is whole when its parent takes it
-            R = w.world[limbs.bone[p]]
-            for y in range(3):
-                v = limbs.offset[p, y]
+            R, S = w.world[limbs.bone[p]], limbs.shape[p]
+            for x in range(3):
+                a, b, c = R[x, 0], R[x, 1], R[x, 2]
                 for n in range(10):
-                    v += betas[n] * limbs.by_shape[p, y, n]
+                    J[x, n] += a * S[0, n] + b * S[1, n] + c * S[2, n]
                 for e in range(207 if blend else 0):
-                    bent = w.local[1 + e // 9, e % 9 // 3, e % 3] - (1.0 if e % 9 % 4 == 0 else 0.0)
-                    v += limbs.by_pose[p, y, e] * bent
-                for x in range(3):
-                    w.arm[p, x] += R[x, y] * v
-                    for n in range(10 if jacobian else 0):
-                        J[x, n] += R[x, y] * limbs.by_shape[p, y, n]
-                    for e in range(207 if blend and jacobian else 0):
-                        w.entry[x, e] += R[x, y] * limbs.by_pose[p, y, e]
-            if p > first:
-                for x in range(3):
-                    w.arm[limbs.before[p], x] += w.arm[p, x]
+                    B = limbs.by_pose
+                    w.entry[x, e] += a * B[3 * p, e] + b * B[3 * p + 1, e] + c * B[3 * p + 2, e]
+                if p > first:
+                    w.term[3 * limbs.before[p] + x] += w.term[3 * p + x]
         for p in range(first, end):
-            q, arm = limbs.bone[p], w.arm[p]
-            A = w.axes[q]
-            for c in range(3 if jacobian and limbs.column[q] >= 0 else 0):
-                w.column[k, m] = limbs.column[q] + c
-                J[0, m] = A[1, c] * arm[2] - A[2, c] * arm[1]
-                J[1, m] = A[2, c] * arm[0] - A[0, c] * arm[2]
-                J[2, m] = A[0, c] * arm[1] - A[1, c] * arm[0]
-                if blend and q > 0:
-                    _bend(J, m, w.entry, w.local[q], w.tangent[q], q, c)
+            q = limbs.bone[p]
+            A, a, b, c = w.axes[q], w.term[3 * p], w.term[3 * p + 1], w.term[3 * p + 2]
+            for x in range(3 if limbs.column[q] >= 0 else 0):
+                w.column[k, m] = limbs.column[q] + x
+                J[0, m] = A[1, x] * c - A[2, x] * b
+                J[1, m] = A[2, x] * a - A[0, x] * c
+                J[2, m] = A[0, x] * b - A[1, x] * a
+                for y in range(3 if blend and q > 0 else 0):
+                    J[y, m] += _bent(w.entry[y], w.local[q], w.tangent[q], q, x)
                 m += 1
         for x in range(3):
-            w.xyz[k, x] = limbs.root[k, x] + limbs.share[k] * place[x] + w.arm[first, x]
-            for n in range(10):
-                w.xyz[k, x] += betas[n] * limbs.root_by_shape[k, x, n]
             for y in range(3):
                 J[y, m + x] = limbs.share[k] if x == y else 0.0
             w.column[k, m + x] = len(w.gradient) - 3 + x
-        for n in range(10):
-            w.column[k, n] = n
         w.count[k] = m + 3
 
 
 @part
-def _bend(J, m, entry, L, T, q, c):
-    """What turning joint q about its axis c does through the pose blend shapes, of slopes `entry` (3, 207)."""
-    x, y, z = T[0, c], T[1, c], T[2, c]
-    for i in range(3):
-        turned = (L[i, 1] * z - L[i, 2] * y, L[i, 2] * x - L[i, 0] * z, L[i, 0] * y - L[i, 1] * x)
-        for j in range(3):
-            for a in range(3):
-                J[a, m] += entry[a, 9 * q - 9 + 3 * i + j] * turned[j]
-
-
-@part
-def _pull(w, k, f0, f1, f2):
-    """The gradient of a force on a point: its Jacobian, transposed, times it."""
-    J, column = w.J[k], w.column[k]
-    for i in range(w.count[k]):
-        w.gradient[column[i]] += f0 * J[0, i] + f1 * J[1, i] + f2 * J[2, i]
-
-
-@part
-def _slope(limbs, priors, free, rows, b, scale, w):
+def _energy(limbs, priors, free, rows, b, scale, w):
     """The energy of row b, and half its gradient."""
     A, g, c2, energy = len(priors.mean), w.gradient, scale * scale, 0.0
     pose = w.entry[0]
@@ -146,19 +231,23 @@ def _slope(limbs, priors, free, rows, b, scale, w):
         _rotation(pose[0], pose[1], pose[2], w.local[q], w.tangent[q])
     for i in range(9):
         w.tangent[0, i // 3, i % 3] = 1.0 if i % 4 == 0 else 0.0
-    _put(limbs, free[:10], free[13 + A :], len(w.J) > 0, w)
+    _laid(limbs, free, free[13 + A :], w)
     for i in range(len(g)):
         g[i] = 0.0
+    for i in range(A):
+        pose[i] = free[13 + i] - rows.angles[b, i]
+    for i in range(A):
+        pull = 0.0
+        for j in range(A):
+            pull += priors.precision[i, j] * pose[j]
+        g[13 + i] = pull
+        energy += pull * pose[i]
     for n in range(10):
         away = free[n] - rows.betas[b, n]
         g[n] = rows.stiffness[b] * away
         energy += g[n] * away
-    for i in range(A):
-        for j in range(A):
-            g[13 + i] += priors.precision[i, j] * (free[13 + j] - rows.angles[b, j])
-        energy += g[13 + i] * (free[13 + i] - rows.angles[b, i])
-    for k in range(len(w.xyz)):
-        S, r0, r1, r2 = rows.root[b, k], w.xyz[k, 0], w.xyz[k, 1], w.xyz[k, 2]
+    for k in range(len(w.squared)):
+        S, r0, r1, r2 = rows.root[b, k], w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
         r0, r1, r2 = r0 - rows.xyz[b, k, 0], r1 - rows.xyz[b, k, 1], r2 - rows.xyz[b, k, 2]
         u0 = S[0, 0] * r0 + S[0, 1] * r1 + S[0, 2] * r2
         u1 = S[1, 0] * r0 + S[1, 1] * r1 + S[1, 2] * r2
@@ -170,93 +259,143 @@ def _slope(limbs, priors, free, rows, b, scale, w):
         if w.squared[k] != 0.0:
             f0 = v * (S[0, 0] * u0 + S[0, 1] * u1 + S[0, 2] * u2)
             f1 = v * (S[1, 0] * u0 + S[1, 1] * u1 + S[1, 2] * u2)
-            _pull(w, k, f0, f1, v * (S[2, 0] * u0 + S[2, 1] * u1 + S[2, 2] * u2))
+            _pulled(limbs, k, f0, f1, v * (S[2, 0] * u0 + S[2, 1] * u1 + S[2, 2] * u2), w)
+    _gathered(limbs, w)
     return energy
 
 
 @part
-def _normal(priors, rows, b, H, w):
-    """Half the Gauss-Newton Hessian where `_slope` was last, its lower triangle; below it the gradient and, where
-    there is room, the Jacobian and the unit vectors of the betas.
+def _normal(priors, rows, b, asked, H, w):
+    """Half the Gauss-Newton Hessian where `_energy` and `_slopes` were last, its lower triangle; below it the
+    gradient, the Jacobian of the points that are `asked` for, and the unit vectors of the betas.
     """
-    M, P, A, K = w.entry, len(w.gradient), len(priors.mean), len(w.xyz)
-    vectors = len(H) > P + 1
+    M, P, A, K, N = w.entry, len(w.gradient), len(priors.mean), len(w.squared), len(asked)
     for i in range(len(H)):
         for j in range(P):
             H[i, j] = 0.0
     for i in range(10):
         H[i, i] = rows.stiffness[b]
-        if vectors:
-            H[P + 1 + 3 * K + i, i] = 1.0
+        H[P + 1 + 3 * N + i, i] = 1.0
     for i in range(A):
         for j in range(i + 1):
             H[13 + i, 13 + j] = priors.precision[i, j]
     _copied(w.gradient, H[P])
+    for n in range(N):
+        J, column = w.J[asked[n]], w.column[asked[n]]
+        for i in range(w.count[asked[n]]):
+            for j in range(3):
+                H[P + 1 + 3 * n + j, column[i]] = J[j, i]
     for k in range(K):
-        S, J, column, m, at = rows.root[b, k], w.J[k], w.column[k], w.count[k], P + 1 + 3 * k
-        for x in range(3):
-            for y in range(3):
-                M[x, y] = w.weight[k] * (S[x, 0] * S[0, y] + S[x, 1] * S[1, y] + S[x, 2] * S[2, y])
-        seen = M[0, 0] + M[1, 1] + M[2, 2] > 0.0
-        for i in range(m):
-            for x in range(3 if vectors else 0):
-                H[at + x, column[i]] = J[x, i]
-            row = H[column[i]]
-            t0 = M[0, 0] * J[0, i] + M[0, 1] * J[1, i] + M[0, 2] * J[2, i]
-            t1 = M[1, 0] * J[0, i] + M[1, 1] * J[1, i] + M[1, 2] * J[2, i]
-            t2 = M[2, 0] * J[0, i] + M[2, 1] * J[1, i] + M[2, 2] * J[2, i]
-            for j in range(i + 1 if seen else 0):  # columns rise
-                row[column[j]] += t0 * J[0, j] + t1 * J[1, j] + t2 * J[2, j]
+        S, J, column, m = rows.root[b, k], w.J[k], w.column[k], w.count[k]
+        for i in range(3):
+            for j in range(3):
+                M[i, j] = w.weight[k] * (S[i, 0] * S[0, j] + S[i, 1] * S[1, j] + S[i, 2] * S[2, j])
+        for i in range(m if M[0, 0] + M[1, 1] + M[2, 2] > 0.0 else 0):
+            row, x, y, z = H[column[i]], J[0, i], J[1, i], J[2, i]
+            t0 = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z
+            t1 = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z
+            t2 = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z
+            for j in range(10):
+                row[j] += t0 * J[0, j] + t1 * J[1, j] + t2 * J[2, j]
+            for j in range(10, i + 1, 3):  # after the betas come threes, which rise
+                at = column[j]
+                row[at] += t0 * J[0, j] + t1 * J[1, j] + t2 * J[2, j]
+                row[at + 1] += t0 * J[0, j + 1] + t1 * J[1, j + 1] + t2 * J[2, j + 1]
+                row[at + 2] += t0 * J[0, j + 2] + t1 * J[1, j + 2] + t2 * J[2, j + 2]
 
 
 @kernel
-def linearised(limbs, priors, free, rows, scale, linear, w):
-    """The energy of B rows around `free` (B, P), the robust kernel of each having this `scale` (B,)."""
+def linearised(limbs, priors, free, rows, scale, asked, linear, w):
+    """The energy of B rows around `free` (B, P), the robust kernel of each having this `scale` (B,); systems are
+    for the points `asked` (B, N).
+    """
     for b in range(len(free)):
-        linear.energy[b] = _slope(limbs, priors, free[b], rows, b, scale[b], w)
+        linear.energy[b] = _energy(limbs, priors, free[b], rows, b, scale[b], w)
         _copied(w.squared, linear.squared[b])
         _copied(w.gradient, linear.gradient[b])
-        for k in range(len(w.xyz)):
-            _copied(w.xyz[k], linear.xyz[b, k])
+        for i in range(len(w.xyz)):
+            linear.xyz[b, i // 3, i % 3] = w.xyz[i]
         if len(linear.system) > 0:
-            _normal(priors, rows, b, linear.system[b], w)
+            _slopes(limbs, w)
+            _normal(priors, rows, b, asked[b], linear.system[b], w)
 
 
 @part
-def _write_jacobian(w, k, jacobian):
-    for x in range(3):
-        for i in range(jacobian.shape[1]):
-            jacobian[x, i] = 0.0
-        for i in range(w.count[k]):
-            jacobian[x, w.column[k, i]] = w.J[k, x, i]
+def _posed(limbs, local, betas, place, w):
+    """As `_laid`, from rotations (24, 3, 3), which turn in the tangents of the scratch arrays `w`."""
+    for q in range(24):
+        for x in range(3):
+            _copied(local[q, x], w.local[q, x])
+    _laid(limbs, betas, place, w)
 
 
 @kernel
-def placed(limbs, local, betas, place, target, information, scale, xyz, gradient, jacobian, w):
-    """Points `xyz` (B, K, 3) of bodies with rotations `local` (B, 24, 3, 3), and half the `gradient` (B, P) of the
-    robust energy of targets (B, K, 3), of which there may be none; `jacobian` (B, K, 3, P) or (0, K, 3, P).
-
-    Rotations turn in the tangents of the scratch arrays `w`.
+def placed(limbs, local, betas, place, xyz, jacobian, w):
+    """Points `xyz` (B, K, 3) of bodies with rotations `local` (B, 24, 3, 3), and their `jacobian` (B, K, 3, P) or
+    (0, K, 3, P).
     """
-    f, r = w.entry[0], w.entry[1]
     for b in range(len(xyz)):
-        for q in range(24):
+        _posed(limbs, local[b], betas[b], place[b], w)
+        for i in range(len(w.xyz)):
+            xyz[b, i // 3, i % 3] = w.xyz[i]
+        if len(jacobian) > 0:
+            _slopes(limbs, w)
+            for k in range(len(limbs.share)):
+                for x in range(3):
+                    for i in range(jacobian.shape[3]):
+                        jacobian[b, k, x, i] = 0.0
+                    for i in range(w.count[k]):
+                        jacobian[b, k, x, w.column[k, i]] = w.J[k, x, i]
+
+
+@kernel
+def seen(limbs, own, betas, local, place, target, information, kernel_scale, steepness, inputs, w):
+    """Fill the network's `inputs` (B, 574) with what is seen of B bodies, `betas` (B, 10), `local` (B, 24, 3, 3)
+    rotations and `place` (B, 3), with targets (B, N, 3) of this `information` (B, N, 3, 3). Slopes, of the robust
+    energy of the targets, are multiplied by `steepness` (79,). Who has which target, and how far the body's `own`
+    points are from the detector's, say `Own`.
+    """
+    S, K, g = w.entry, len(limbs.share), w.gradient
+    for b in range(len(betas)):
+        row = inputs[b]
+        _posed(limbs, local[b], betas[b], place[b], w)
+        for i in range(len(g)):
+            g[i] = 0.0
+        for k in range(K):
+            t, at, R, o, x = own.target[k], 7 * k, w.world[own.bone[k]], own.offset[k], w.xyz[3 * k : 3 * k + 3]
+            for y in range(3):
+                row[at + y] = x[y] - R[y, 0] * o[0] - R[y, 1] * o[1] - R[y, 2] * o[2]
+                row[at + 3 + y] = 0.0
+            row[at + 6] = 0.0
+            if t >= 0:
+                M = information[b, t]
+                a0, a1, a2 = target[b, t, 0] - x[0], target[b, t, 1] - x[1], target[b, t, 2] - x[2]
+                _share(M, TRUST_M, S)
+                row[at + 6] = (S[0, 0] + S[1, 1] + S[2, 2]) / 3
+                _share(M, REACH_M, S)
+                s0 = S[0, 0] * a0 + S[0, 1] * a1 + S[0, 2] * a2
+                s1 = S[1, 0] * a0 + S[1, 1] * a1 + S[1, 2] * a2
+                s2 = S[2, 0] * a0 + S[2, 1] * a1 + S[2, 2] * a2
+                near = 1 / (1 + math.sqrt(s0 * s0 + s1 * s1 + s2 * s2) / FAR_M)
+                row[at] += near * s0
+                row[at + 1] += near * s1
+                row[at + 2] += near * s2
+                row[at + 3], row[at + 4], row[at + 5] = 5 * near * s0, 5 * near * s1, 5 * near * s2
+                f0 = M[0, 0] * a0 + M[0, 1] * a1 + M[0, 2] * a2
+                f1 = M[1, 0] * a0 + M[1, 1] * a1 + M[1, 2] * a2
+                f2 = M[2, 0] * a0 + M[2, 1] * a1 + M[2, 2] * a2
+                squared = a0 * f0 + a1 * f1 + a2 * f2
+                v = kernel_scale * kernel_scale / (kernel_scale * kernel_scale + squared)
+                if squared != 0.0:
+                    _pulled(limbs, k, v * v * f0, v * v * f1, v * v * f2, w)
+        _gathered(limbs, w)
+        at = 7 * K
+        for n in range(10):
+            row[at + n] = betas[b, n] / 3
+        for q in range(22):
             for x in range(3):
-                _copied(local[b, q, x], w.local[q, x])
-        _put(limbs, betas[b], place[b], len(jacobian) > 0 or len(target) > 0, w)
-        for i in range(len(w.gradient)):
-            w.gradient[i] = 0.0
-        for k in range(len(w.xyz)):
-            _copied(w.xyz[k], xyz[b, k])
-            if len(jacobian) > 0:
-                _write_jacobian(w, k, jacobian[b, k])
-            if len(target) > 0:
-                M, squared = information[b, k], 0.0
-                for x in range(3):
-                    r[x] = w.xyz[k, x] - target[b, k, x]
-                for x in range(3):
-                    f[x] = M[x, 0] * r[0] + M[x, 1] * r[1] + M[x, 2] * r[2]
-                    squared += f[x] * r[x]
-                v = (scale * scale / (scale * scale + squared)) ** 2
-                _pull(w, k, v * f[0], v * f[1], v * f[2])
-        _copied(w.gradient, gradient[b])
+                row[at + 10 + 6 * q + x], row[at + 13 + 6 * q + x] = local[b, q, x, 0], local[b, q, x, 1]
+        for x in range(3):
+            row[at + 142 + x] = place[b, x]
+        for i in range(79):  # all but the hands', towards the targets
+            row[at + 145 + i] = min(max(g[i if i < 76 else i + 6] * steepness[i], -STEEP), STEEP)

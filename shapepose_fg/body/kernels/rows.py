@@ -17,21 +17,34 @@ class Limbs(NamedTuple):
     before: Index
     """(L,) the term of the bone's parent; -1 for the root's."""
     offset: Array
-    """(L, 3) in the frame of the bone, metres."""
+    """(3 L,) in the frame of the bone, metres."""
     by_shape: Array
-    """(L, 3, 10) metres per unit of each beta."""
+    """(10, 3 L) metres per unit of each beta."""
+    shape: Array
+    """(L, 3, 10) the same in another order."""
     by_pose: Array
-    """(L, 3, 207) metres per unit of each entry of R - I; (0, 3, 207) without pose blend shapes."""
+    """(3 L, 207) metres per unit of each entry of R - I; (0, 207) without pose blend shapes."""
     root: Array
-    """(K, 3) what does not turn, metres."""
+    """(3 K,) what does not turn, metres."""
     root_by_shape: Array
-    """(K, 3, 10) metres per unit of each beta."""
+    """(10, 3 K) metres per unit of each beta."""
     share: Array
     """(K,) how much of the translation a point takes."""
     parent: Index
     """(24,) of each bone."""
     column: Index
     """(24,) where the unknowns of each rotation begin; -1 where it is none."""
+
+
+class Own(NamedTuple):
+    """How K points, which a detector sees, belong to the body and to targets."""
+
+    target: Index
+    """(K,) which target is of the point; -1: none."""
+    offset: Array
+    """(K, 3) how far the detector's point is from the body's, metres."""
+    bone: Index
+    """(K,) in the frame of which bone."""
 
 
 class Priors(NamedTuple):
@@ -76,8 +89,8 @@ class Linear(NamedTuple):
     gradient: Array
     """(B, P) half the gradient."""
     system: Array
-    """(B, P + 1 + 3 K + 10, P): the lower triangle of half the Gauss-Newton Hessian, robust weights included;
-    below it the gradient, the Jacobian of the keypoints, and the unit vectors of the betas. (0, ...) where only
+    """(B, P + 1 + 3 N + 10, P): the lower triangle of half the Gauss-Newton Hessian, robust weights included;
+    below it the gradient, the Jacobian of some keypoints, and the unit vectors of the betas. (0, ...) where only
     the slope is asked for."""
 
     @property
@@ -88,7 +101,7 @@ class Linear(NamedTuple):
 
     @property
     def jacobian(self) -> Array:
-        """(B, 3 K, P) of the keypoints."""
+        """(B, 3 N, P) of these keypoints."""
         return self.system[:, self.system.shape[2] + 1 : -10]
 
 
@@ -103,12 +116,20 @@ class Work(NamedTuple):
     """(24, 3, 3) world from bone."""
     axes: Array
     """(24, 3, 3) about which the bones turn, in the world."""
-    arm: Array
-    """(L, 3) what of a point a bone turns: about an axis a, the point moves by a x arm."""
+    inside: Array
+    """(3 L,) the terms in the frames of their bones, metres."""
+    term: Array
+    """(3 L,) and in the world."""
+    force: Array
+    """(3 L,) on them, in the frames of the bones."""
+    torque: Array
+    """(24, 3) on the bones, in the world."""
     entry: Array
     """(3, 207) anything."""
     xyz: Array
-    """(K, 3) points."""
+    """(3 K,) points."""
+    push: Array
+    """(3 K,) forces on them."""
     J: Array
     """(K, 3, 85) Jacobian of each point, its first `count` columns."""
     column: Index
@@ -125,9 +146,10 @@ class Work(NamedTuple):
     @classmethod
     def of(cls, limbs: Limbs, unknowns: int) -> "Work":
         """For the rows of a body; as it is made, rotations turn in their own right tangents."""
-        K, L = len(limbs.root), len(limbs.bone)
+        K, L = len(limbs.share), len(limbs.bone)
         eye = np.tile(np.eye(3), (24, 1, 1))
         rotations = (eye.copy(), eye.copy(), eye.copy(), eye.copy())
-        points = (np.zeros((L, 3)), np.zeros((3, 207)), np.zeros((K, 3)), np.zeros((K, 3, 85)))
+        terms = (np.zeros(3 * L), np.zeros(3 * L), np.zeros(3 * L), np.zeros((24, 3)))
+        points = (np.zeros((3, 207)), np.zeros(3 * K), np.zeros(3 * K), np.zeros((K, 3, 85)))
         columns = (np.zeros((K, 85), dtype=np.intp), np.zeros(K, dtype=np.intp))
-        return cls(*rotations, *points, *columns, np.zeros(K), np.zeros(K), np.zeros(unknowns))
+        return cls(*rotations, *terms, *points, *columns, np.zeros(K), np.zeros(K), np.zeros(unknowns))

@@ -1,6 +1,6 @@
-"""Normal equations of bodies, row by row, compiled: steps, covariances, and the same with targets left out.
+"""Normal equations of bodies, row by row, compiled: steps, covariances, and chains of rows.
 
-A system (P + 1 + 3 K + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
+A system (P + 1 + 3 N + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
 Hessian H, below it vectors. It is reduced in place to the factor L, H = L Lᵀ, and L^-1 of the vectors. Everything
 is scalar products of rows.
 """
@@ -116,7 +116,7 @@ def _with_sag(C, at):
 
 @kernel
 def known(system, covariance, shape):
-    """From B systems with reduced Hessians: the `covariance` (B, K, 3, 3) of the joints (Laplace), m², as
+    """From B systems with reduced Hessians: the `covariance` (B, N, 3, 3) of their joints (Laplace), m², as
     `_with_sag` has it, and that of the betas, `shape` (B, 10, 10). The rest of the systems is reduced.
     """
     for b in range(len(system)):
@@ -127,77 +127,6 @@ def known(system, covariance, shape):
             _products(H, P + 1 + 3 * k, len(C), P, C)
             _with_sag(C, len(C) - 3)
         _products(H, P + 1 + 3 * K, shape.shape[1], P, shape[b])
-
-
-@kernel
-def lessened(system, row, without, root, Y, B, C, good):
-    """Prepare the fits of N pairs, a `row` (N,) and targets `without` (N, M) that are left out of it, -1 for none.
-
-    With Y = J L^-T of the Jacobian of these and R the square `root` (N, M, 3, 3) of their information, the Hessian
-    without them is L (I - Yᵀ Rᵀ R Y) Lᵀ, and its inverse is known by the factor of I - R Y Yᵀ Rᵀ (Woodbury).
-    Written are `Y` (N, 6 M + 10, P), R Y, Y and L^-1 of the betas; `B` (N, 6 M + 11, 3 M), that factor, a place
-    for right-hand sides, and products of Y; `C` (N, 3 M + 10, 3 M + 10), the covariance of the joints, as
-    `_with_sag` has it, and of the betas without them; whether it is positive definite, `good` (N,).
-    """
-    P, m = system.shape[2], B.shape[2]
-    for n in range(len(row)):
-        H, Z, D, G, count = system[row[n]], Y[n], B[n], C[n], 2 * m + 10
-        for i in range(m // 3):
-            S, at = root[n, i], P + 1 + 3 * max(without[n, i], 0)
-            for x in range(3):
-                for p in range(P):
-                    Z[3 * i + x, p] = S[x, 0] * H[at, p] + S[x, 1] * H[at + 1, p] + S[x, 2] * H[at + 2, p]
-                    Z[m + 3 * i + x, p] = H[at + x, p]
-        for i in range(10):
-            for p in range(P):
-                Z[2 * m + i, p] = H[len(H) - 10 + i, p]
-        for i in range(count):
-            for j in range(i + 1):
-                total = 0.0
-                for p in range(P):
-                    total += Z[i, p] * Z[j, p]
-                if i < m:
-                    D[i, j] = (1.0 if i == j else 0.0) - total
-                elif j < m:
-                    D[i + 1, j] = total
-                else:
-                    G[i - m, j - m] = G[j - m, i - m] = total
-        good[n] = _reduced(D, m, _FIRST, m)
-        if good[n]:
-            _reduced(D, m, m + 1, count + 1)
-            for i in range(m + 10):
-                for j in range(m + 10):
-                    for p in range(m):
-                        G[i, j] += D[m + 1 + i, p] * D[m + 1 + j, p]
-            for i in range(0, m, 3):
-                _with_sag(G, i)
-
-
-@kernel
-def stepped(system, row, pair, Y, B, gradient, step, move):
-    """The Gauss-Newton `step` (N, P) of `pair`s (N,) among those that `lessened` prepared, where half the
-    gradient is `gradient` (N, P), and by how much the joints that are left out would `move` (N, 3 M), metres.
-    """
-    P, m = gradient.shape[1], B.shape[2]
-    for n in range(len(row)):
-        H, Z, D, s, moved = system[row[n]], Y[pair[n]], B[pair[n]], step[pair[n]], move[pair[n]]
-        for p in range(P):
-            H[P, p] = gradient[n, p]
-        _reduced(H, P, P, P + 1)
-        for i in range(m):
-            D[m, i] = 0.0
-            for p in range(P):
-                D[m, i] += Z[i, p] * H[P, p]
-        _reduced(D, m, m, m + 1)
-        _back(D, m, m, s)
-        for i in range(m):
-            for p in range(P):
-                H[P, p] -= Z[i, p] * s[i]
-        _back(H, P, P, s)
-        for i in range(m):
-            moved[i] = 0.0
-            for p in range(P):
-                moved[i] -= Z[m + i, p] * H[P, p]
 
 
 @kernel

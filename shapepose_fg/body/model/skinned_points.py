@@ -89,12 +89,13 @@ class SkinnedPoints:
         term = np.full(rides.shape, -1)
         term[point, bone] = np.arange(len(bone))
         parents = np.array(SMPL_PARENTS, dtype=np.intp)
+        shape = self.offsets_shape[:, point, :, bone].transpose(0, 2, 1)
         pose = np.zeros((0, 207, 3)) if self.offsets_pose is None else self.offsets_pose[:, point, :, bone]
         parts = (
             np.append(0, np.cumsum(rides.sum(1))), bone, np.where(bone > 0, term[point, parents[bone]], -1),
-            self.offsets[point, :, bone], self.offsets_shape[:, point, :, bone].transpose(0, 2, 1),
-            pose.transpose(0, 2, 1), self.root, self.root_shape.transpose(1, 2, 0), self.translation, parents,
-            column,
+            self.offsets[point, :, bone].ravel(), shape.reshape(-1, 10).T, shape,
+            pose.transpose(0, 2, 1).reshape(-1, 207), self.root.ravel(), self.root_shape.reshape(10, -1),
+            self.translation, parents, column,
         )  # fmt: skip
         return Limbs(*map(_contiguous, parts))
 
@@ -116,33 +117,11 @@ class SkinnedPoints:
         return self._placed(local, betas, transl, jacobian=True)
 
     def _placed(self, local: Array, betas: Array, transl: Array, *, jacobian: bool) -> tuple[Array, Array]:
-        xyz, slopes, _ = self.pulled(
-            local, betas, transl, np.zeros((0, 0, 3)), np.zeros((0, 0, 3, 3)), 1.0, jacobian=jacobian
-        )
-        return xyz, slopes
-
-    def pulled(
-        self,
-        local: Array,
-        betas: Array,
-        transl: Array,
-        target: Array,
-        information: Array,
-        kernel_scale: float,
-        *,
-        jacobian: bool = False,
-    ) -> tuple[Array, Array, Array]:
-        """Positions, Jacobian (0 rows where it is not asked for), and half the gradient (B, 85) of the robust
-        energy of targets (B, K, 3) with `information` (B, K, 3, 3).
-        """
         B, K = len(betas), len(self.root)
-        given = (np.require(part, float, ["C", "W"]) for part in (local, betas, transl, target, information))
-        local, betas, transl, target, information = given
-        xyz, gradient = np.zeros((B, K, 3)), np.zeros((B, NUM_COLUMNS))
-        slopes = np.zeros((B if jacobian else 0, K, 3, NUM_COLUMNS))
-        work = Work.of(self._limbs, NUM_COLUMNS)
-        placed(self._limbs, local, betas, transl, target, information, kernel_scale, xyz, gradient, slopes, work)
-        return xyz, slopes, gradient
+        given = (np.require(part, float, ["C", "W"]) for part in (local, betas, transl))
+        xyz, slopes = np.zeros((B, K, 3)), np.zeros((B if jacobian else 0, K, 3, NUM_COLUMNS))
+        placed(self._limbs, *given, xyz, slopes, Work.of(self._limbs, NUM_COLUMNS))
+        return xyz, slopes
 
 
 def _contiguous(part: Any) -> Any:

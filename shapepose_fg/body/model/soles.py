@@ -1,9 +1,9 @@
 """Bodies on a floor: the lowest point of each foot, and how what sinks gets out of it."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.skeleton import SMPL_24
 
@@ -45,9 +45,9 @@ def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float
     before (29.6, 29.4, 16.1 mm: 29.6, 29.3, 16.1), and nearer where the detector sees no feet (38.3: 37.1).
     """
     betas, orient, pose, transl = bodies
-    turned = Rotation.from_rotvec(_bends(model, bodies, normal, height_m).reshape(-1, 3))
+    turned = exp_so3(_bends(model, bodies, normal, height_m))
     pose, ankles = pose.copy(), np.array(_ANKLES) - 1
-    pose[:, ankles] = (turned * Rotation.from_rotvec(pose[:, ankles].reshape(-1, 3))).as_rotvec().reshape(-1, 2, 3)
+    pose[:, ankles] = log_so3(turned @ exp_so3(pose[:, ankles]))
     sunk = np.maximum(height_m - SINK_M - _lowest(model, (betas, orient, pose, transl), normal), 0.0)
     return betas, orient, pose, transl + sunk[:, None] * normal
 

@@ -46,6 +46,7 @@ class Request(DetectionOptions):
     body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
     fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
     timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
+    readout: float | None = option(TIME, "Seconds that rolling shutters take from first to last row.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
     temporal: bool | None = option(TIME, "People over time, or frame by frame.", None, "--temporal/--no-temporal")
@@ -53,6 +54,19 @@ class Request(DetectionOptions):
     chunk_frames: int | None = option(RUN, "Follow people side by side, too, in chunks of about so many frames.")
     report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report")
     check: bool = option(RESULT, "Whether cameras and detections fit.", True, "--check/--no-check")
+
+    def rig(self) -> "Rig":
+        """The cameras, rolling shutters as `readout` says where the calibration says nothing of them."""
+        from shapepose_fg.core.camera import LONGEST_READOUT_S
+
+        found = super().rig()
+        if self.readout is None:
+            return found
+        if not 0 <= self.readout <= LONGEST_READOUT_S:
+            most = f"0 to {LONGEST_READOUT_S:g} seconds, such as 0.02"
+            raise InputError(f"--readout {self.readout:g}: must be {most}")
+        cameras = (replace(each, readout_s=each.readout_s or self.readout) for each in found.cameras)
+        return replace(found, cameras=tuple(cameras))
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.export.markers import write_pose2sim_files
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
@@ -235,6 +234,8 @@ class _Run:
         else:  # that of an earlier result would say what is no longer true
             (output / REPORT).unlink(missing_ok=True)
         if project is not None:
+            from shapepose_fg.io.export.markers import write_pose2sim_files  # with SciPy: a fifth of a second
+
             whole = people if len(people) == len(result) else result.reconstruction()
             made = write_pose2sim_files(whole, self.task.rig.up, project)
             written += map(str, made.files)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,6 +47,7 @@ def write_rig(rig: Rig, path: str | Path) -> None:
             "distortion": camera.distortion.tolist(),
             "wTc": camera.wTc.tolist(),
         }
+        | ({"readout_s": camera.readout_s} if camera.readout_s > 0 else {})
         for camera in rig.cameras
     ]
     content = {"format": RIG_FORMAT, "unit": "m", "up": rig.up, "cameras": cameras}
@@ -63,6 +65,7 @@ class _Camera(BaseModel):
     distortion: Any = None
     wTc: Any = None
     cTw: Any = None
+    readout_s: float = 0.0
 
 
 class _Rig(BaseModel):
@@ -96,7 +99,8 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
         if (camera.wTc is None) == (camera.cTw is None):
             raise InputError(f"{node.place}: give exactly one of wTc and cTw; {_CURES['wTc']}")
         wTc = node.pose_of_rows("cTw") if camera.wTc is None else node.pose_of_matrix("wTc")
-        cameras.append(node.camera(camera.name, "K", wTc, ["image_size"], "distortion", camera.lens))
+        one = node.camera(camera.name, "K", wTc, ["image_size"], "distortion", camera.lens)
+        cameras.append(replace(one, readout_s=camera.readout_s))
     return WrittenRig(cameras, rig.unit, rig.up, cures)
 
 

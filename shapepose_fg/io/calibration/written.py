@@ -43,6 +43,8 @@ class WrittenCamera:
     """In OpenCV's order; coefficients at the end may be left out."""
     lens: Lens = "perspective"
     """Which lens the coefficients belong to."""
+    readout_s: float = 0.0
+    """How long its shutter takes from the first row of a picture to the last, seconds."""
 
     def finished(self, metres: float, image_size: tuple[int, int] | None, path: Path) -> Camera:
         """The camera in metres; InputError where its numbers are those of no camera."""
@@ -50,7 +52,8 @@ class WrittenCamera:
         wTc[:3, 3] *= metres
         size = self.image_size or image_size or (0, 0)
         with naming(path, "correct it in the file"):
-            return Camera(self.name, self.K, wTc, size, padded_distortion(self.distortion, self.lens), self.lens)
+            bend = padded_distortion(self.distortion, self.lens)
+            return Camera(self.name, self.K, wTc, size, bend, self.lens, self.readout_s)
 
 
 @dataclass(frozen=True)

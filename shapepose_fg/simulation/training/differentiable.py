@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from shapepose_fg.body.fitting.descent import STEP, BodyState, Sight, believed
+from shapepose_fg.body.fitting.descent import STEP, BodyState, Sight
 from shapepose_fg.body.fitting.network import (
     NUM_PARAMETERS,
     NUM_ROTATIONS,
@@ -95,10 +95,10 @@ class State:
 def unroll(see: Sight, network: TrainedNetwork, state: State, targets: DescentTargets) -> Iterator[State]:
     """The states after each update of bodies that `see` their targets. Each starts from the last one detached."""
     xyz, information = (value.double().numpy() for value in (targets.xyz, targets.information))
-    trusted, scale = believed(information), network.gradient_scale.cpu().numpy()
+    scale = network.gradient_scale.cpu().numpy()
     for step in range(network.config.steps):
         plain = BodyState(*(value.detach().double().numpy() for value in vars(state).values()))
-        change = STEP * network(torch.from_numpy(see(plain, xyz, information, trusted, scale)), step)
+        change = STEP * network(torch.from_numpy(see(plain, xyz, information, scale)), step)
         turned = _six_d(state.local[:, :NUM_ROTATIONS]) + change[:, 10:-3].unflatten(1, (NUM_ROTATIONS, 6))
         local = torch.cat((_from_six_d(turned), state.local[:, NUM_ROTATIONS:]), 1)
         state = State(state.betas + 10 * change[:, :10], local, state.transl + change[:, -3:])

@@ -1,0 +1,223 @@
+"""The solver: poses and lenses of all cameras, and joints of the people they see, in one factor graph (GTSAM).
+
+A joint seen by a camera is `GeneralSFMFactor2` between pose, joint and lens, with a robust kernel; what is known
+of each camera beforehand is a prior on its pose and its lens.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import C, L, X
+
+from factors.noise import diagonal, gaussian, isotropic_models, robust_kernel
+from shapepose_fg.calibration.people import People
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Camera, Rig
+
+TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
+"""Where a camera's parameters stand: rad and m along its own axes, log of the focal length, px, k1 k2 p1 p2."""
+Q = 13
+_HELD = 1e-6
+"""Sigma of what must not change, as a part of what it would be."""
+_HELD_PX = 0.1
+"""The same of what lenses hold, pixels; tighter constraints of single numbers would damp what they share."""
+_STEPS = 6
+_ENOUGH = 1e-4
+_PRIOR_WIDTH = 4.0
+"""Sigmas, of six numbers, at which a camera's prior gives way: one that was bumped must not pull the rig."""
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """How far each camera may be from what its file says, one sigma; 0 is not at all."""
+
+    turn_deg: float = 1.0
+    """Any turn, degrees."""
+    move_m: float = 0.02
+    """Any way, metres."""
+    focal: float = 0.0
+    """Part of the focal length."""
+    centre_px: float = 0.0
+    """Principal point, each axis, pixels."""
+    lens: float = 0.0
+    """Each of k1 k2 p1 p2."""
+
+    @property
+    def sigmas(self) -> Array:
+        """(Q,) of each parameter of a camera, one sigma."""
+        turn, move = np.radians(self.turn_deg) / np.sqrt(3), self.move_m / np.sqrt(3)
+        return np.array([turn] * 3 + [move] * 3 + [self.focal] + [self.centre_px] * 2 + [self.lens] * 4)
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Cameras that fit the people, and how well they are known."""
+
+    rig: Rig
+    """The cameras."""
+    covariance: Array
+    """(V, Q, V, Q) of their parameters as against the rig as a whole: where that stands is the given rig's."""
+    people: People
+    """Their joints moved to where the cameras see them."""
+    scale: float
+    """The detector's errors as a part of what was measured of detectors: robust, from the residuals."""
+
+    def sigma(self, part: slice) -> Array:
+        """(V,) of a part of the parameters, root of the summed variances."""
+        variance = np.einsum("vqvq->vq", self.covariance)[:, part]
+        return np.sqrt(np.maximum(variance, 0.0).sum(axis=1))
+
+
+def adjust(
+    given: Rig,
+    start: Rig,
+    people: People,
+    freedom: Freedom,
+    dilution: float,
+    scale: float = 1.0,
+    reference: int | None = None,
+) -> Adjusted:
+    """The cameras from `start` on, `given` beforehand to within `freedom`, adjusted to `people`.
+
+    The camera `reference` keeps its pose; without one the rig stays where it is as a whole.
+
+    `dilution` is how many of the errors of a detection, of joints and of frames, are one error: the priors are
+    weighed up by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies
+    the detections' sigmas.
+    """
+    free = freedom.lens > 0
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    person, joint, view = np.nonzero(people.seen)
+    points = people.points[person, joint]
+    key = np.unique(person * people.points.shape[1] + joint, return_inverse=True)[1]
+    xy = people.xy[person, joint, view]
+    models = isotropic_models(2, scale * people.sigma_px[person, joint, view], robust_kernel("cauchy"))
+    factor = gtsam.GeneralSFMFactor2Cal3DS2 if free else gtsam.GeneralSFMFactor2Cal3_S2
+    joints = [L(each) for each in key.tolist()]
+    poses, lenses = ([letter(each) for each in view.tolist()] for letter in (X, C))
+    for each in map(factor, xy, models, poses, joints, lenses):
+        graph.push_back(each)
+    first = np.unique(key, return_index=True)[1]
+    for place in first.tolist():
+        values.insert(joints[place], points[place])
+    weight = np.sqrt(dilution)
+    priors, kernel = gtsam.NonlinearFactorGraph(), robust_kernel("cauchy", _PRIOR_WIDTH * weight)
+    for each, (camera, before) in enumerate(zip(start.cameras, given.cameras, strict=True)):
+        values.insert(X(each), gtsam.Pose3(camera.wTc))
+        values.insert(C(each), _lens(camera, free))
+        sigmas = freedom.sigmas / weight
+        pose = diagonal(np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel)
+        priors.addPriorPose3(X(each), gtsam.Pose3(before.wTc), pose)
+        noise = gaussian(_lens_covariance(before, sigmas, free))
+        add = priors.addPriorCal3DS2 if free else priors.addPriorCal3_S2
+        add(C(each), _lens(before, free), noise)
+    last = [letter(each) for letter in (X, C) for each in range(len(start))]
+    order = gtsam.Ordering()
+    for each in [*dict.fromkeys(joints), *last]:
+        order.push_back(each)
+    # Ceres's way damps each parameter by its own information: pixels and metres stand side by side.
+    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    params.setMaxIterations(_STEPS)
+    params.setRelativeErrorTol(_ENOUGH)
+    params.setOrdering(order)
+    both = gtsam.NonlinearFactorGraph(graph)
+    both.push_back(priors)
+    found = gtsam.LevenbergMarquardtOptimizer(both, values, params).optimize()
+    rig = replace(start, cameras=tuple(_camera(start.cameras[v], found, v, free) for v in range(len(start))))
+    moved = np.full_like(people.points, np.nan)
+    moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
+    placed = replace(people, points=moved)
+    information = _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
+    covariance = _covariance(information, rig, freedom.sigmas, reference)
+    return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))
+
+
+def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
+    """How large residuals are as against what sigmas (times `scale`) say, by their median: 1 as they should."""
+    views = people.seen.sum(axis=-1, keepdims=True)
+    seen, _ = rig.project(people.points)
+    away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
+    # A joint of n views takes 3 of 2 n numbers for itself.
+    left = np.sqrt(np.maximum(1 - 1.5 / np.maximum(views, 2), 0.25))
+    return float(np.median((away / left)[people.seen]) / np.sqrt(2 * np.log(2)))
+
+
+def _lens(camera: Camera, free: bool) -> gtsam.Cal3DS2 | gtsam.Cal3_S2:
+    K, d = camera.K, camera.distortion
+    five = (K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2])
+    return gtsam.Cal3DS2(*five, *d[:4]) if free else gtsam.Cal3_S2(*five)
+
+
+def _lens_columns(camera: Camera, free: bool) -> Array:
+    """(5 or 9, Q - 6) how fx fy s u v k1 k2 p1 p2 change with the parameters."""
+    columns = np.zeros((9 if free else 5, Q - 6))
+    columns[0, 0], columns[1, 0] = camera.K[0, 0], camera.K[1, 1]
+    columns[3, 1] = columns[4, 2] = 1.0
+    if free:
+        columns[5:, 3:] = np.eye(4)
+    return columns
+
+
+def _lens_covariance(camera: Camera, sigmas: Array, free: bool) -> Array:
+    columns = _lens_columns(camera, free)
+    held = np.diag(np.r_[_HELD_PX * np.ones(5), _HELD_PX / camera.K[0, 0] * np.ones(4)][: len(columns)]) ** 2
+    return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + held
+
+
+def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Camera:
+    """The camera as it was found."""
+    wTc, lens = values.atPose3(X(view)).matrix(), values.atCal3DS2(C(view)) if free else values.atCal3_S2(C(view))
+    K, distortion = lens.K(), camera.distortion.copy()
+    if free:
+        distortion[:4] = lens.vector()[5:]
+    U, _, Vt = np.linalg.svd(wTc[:3, :3])
+    wTc[:3, :3] = U @ Vt
+    return replace(camera, K=K, wTc=wTc, distortion=distortion)
+
+
+def _information(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    joints: Sequence[int],
+    views: Sequence[int],
+    rig: Rig,
+    free: bool,
+) -> Array:
+    """(V Q, V Q) what the people say of the cameras' parameters, their joints eliminated."""
+    first, last = gtsam.Ordering(), gtsam.Ordering()
+    for each in joints:
+        first.push_back(each)
+    lens = 9 if free else 5
+    # From GTSAM's parameters to ours; a camera that sees nobody is in no factor.
+    seen, count = sorted(set(views)), len(rig)
+    to = np.zeros((len(seen) * (6 + lens), count * Q))
+    for n, view in enumerate(seen):
+        last.push_back(X(view))
+        last.push_back(C(view))
+        at, ours = n * (6 + lens), view * Q
+        to[at : at + 6, ours : ours + 6] = np.eye(6)
+        to[at + 6 : at + 6 + lens, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view], free)
+    _, rest = graph.linearize(values).eliminatePartialMultifrontal(first)
+    information, _ = rest.hessian(last)
+    return to.T @ information @ to
+
+
+def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | None) -> Array:
+    """(V, Q, V, Q) of the cameras' parameters, without what the rig may move as a whole."""
+    V = len(rig)
+    prior = np.tile(sigmas, (V, 1))
+    if reference is not None:
+        prior[reference, :6] = 0.0
+    used = prior.ravel() > 0
+    weight = 1 / prior.ravel()[used] ** 2
+    inner = np.linalg.inv(information[np.ix_(used, used)] + np.diag(weight))
+    if reference is None:
+        whole = np.zeros((V, Q, 6))
+        whole[:, :6] = [gtsam.Pose3(camera.wTc).inverse().AdjointMap() for camera in rig.cameras]
+        G = whole.reshape(V * Q, 6)[used]
+        inner = inner - G @ np.linalg.solve(G.T @ (weight[:, None] * G), G.T)
+    covariance = np.zeros((V * Q, V * Q))
+    covariance[np.ix_(used, used)] = inner
+    return covariance.reshape(V, Q, V, Q)

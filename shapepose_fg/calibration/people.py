@@ -1,0 +1,129 @@
+"""The people by whom cameras are adjusted: seen by several cameras at frames that are apart in time."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.setup_check.evidence import observed, triangulate
+from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
+
+_LEAST_STEP_S = 0.1
+"""Frames nearer than this show the same errors of the detector: their correlation is 0.8."""
+_MOST_FRAMES = 100
+_MOST_SIGHTINGS = 5_000
+"""More of either cost time, and what they tell has been told: errors of one second are one error by a third."""
+_MIN_DEPTH_M = 0.3
+_WEAKEST_M = 0.15
+"""A joint that is known worse than this, in its worst direction, says nothing of cameras."""
+_NOISE = ObservationConfig()
+
+
+@dataclass(frozen=True)
+class People:
+    """P people of single frames, J joints, V cameras."""
+
+    frame: Index
+    """(P,) frame of each."""
+    xy: Array
+    """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
+    sigma_px: Array
+    """(P, J, V) of each detection on each axis, as the detector was measured; NaN where there is none."""
+    points: Array
+    """(P, J, 3) where the cameras put the joints, metres; NaN where fewer than two saw them."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def seen(self) -> Array:
+        """(P, J, V) which detections place a joint."""
+        return np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1])
+
+    def only(self, keep: Array) -> "People":
+        """Some of the people."""
+        return People(self.frame[keep], self.xy[keep], self.sigma_px[keep], self.points[keep])
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What the cameras saw at the frames that are used."""
+
+    sightings: Sightings
+    """The people of single cameras, in pixels as the lens gives them."""
+    joints: tuple[str, ...]
+    """(J,) names of the joints."""
+
+    @classmethod
+    def of(cls, detections: DetectionSequence, rig: Rig, times: FrameTimes, frames: range) -> "Footage":
+        """At frames spread over the recording, as many as tell something new."""
+        taken = times.frame_s[frames.start : frames.stop]
+        lasts = float(taken[-1] - taken[0])
+        count = max(2, min(_MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
+        wanted = np.searchsorted(taken, taken[0] + np.linspace(0.0, lasts, count)).clip(0, len(taken) - 1)
+        chosen = frames.start + np.unique(wanted)
+        sightings = Sightings.of(detections, chosen.tolist())
+        thin = -(-len(sightings) // _MOST_SIGHTINGS)
+        sightings = sightings.only(np.isin(sightings.frame, chosen[::thin]))
+        xy = sightings.xy.copy()
+        for view, camera in enumerate(rig.cameras):
+            here = sightings.view == view
+            xy[here] = camera.distort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
+        skeleton = detections.skeleton
+        return cls(replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core))
+
+    def at(self, frames: Index) -> "Footage":
+        """Some of the frames."""
+        return replace(self, sightings=self.sightings.only(np.isin(self.sightings.frame, frames)))
+
+    def undistorted(self, rig: Rig) -> Sightings:
+        """The sightings under the lenses of `rig`."""
+        xy = self.sightings.xy.copy()
+        for view, camera in enumerate(rig.cameras):
+            here = self.sightings.view == view
+            xy[here] = camera.undistort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
+        return replace(self.sightings, xy=xy)
+
+    def people(self, rig: Rig) -> People:
+        """Who is whom in other cameras, as the cameras `rig` have it, and where everybody is."""
+        sightings, views = self.undistorted(rig), Views.of(rig)
+        groups = Pairs.of(sightings, views).groups(len(sightings), tuple(range(len(rig))))
+        xy, confidence, size = observed(groups, sightings)
+        placed = triangulate(xy, confidence, size, views)
+        near = (placed.depth > _MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
+        weight = _NOISE.weight(confidence) / _NOISE.scatter(self.joints)[:, None] ** 2
+        at = np.where(near, placed.depth, np.nan)
+        sigma = np.hypot(_NOISE.floor_rad * rig.focal_px, _NOISE.sigma_m * rig.focal_px / at) / np.sqrt(weight)
+        placeable = _well_placed(placed.points, sigma * at / rig.focal_px, rig)
+        points = np.where(placeable[..., None], placed.points, np.nan)
+        return People(groups.frame, xy, np.where(placeable[..., None], sigma, np.nan), points)
+
+
+def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Array:
+    """(P, J) which points are known in all directions from views that know them across their rays by `sigma_m`."""
+    rays = points[:, :, None] - rig.centres
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    information = np.nansum(across / sigma_m[..., None, None] ** 2, axis=2)
+    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / _WEAKEST_M**2)
+
+
+def missed_px(people: People, rig: Rig) -> Array:
+    """(P, J, V) how far each detection is from where the *other* cameras alone put the joint, pixels.
+
+    NaN where fewer than two others see it.
+    """
+    missed = np.full(people.sigma_px.shape, np.nan)
+    weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)
+    size = size_of(np.moveaxis(people.xy, 2, 1))
+    for view, camera in enumerate(rig.cameras):
+        others, xy = weight.copy(), people.xy.copy()
+        others[:, :, view], xy[:, :, view] = 0.0, np.nan
+        placed = triangulate(xy, others, size, Views.of(rig))
+        seen, _ = camera.project(placed.points)
+        missed[:, :, view] = np.linalg.norm(seen - people.xy[:, :, view], axis=-1)
+    return np.where(weight > 0, missed, np.nan)

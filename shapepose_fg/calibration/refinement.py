@@ -1,0 +1,206 @@
+"""Better cameras from the people of a recording: who is whom and where cameras are, in turns; tried elsewhere."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.people import Footage, missed_px
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.setup_check.diagnosis import build_of
+from shapepose_fg.setup_check.fit import difference
+
+_ROUNDS = 4
+"""Times that people are grouped anew under the cameras of the round before."""
+_LEAST_PEOPLE = 10
+"""People, one per frame, by whom a camera is adjusted at the least."""
+_SAME_PERSON = 2.5
+"""Joints of one person in one view err together: what so many say is one."""
+_ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
+"""Shares of a detector's errors, and how long each lasts, seconds: measured on simulated recordings, whose
+detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
+_UNKNOWN = 0.8
+"""A parameter whose sigma is still this part of what it was beforehand is not determined."""
+
+PARTS = {"turn": TURN, "move": MOVE, "focal": FOCAL, "centre": CENTRE, "lens": LENS}
+"""What of a camera may change."""
+_UNITS = {"turn": float(np.degrees(1)), "move": 1e3, "focal": 100.0, "centre": 1.0}
+"""Degrees, millimetres, percent and pixels."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What became of a rig."""
+
+    given: Rig
+    """As the user has it."""
+    adjusted: Adjusted
+    """As the people have it."""
+    freedom: Freedom
+    """How far the cameras might be off."""
+    before_px: float
+    """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
+    used; given cameras."""
+    after_px: float
+    """The same with cameras that were refined by the other half of the recording."""
+    counts: Index
+    """(V,) people, one per frame, by whom each camera was adjusted."""
+    notes: tuple[str, ...] = field(default=())
+    """What motion does not determine, a sentence each."""
+    stature_m: float = float("nan")
+    """Median of the people's statures as their bones say, in the adjusted cameras' metres."""
+
+    @property
+    def better(self) -> bool:
+        """Whether the refined cameras fit people better whom they were not refined by."""
+        return self.after_px < self.before_px
+
+    @property
+    def rig(self) -> Rig:
+        """The refined cameras where they are better, else the given ones."""
+        return self.adjusted.rig if self.better else self.given
+
+    def of_stature(self, stature_m: float) -> Rig:
+        """The same, farther apart or nearer, so that people have this stature in the median."""
+        factor, middle = stature_m / self.stature_m, self.rig.centres.mean(axis=0)
+        cameras = []
+        for camera in self.rig.cameras:
+            wTc = camera.wTc.copy()
+            wTc[:3, 3] = middle + factor * (wTc[:3, 3] - middle)
+            cameras.append(replace(camera, wTc=wTc))
+        return replace(self.rig, cameras=tuple(cameras))
+
+    def change(self) -> dict[str, Array]:
+        """(V,) how far each camera was adjusted: turn in degrees, move in mm, focal in %, centre in pixels."""
+        turn, move, focal, centre = [], [], [], []
+        for old, new in zip(self.given.cameras, self.adjusted.rig.cameras, strict=True):
+            angle, way = difference(old.cTw, new.cTw)
+            turn.append(angle)
+            move.append(1e3 * way)
+            focal.append(100 * (new.K[0, 0] / old.K[0, 0] - 1))
+            centre.append(np.hypot(*(new.K[:2, 2] - old.K[:2, 2])))
+        return {name: np.array(each) for name, each in zip(_UNITS, (turn, move, focal, centre), strict=True)}
+
+    def sigma(self) -> dict[str, Array]:
+        """(V,) of the same, in the same units."""
+        each = {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
+        return each
+
+    def as_dict(self) -> dict[str, Any]:
+        """All figures, as plain values."""
+        change, sigma = self.change(), self.sigma()
+        cameras = [
+            {
+                "camera": camera.name,
+                "people": int(self.counts[view]),
+                **{name: round(float(change[name][view]), 4) for name in _UNITS},
+                **{f"sigma_{name}": round(float(sigma[name][view]), 4) for name in _UNITS},
+            }
+            for view, camera in enumerate(self.given.cameras)
+        ]
+        held_out = {"before_px": round(self.before_px, 3), "after_px": round(self.after_px, 3)}
+        about = {"better": self.better, "stature_m": round(self.stature_m, 3), "notes": list(self.notes)}
+        return {"cameras": cameras, "held_out": held_out, **about}
+
+
+def refine(
+    detections: DetectionSequence,
+    rig: Rig,
+    times: FrameTimes,
+    frames: range,
+    freedom: Freedom | None = None,
+    reference: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Refinement:
+    """Refine the cameras of `rig`, which may be off by about `freedom`, by the people whom `detections` show.
+
+    The scale is that of the cameras' places beforehand. InputError where hardly anybody is seen by two cameras.
+    """
+    freedom = Freedom() if freedom is None else freedom
+    footage = Footage.of(detections, rig, times, frames)
+    taken = np.unique(footage.sightings.frame)
+    halves = np.array_split(taken, 2)
+    spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
+    found, before, after = list[Adjusted](), list[Array](), list[Array]()
+    for number, (used, left) in enumerate(spans):
+        part = footage.at(used)
+
+        def told(step: int, number: int = number) -> None:
+            progress(number * _ROUNDS + step + 1, len(spans) * _ROUNDS)
+
+        found.append(_fitted(part, rig, times, freedom, reference, told))
+        if number > 0:
+            people = footage.at(left).people(found[-1].rig)
+            both = [missed_px(people, each) for each in (rig, found[-1].rig)]
+            known = np.isfinite(both[0]) & np.isfinite(both[1])
+            before.append(both[0][known])
+            after.append(both[1][known])
+    medians = [float(np.median(np.concatenate(each))) for each in (before, after)]
+    counts = found[0].people.seen.any(axis=1).sum(axis=0)
+    stature = build_of(found[0].people.points, detections.skeleton).stature
+    notes = tuple(_undetermined(found[0], freedom, counts))
+    return Refinement(rig, found[0], freedom, *medians, counts, notes, stature)
+
+
+def _fitted(
+    footage: Footage,
+    rig: Rig,
+    times: FrameTimes,
+    freedom: Freedom,
+    reference: int | None,
+    told: Callable[[int], None],
+) -> Adjusted:
+    """The cameras by the people of some frames."""
+    rig_now, adjusted = rig, None
+    for step in range(_ROUNDS):
+        people = footage.people(rig_now)
+        if len(people) < _LEAST_PEOPLE or not people.seen.any():
+            raise InputError(
+                f"only {len(people)} people are seen by two cameras at once, at the frames that were looked at;"
+                " cameras are refined by at least 10: film people where views overlap, or see"
+                " shapepose-fg check-calibration"
+            )
+        spread = dilution(times.frame_s[np.unique(people.frame)])
+        adjusted = adjust(rig, rig_now, people, freedom, spread, misfit(people, rig_now), reference)
+        rig_now = adjusted.rig
+        told(step)
+    assert adjusted is not None
+    return adjusted
+
+
+def dilution(time_s: Array) -> float:
+    """How many errors of a detection are one, at frames taken at `time_s` (T,): over time, and over joints."""
+    apart = np.abs(time_s[:, None] - time_s)
+    alike = sum(share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS)
+    return float(_SAME_PERSON * np.sum(alike) / len(time_s))
+
+
+def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[str]:
+    """What the people do not tell, in words."""
+    prior = {name: float(np.sqrt((freedom.sigmas[part] ** 2).sum())) for name, part in PARTS.items()}
+    words = {
+        "turn": "which way it looks",
+        "move": "where it stands",
+        "focal": "its focal length",
+        "centre": "its principal point",
+        "lens": "its distortion",
+    }
+    notes = []
+    for view, camera in enumerate(adjusted.rig.cameras):
+        if counts[view] < _LEAST_PEOPLE:
+            few = f"sees {counts[view]} people whom another camera sees, too few"
+            notes.append(f"camera {camera.name}: {few}; it stays")
+            continue
+        sigmas = {name: adjusted.sigma(part)[view] for name, part in PARTS.items()}
+        unknown = [words[name] for name in PARTS if prior[name] > 0 and sigmas[name] > _UNKNOWN * prior[name]]
+        if unknown:
+            what = f"the people's motion does not determine {' or '.join(unknown)} better than was known before"
+            cure = "film people who walk through all of the picture, near and far"
+            notes.append(f"camera {camera.name}: {what}; {cure}")
+    return notes

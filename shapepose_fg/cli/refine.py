@@ -1,0 +1,158 @@
+"""The command `refine-calibration`: better cameras from the people of a recording."""
+
+import json
+import shlex
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from shapepose_fg.cli.options import (
+    REQUIRED,
+    RESULT,
+    TIME,
+    DetectionOptions,
+    check_fps,
+    frame_range,
+    frames_option,
+    grouped,
+    json_option,
+    option,
+)
+from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.core.errors import InputError
+
+if TYPE_CHECKING:
+    from shapepose_fg.calibration.refinement import Refinement
+    from shapepose_fg.core.camera import Rig
+    from shapepose_fg.core.frame_times import FrameTimes
+    from shapepose_fg.io.calibration import Unit
+
+_CAMERAS = "What may change"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateOptions:
+    """When frames were taken, and which are used."""
+
+    fps: float | None = option(TIME, "Frames a second; 30 where nothing says it.")
+    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
+    frames: str | None = frames_option()
+
+    def times(self, detections: Path, rig: "Rig", count: int) -> "FrameTimes":
+        """Of a recording of `count` frames."""
+        from shapepose_fg.core.frame_times import FrameTimes
+        from shapepose_fg.io.timestamps import read_timestamps
+
+        if self.fps is not None and self.timestamps is not None:
+            raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
+        check_fps(self.fps)
+        beside = detections / "times.csv"
+        file = self.timestamps or (beside if self.fps is None and beside.is_file() else None)
+        if file is not None:
+            return read_timestamps(file, rig, count)
+        return FrameTimes.assumed(count) if self.fps is None else FrameTimes.from_fps(self.fps, count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreedomOptions:
+    """How far cameras may be from what the file says."""
+
+    off_degrees: float = option(_CAMERAS, "How far cameras may be turned, about, in degrees.", 1.0)
+    off_cm: float = option(_CAMERAS, "How far they may be moved, about, in centimetres.", 2.0)
+    focal: bool = option(_CAMERAS, "Refine focal lengths too, which may be off by 2 %.", False, "--focal")
+    centre: bool = option(_CAMERAS, "Refine principal points too (10 pixels).", False, "--principal-point")
+    lens: bool = option(_CAMERAS, "Refine k1 k2 p1 p2 too (0.02).", False, "--distortion")
+    reference: str | None = option(_CAMERAS, "This camera stays; else the rig as a whole.", metavar="CAMERA")
+    stature: float | None = option(_CAMERAS, "People's mean stature in metres: it, not the rig, says the scale.")
+
+
+@grouped
+def refine_calibration(
+    seen: DetectionOptions,
+    rate: RateOptions,
+    may: FreedomOptions,
+    output: Path = option(RESULT, "File for the refined cameras, in the format they came in.", REQUIRED),
+    as_json: bool = json_option(),
+) -> None:
+    """Refine where cameras stand and look, and their lenses if asked, by the people of a recording.
+
+    The rig is tried on frames that it was not refined by; where it does not fit them better it is left as it was.
+    """
+    from shapepose_fg.calibration.adjustment import Freedom
+    from shapepose_fg.calibration.refinement import refine
+    from shapepose_fg.core.storage.kept_arrays import InFolder
+    from shapepose_fg.io.calibration import write_like
+    from shapepose_fg.io.detections import read_detections
+
+    if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
+        raise InputError("--off-degrees must be above 0, up to 20, and --off-cm above 0, up to 200")
+    if may.stature is not None and not 0.5 <= may.stature <= 2.5:
+        raise InputError(f"--stature {may.stature:g}: must be 0.5 to 2.5 metres")
+    rig = seen.rig()
+    if may.reference is not None and may.reference not in rig.names:
+        raise InputError(f"--reference {may.reference}: no such camera; give one of {' '.join(rig.names)}")
+    bent = [camera.name for camera in rig.cameras if camera.lens == "fisheye" or camera.distortion[4:].any()]
+    if may.lens and bent:
+        raise InputError(
+            f"camera {bent[0]}: only lenses with k1 k2 p1 p2 alone can be refined; leave --distortion out"
+        )
+    freedom = Freedom(
+        may.off_degrees,
+        may.off_cm / 100,
+        0.02 if may.focal else 0.0,
+        10.0 if may.centre else 0.0,
+        0.02 if may.lens else 0.0,
+    )
+    with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
+        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
+        note(*recording.notes)
+        span = frame_range(rate.frames, len(recording), recording.first)
+        times = rate.times(seen.detections, rig, len(recording))
+        reference = None if may.reference is None else rig.names.index(may.reference)
+        with progress("refining", "rounds") as done:
+            found = refine(recording, rig, times, span, freedom, reference, done)
+    note(*found.notes)
+    new = found.rig if may.stature is None else found.of_stature(may.stature)
+    form = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
+    if as_json:
+        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+    else:
+        _show(found, may)
+        print(f"{output}: {form}")
+        print(next_command(seen, rate, output, seen.detections, form == "our own rig file"))
+
+
+def next_command(seen: DetectionOptions, rate: RateOptions, cameras: Path, detections: Path, whole: bool) -> str:
+    """How to go on, as a line to copy; `whole`: the file of the cameras says unit, axis and size itself."""
+    said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
+    options: dict[str, object] = {
+        "--calibration": cameras,
+        "--detections": detections,
+        "--skeleton": seen.skeleton,
+    }
+    options |= {} if whole else said
+    options |= {"--fps": rate.fps, "--timestamps": rate.timestamps, "--frames": rate.frames, "--output": "results"}
+    words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
+    return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def _show(found: "Refinement", may: FreedomOptions) -> None:
+    """What changed, by camera, and whether it is better."""
+    change, sigma = found.change(), found.sigma()
+    parts = {"turn": "turn, °", "move": "move, mm"} | ({"focal": "focal, %"} if may.focal else {})
+    parts |= {"centre": "centre, px"} if may.centre else {}
+    rows = []
+    for view, name in enumerate(found.given.names):
+        figures = [f"{change[part][view]:.2f} ± {sigma[part][view]:.2f}" for part in parts]
+        rows.append((name, str(found.counts[view]), *figures))
+    scale = (
+        "the cameras' distances as they were" if may.stature is None else f"people's stature, {may.stature:g} m"
+    )
+    stays = "the rig as a whole" if may.reference is None else f"camera {may.reference}"
+    caption = f"± is one sigma, as against {stays}; scale: {scale}"
+    show(table(("camera", "people", *parts.values()), rows, caption=caption))
+    figures = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
+    print(f"a joint as against the other cameras, on frames that were not used: {figures}")
+    if not found.better:
+        print("the people do not fit better: the cameras are left as they were")

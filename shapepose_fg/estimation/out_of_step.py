@@ -1,0 +1,61 @@
+"""Views that are exposed before or after the others of their frame: joints have moved by then.
+
+The window's graph measures each joint where it is at the view's own time, from its position and velocity
+(`factors.moving_projection_factors`). Gates and bodies know positions only: for these, detections are carried to
+the frame's time by the velocity that is known so far.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.in_time import velocities
+
+_AT_ONCE_S = 1e-3
+"""Views that are exposed nearer to each other are of one time: a hand at 5 m/s moves by 5 mm."""
+
+
+def leads(observations: Observations, views: Views) -> Array:
+    """(N, J, V) how long after its frame, the mean of the views' times, each observation was exposed, seconds.
+
+    0 where the views of a frame are within a millisecond; and a rolling shutter exposes one row after the other.
+    """
+    time_s = observations.time_s
+    apart = np.ptp(time_s, axis=1, keepdims=True) > _AT_ONCE_S
+    of_view = np.where(apart, time_s - time_s.mean(axis=1, keepdims=True), 0.0)
+    lead_s = np.repeat(of_view[:, None], observations.xy.shape[1], axis=1)
+    if np.any(views.readout_s):
+        height = np.broadcast_to(views.image_sizes, (len(views), 2))[:, 1]
+        down = np.clip(observations.xy[..., 1] / height, 0.0, 1.0)
+        lead_s += np.where(observations.seen, (down - 0.5) * views.readout_s, 0.0)
+    return lead_s
+
+
+def velocities_of(observations: Observations, points: Array) -> Array:
+    """(N, J, 3) how the joints `points` (N, J, 3) of each track move, m/s; 0 where that is not known."""
+    velocity, time_s = np.zeros(points.shape), observations.time_s.mean(axis=1)
+    order = np.lexsort((time_s, observations.track))
+    for rows in np.split(order, np.flatnonzero(np.diff(observations.track[order])) + 1):
+        velocity[rows] = velocities(points[rows], time_s[rows])
+    return np.nan_to_num(velocity)
+
+
+def carried_to_frames(observations: Observations, points: Array, velocity: Array, views: Views) -> Observations:
+    """The observations as they would be at their frames' time, of joints at `points` (N, J, 3), metres, that move
+    by `velocity` (N, J, 3), m/s.
+    """
+    lead_s = leads(observations, views)
+    if not lead_s.any():
+        return observations
+    there = points[:, :, None] + lead_s[..., None] * velocity[:, :, None]
+    away = views.project_apart(there)[0] - views.project(points)[0]
+    return replace(observations, xy=observations.xy - np.where(np.isfinite(away), away, 0.0))
+
+
+def spread(observations: Observations, velocity: Array, views: Views) -> Array:
+    """(N, J, 3, 3) how far joints are, in any view, from where they are at their frame's time, m²."""
+    most = np.abs(leads(observations, views)).max(axis=2)[..., None] * velocity
+    return most[..., None] * most[..., None, :]

@@ -1,0 +1,111 @@
+"""A calibration written again in the format it came in: JSON and TOML; all others become our own rig file."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.io.calibration.content import Content, load
+from shapepose_fg.io.calibration.json_and_toml import write_rig
+from shapepose_fg.io.calibration.reading import FORMATS
+from shapepose_fg.io.calibration.written import METRES, Unit
+
+_TABLE = re.compile(r"\s*\[\s*(?P<key>[^\]]+?)\s*\]\s*(#.*)?$")
+_ENTRY = re.compile(r"(?P<head>\s*(?P<name>matrix|rotation|translation|distortions)\s*=\s*)")
+
+
+def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -> str:
+    """Write `rig`, which was read from `source` and changed, to `target`; returns the format's name.
+
+    Poses, intrinsics and distortions are replaced, the rest of the file stays. `unit` is what `read_rig` was told.
+    Formats that are neither JSON nor TOML are written as our own rig file.
+    """
+    content = load(source)
+    read = ((each, each.read(content)) for each in FORMATS)
+    form, written = next((form, written) for form, written in read if written is not None)
+    metres = METRES[unit or written.unit or "m"]
+    if content.syntax == "TOML":
+        write_content(target, _toml(source, content, rig, metres))
+        return form.name
+    place = _PLACES.get(form.name)
+    if place is None:
+        write_rig(rig, target)
+        return FORMATS[0].name
+    for camera, entry in zip(rig.cameras, place(content.value), strict=True):
+        _fill(entry, camera, metres)
+    write_content(target, json.dumps(content.value, indent=1))
+    return form.name
+
+
+def _voxelpose(value: Any) -> list[dict[str, Any]]:
+    if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
+        value = next(iter(value.values()))
+    return value if isinstance(value, list) else list(value.values())
+
+
+_PLACES: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
+    "our own rig file": lambda value: value["cameras"],
+    "CMU Panoptic's JSON": lambda value: value["cameras"],
+    "VoxelPose's JSON": _voxelpose,
+    "4D Association's calibration.json": lambda value: list(value.values()),
+}
+"""Where each format of JSON has its cameras, in the order in which they are read."""
+
+
+def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:
+    """Put a camera's numbers in the place of those that its entry has, each in the shape it had."""
+    cTw, centre = camera.cTw.copy(), camera.centre / metres
+    cTw[:, 3] /= metres
+    wTc = camera.wTc.copy()
+    wTc[:3, 3] = centre
+    at = centre if "fx" in entry else cTw[:, 3]  # VoxelPose has R (X - T)
+    R = cTw[:, :3] if np.size(entry.get("R", 0)) != 3 else cv2.Rodrigues(cTw[:, :3])[0]
+    numbers = {"K": camera.K, "RT": cTw, "cTw": cTw, "wTc": wTc, "R": R, "T": at, "t": at}
+    numbers |= dict(zip(("fx", "cx", "fy", "cy"), camera.K[[0, 0, 1, 1], [0, 2, 1, 2]], strict=True))
+    d = np.r_[camera.distortion, np.zeros(14)]
+    numbers |= {"k": d[[0, 1, 4]], "p": d[2:4]} if "fx" in entry else {}
+    numbers |= {name: d for name in ("distCoeff", "dist", "distortion", "distCoef")}
+    for name, value in numbers.items():
+        if entry.get(name) is not None:
+            shape = np.shape(entry[name])
+            entry[name] = np.ravel(value)[: int(np.prod(shape))].reshape(shape).tolist()
+
+
+def _toml(source: Path, content: Content, rig: Rig, metres: float) -> str:
+    """The file with the numbers of each camera's table replaced, line by line."""
+    inner = content.value.get("cameras")
+    tables = inner if isinstance(inner, dict) else content.value
+    used = [key for key, each in tables.items() if isinstance(each, dict) and "matrix" in each]
+    used = [key for key in used if tables[key].get("ignore") is not True]
+    cameras, camera, lines, depth = dict(zip(used, rig.cameras, strict=True)), None, [], 0
+    for line in read_text(source).splitlines():
+        if depth > 0:  # the rest of a value that was replaced
+            depth += line.count("[") - line.count("]")
+            continue
+        if (table := _TABLE.match(line)) is not None:
+            key = table["key"].removeprefix("cameras.").strip("\"'")
+            camera = cameras.get(key)
+        elif camera is not None and (entry := _ENTRY.match(line)) is not None:
+            old = tables[key][entry["name"]]
+            depth = line.count("[") - line.count("]")
+            line = entry["head"] + json.dumps(_table_value(entry["name"], old, camera, metres))
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def _table_value(name: str, old: Any, camera: Camera, metres: float) -> list[Any]:
+    """The value of an entry of a camera's table, in the shape it had."""
+    R = camera.cTw[:, :3]
+    values = {
+        "matrix": camera.K,
+        "rotation": cv2.Rodrigues(R)[0] if np.size(old) == 3 else R,
+        "translation": camera.cTw[:, 3] / metres,
+        "distortions": np.r_[camera.distortion, np.zeros(14)][: np.size(old)],
+    }
+    return np.reshape(values[name], np.shape(old)).tolist()

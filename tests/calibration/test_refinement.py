@@ -1,0 +1,110 @@
+"""Cameras that are off are brought back by the people; sound ones stay; what motion does not say is said."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust, misfit
+from shapepose_fg.calibration.people import Footage
+from shapepose_fg.calibration.refinement import dilution, refine
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.io.calibration import read_rig, write_rig
+from shapepose_fg.io.write_detections import write_openpose
+from tests.calibration.conftest import FPS, disturbed, off_by
+
+TIMES = FrameTimes.from_fps(FPS, 250)
+
+
+def run(arguments, capsys):
+    """Exit code, stdout and stderr of a command."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(each) for each in arguments])
+    said = capsys.readouterr()
+    return ended.value.code, said.out, said.err
+
+
+def test_one_frame_is_one_look_and_a_minute_is_many():
+    assert dilution(np.zeros(1)) == pytest.approx(2.5)
+    assert dilution(np.arange(10.0) * 100) == pytest.approx(2.5, rel=0.01)
+    # Twice as many frames of the same seconds tell hardly more.
+    few, many = (dilution(np.linspace(0, 10, count)) / count for count in (50, 100))
+    assert many == pytest.approx(few, rel=0.05)
+
+
+@pytest.mark.slow
+def test_disturbed_cameras_come_back(rig, recording):
+    wrong = disturbed(rig, 0, focal=0.02)
+    found = refine(recording, wrong, TIMES, range(250), Freedom(focal=0.02))
+    turn, move = off_by(found.rig, rig)
+    assert found.better and found.after_px < 0.4 * found.before_px and found.notes == ()
+    assert np.median(off_by(wrong, rig)[0]) > 0.6
+    assert turn.max() < 0.2 and move.max() < 0.025
+    focal = [new.K[0, 0] / old.K[0, 0] - 1 for new, old in zip(found.rig.cameras, rig.cameras, strict=True)]
+    assert np.abs(focal).max() < 0.012
+    # Independent errors are taken for lasting ones: sigmas are wide rather than narrow.
+    assert (turn < 2.8 * np.degrees(found.adjusted.sigma(TURN))).all()
+    assert (move < 2.8 * found.adjusted.sigma(MOVE)).all()
+    wide, before = (np.linalg.norm(np.diff(each.centres, axis=0)) for each in (found.of_stature(1.8), found.rig))
+    assert wide / before == pytest.approx(1.8 / found.stature_m)
+
+
+@pytest.mark.slow
+def test_a_sound_rig_stays_within_its_sigma(rig, recording):
+    found = refine(recording, rig, TIMES, range(250))
+    turn, move = off_by(found.rig, rig)
+    assert (turn < 2 * np.degrees(found.adjusted.sigma(TURN))).all()
+    assert (move < 2 * found.adjusted.sigma(MOVE)).all() and abs(found.after_px / found.before_px - 1) < 0.05
+
+
+def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
+    bumped = replace(rig, cameras=(disturbed(rig, 1, degrees=2.5).cameras[0], *rig.cameras[1:]))
+    footage, now = Footage.of(recording, rig, TIMES, range(250)), bumped
+    for _ in range(3):
+        people = footage.people(now)
+        now = adjust(bumped, now, people, Freedom(), 12.0, misfit(people, now)).rig
+    assert off_by(now, rig)[0].max() < 0.3
+    # Where the rig stands as a whole is said by the three that were right.
+    apart = [a.wTc[:3, :3].T @ b.wTc[:3, :3] for a, b in zip(now.cameras[1:], rig.cameras[1:], strict=True)]
+    assert max(np.degrees(np.arccos((np.trace(each) - 1) / 2)) for each in apart) < 0.5
+
+
+def test_the_reference_camera_keeps_its_pose(rig, recording):
+    wrong, footage = disturbed(rig, 2), Footage.of(recording, rig, TIMES, range(250))
+    adjusted = adjust(wrong, wrong, footage.people(wrong), Freedom(), 12.0, reference=1)
+    np.testing.assert_allclose(adjusted.rig.cameras[1].wTc, wrong.cameras[1].wTc, atol=1e-5)
+    assert adjusted.sigma(TURN)[1] == 0 < adjusted.sigma(TURN)[0]
+
+
+def test_people_whom_one_camera_sees_are_too_few(rig, recording):
+    alone = Recording(recording.skeleton, [each.only(each.view == 0) for each in recording.frames])
+    with pytest.raises(InputError, match="only 0 people are seen by two cameras"):
+        refine(alone, rig, TIMES, range(250))
+
+
+@pytest.mark.slow
+def test_what_motion_does_not_determine_is_said(rig, recording):
+    frames = [each.only((each.view != 3) | (t < 2)) for t, each in enumerate(recording.frames)]
+    few = Recording(recording.skeleton, [*frames[:25], *[Detections.empty()] * 225])
+    found = refine(few, rig, TIMES, range(25), Freedom(focal=0.02))
+    assert any("camera cam3: sees" in each and "it stays" in each for each in found.notes)
+
+
+@pytest.mark.slow
+def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
+    write_openpose(recording, rig, tmp_path / "seen")
+    write_rig(disturbed(rig, 4), tmp_path / "rig.json")
+    base = ["refine-calibration", "--calibration", tmp_path / "rig.json", "--detections", tmp_path / "seen"]
+    code, out, _ = run([*base, "--fps", 25, "--output", tmp_path / "new.json"], capsys)
+    assert code == 0 and "next: shapepose-fg reconstruct" in out and "px before" in out and "±" in out
+    assert off_by(read_rig(tmp_path / "new.json"), rig)[0].max() < 0.25
+    code, out, _ = run([*base, "--fps", 25, "--json", "--output", tmp_path / "new.json"], capsys)
+    told = json.loads(out)
+    assert told["better"] and len(told["cameras"]) == 4 and told["held_out"]["after_px"] < 8
+    for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
+        code, _, error = run([*base, *more, "--output", tmp_path / "new.json"], capsys)
+        assert code == 2 and said in " ".join(error.split())

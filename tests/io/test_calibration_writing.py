@@ -1,0 +1,71 @@
+"""A calibration that was changed is written in the format it came in, and reads back as it was changed."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.io.calibration import read_rig, write_like, write_rig
+from shapepose_fg.simulation import built_in_scene
+
+DATA = Path(os.environ.get("SHAPEPOSE_DATA", "../shared")) / "data"
+REAL = {
+    "shelf/calibration.json": {},
+    "panoptic_pizza/calibration.json": {"image_size": (1920, 1080)},
+    "formats/pose2sim_Calib.toml": {},
+    "formats/freemocap_calibration.toml": {"unit": "mm", "up": "-y"},
+    "formats/caliscope_camera_array.toml": {"up": "-y"},
+}
+
+
+def changed(rig: Rig) -> Rig:
+    """The rig with every camera turned, moved, and of other focal length and distortion."""
+    cameras = []
+    for number, camera in enumerate(rig.cameras):
+        wTc, K = camera.wTc.copy(), camera.K.copy()
+        wTc[:3, :3] = wTc[:3, :3] @ Rotation.from_rotvec([0.01, -0.02, 0.005 * number]).as_matrix()
+        wTc[:3, 3] += (0.01, -0.03, 0.02)
+        K[:2] *= 1.01
+        bent = camera.distortion * 1.1
+        cameras.append(replace(camera, wTc=wTc, K=K, distortion=bent))
+    return replace(rig, cameras=tuple(cameras))
+
+
+def same(one: Rig, other: Rig) -> None:
+    assert one.names == other.names and one.up == other.up
+    for a, b in zip(one.cameras, other.cameras, strict=True):
+        assert a.image_size == b.image_size and a.lens == b.lens
+        for name in ("K", "wTc", "distortion"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9)
+
+
+def test_our_own_rig_file_reads_back(tmp_path):
+    rig = built_in_scene(frames=1).rig
+    write_rig(rig, tmp_path / "rig.json")
+    assert write_like(tmp_path / "rig.json", changed(rig), tmp_path / "new.json") == "our own rig file"
+    same(read_rig(tmp_path / "new.json"), changed(rig))
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_files_read_back_and_keep_the_rest(tmp_path, name):
+    source, how = DATA / name, REAL[name]
+    if not source.exists():
+        pytest.skip("recordings are not here")
+    rig, target = read_rig(source, **how), tmp_path / f"new{source.suffix}"
+    assert write_like(source, changed(rig), target, how.get("unit")) != "our own rig file"
+    same(read_rig(target, **how), changed(rig))
+    write_like(source, rig, target, how.get("unit"))
+    same(read_rig(target, **how), rig)
+
+
+def test_other_formats_become_our_own(tmp_path):
+    source = DATA / "pose2sim_single" / "Calib.qca.txt"
+    if not source.exists():
+        pytest.skip("recordings are not here")
+    rig = read_rig(source)
+    assert write_like(source, changed(rig), tmp_path / "new.json") == "our own rig file"
+    same(read_rig(tmp_path / "new.json"), changed(rig))
