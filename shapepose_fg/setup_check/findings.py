@@ -173,8 +173,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.AXES: "the camera axes of {who} look like those of OpenGL or Blender, y up and z backwards; turn y and z"
     " round",
     Kind.MIRRORED: "the pictures of {who} look mirrored; mirror them back",
-    Kind.BUMPED: "{who} looks turned by {degrees} degrees {when}: somebody moved it; calibrate it for each part, or"
-    " take it out of one",
+    Kind.BUMPED: "{who} looks turned by {degrees} degrees {when}: somebody moved it; calibrate it for"
+    " each part, or take it out of one",
     Kind.DRIFTING: "{who} looks as if it slowly turned, by {degrees} degrees over the recording; fix it on its"
     " stand, and take it out of this recording",
     Kind.FOCAL: _focal,

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
@@ -53,7 +53,7 @@ def likelihood(score: float, worth: float, freedom: int) -> float:
 
 def warped(seen: Sightings, camera: Pinhole, turns: Array) -> Sightings:
     """What `camera` would have seen without the `turns` (S, 3), rotation vectors about its own axes."""
-    back = camera.K @ Rotation.from_rotvec(-turns).as_matrix() @ np.linalg.inv(camera.K)
+    back = camera.K @ exp_so3(-turns) @ np.linalg.inv(camera.K)
     h = np.einsum("sij,snj->sni", back[:, :, :2], seen.xy) + back[:, None, :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = np.where(h[..., 2:] > 0, h[..., :2] / h[..., 2:], np.nan)
@@ -76,7 +76,7 @@ class Story:
 
 
 def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[Story]:
-    """What one camera did over time, if it did anything that explains what it saw better than a pose that lasts."""
+    """What one camera did over time, if that explains what it saw better than a pose that lasts."""
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     if len(others) < 4 * _LEAST_PEOPLE or len(seen) < 4 * _LEAST_PEOPLE:
         return
@@ -105,7 +105,12 @@ def _as_if_still(look: Look, view: int, way: Way) -> Look:
 
 def turned(camera: Pinhole, turn: Array) -> Pinhole:
     """The camera turned by a rotation vector (3,) of its own axes."""
-    return Pinhole(camera.K, Rotation.from_rotvec(turn).as_matrix() @ camera.cTw)
+    return Pinhole(camera.K, exp_so3(turn) @ camera.cTw)
+
+
+def turn_between(camera: Pinhole, other: Pinhole) -> Array:
+    """(3,) the rotation vector of what turns a camera to another."""
+    return log_so3(other.cTw[:, :3] @ camera.cTw[:, :3].T)
 
 
 @dataclass(frozen=True)
@@ -180,7 +185,7 @@ class _Pieces:
                 sole = fit.best_of(few, mine, self.camera, pairs, fit.turned_to)
                 found += [] if sole is None else [self._fitted(few, mine, sole)]
             scores[k], chosen = max(found, key=lambda pair: pair[0])
-            turns[k] = Rotation.from_matrix(chosen.cTw[:, :3] @ self.camera.cTw[:, :3].T).as_rotvec()
+            turns[k] = turn_between(self.camera, chosen)
         return turns, scores
 
     @staticmethod
@@ -214,11 +219,10 @@ def _bumped(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Way
             few, mine = _during(others, seen, first, last)
             if turn.any() and len(few) > 0 and len(mine) > 0:
                 new = fit.refined(few, mine, turned(camera, turn), TURN)
-                turn = Rotation.from_matrix(new.cTw[:, :3] @ camera.cTw[:, :3].T).as_rotvec()
+                turn = turn_between(camera, new)
             sides.append(turn)
         before, after = sides
-    step = Rotation.from_rotvec(after) * Rotation.from_rotvec(before).inv()
-    amount = float(np.rad2deg(step.magnitude()))
+    amount = fit.difference(turned(camera, after).cTw, turned(camera, before).cTw)[0]
 
     def way(frame: Index) -> Array:
         return np.where((frame < at)[:, None], before, after)
