@@ -22,9 +22,9 @@ from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import Change, Lag, gross_mistake, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Change, Lag, gross_mistake, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
-from shapepose_fg.setup_check.over_time import stories
+from shapepose_fg.setup_check.over_time import parted, stories
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
 
 _SAME_PX = 0.6
@@ -360,6 +360,12 @@ def _turned(small: SmallErrors, view: int) -> Finding:
 def _unfit(look: Look, known: set[int]) -> list[Finding]:
     """Cameras that fit nothing, without any explanation."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
+    everybody = tuple(np.flatnonzero(seen).tolist())
+    if len(known) == 0 and (frames := parted(look)) is not None:
+        return [Finding(Kind.UNFIT, everybody, float(look.scores.min()), frames=frames)]
+    if len(everybody) == 2:
+        fits = look.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
+        return [] if fits else [Finding(Kind.UNFIT, everybody, float(look.scores[0]))]
     bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
     return [Finding(Kind.UNFIT, (view,), float(look.scores[view])) for view in bad if view not in known]
 

@@ -161,6 +161,14 @@ def _nobody(finding: Finding, side_px: int) -> str:
     )
 
 
+def _unfit(finding: Finding, side_px: int) -> str:
+    check = "check that its calibration and its detections are its own"
+    if len(finding.cameras) == 1:
+        return f"{{who}} fits the others in nothing that was tried; {check}"
+    since = "" if finding.frames == (None, None) else " {when}, while they agree else: one of them was moved"
+    return f"{{who}} contradict each other{since}; {check.replace('its', 'their')}"
+
+
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TURNED: _turned,
     Kind.MOVED: "{who} looks moved by about {moved} and turned by {amount:.1f} degrees; calibrate its pose again",
@@ -191,8 +199,7 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.NOBODY: _nobody,
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",
-    Kind.UNFIT: "{who} fits the others in nothing that was tried; check that its calibration and its detections"
-    " are its own",
+    Kind.UNFIT: _unfit,
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }
