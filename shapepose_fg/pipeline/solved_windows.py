@@ -50,10 +50,13 @@ class SolvedWindows:
     def read(self, frame: int) -> Input:
         """What the cameras give of a frame."""
         with self.book.stage("read"):
-            self.book.thin("detections", self.detections.is_thinned(frame), frame)
+            thinned = self.detections.is_thinned(frame)
+            self.book.thin("detections", thinned, frame)
             repeated, trust = self.pictures.repeated(frame), self.pictures.trust
             self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
-            said = tuple(sorted({*repeated, *trust.dark(frame)})), trust.in_doubt(frame)
+            # Who is who among more detections than people make is chance.
+            doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
+            said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
             if said not in self._rigs:
                 self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
             return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[said])

@@ -156,11 +156,9 @@ _MOST_COST = 0.86
 _OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
 """Where several cameras have small errors, one that is off by so much, and so many times the next, is turned."""
 _NOTABLE_DEG = 0.25
-_LEAST_GAIN = 0.02
-"""Where no pose of one camera takes away so much of the residuals' cost, none is tried."""
-_POSE_GAIN = 0.04
-"""Another pose of one camera, six numbers, is named where it leaves so much less of the residuals' cost than small
-errors of all cameras do."""
+_LIKELY, _SURE_OF_ONE = 1.0, 0.7
+"""One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less BIC's
+price), and of all cameras' mistakes with this probability its own."""
 _SINGLE = 0.7
 """One camera is said to be turned where it alone explains so much of what small errors of all cameras explain."""
 _TURN_DEG = 0.6
@@ -304,26 +302,30 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 
 def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
-    largest, log = float(np.hypot(small.shift_deg, small.roll_deg).max()), np.abs(np.log(small.focal))
-    if largest < _OFF_DEG and log.max() < _OFF_FOCAL and problem.pose_gain < _LEAST_GAIN:
+    (gain, view, kind), sure = problem.singles[0], problem.sure
+    log = np.abs(np.log(small.focal))
+    if gain > _LIKELY and sure > _SURE_OF_ONE and view not in known:
+        found, _ = problem.single(view, kind)
+        large = abs(np.log(found.amount)) > _OFF_FOCAL if kind == Kind.FOCAL else found.amount > _OFF_DEG
+        if large:
+            x, y = small.centre_px[view].tolist()
+            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else ())]
+    largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
+    if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
         return []
-    (pose, cost), shifted = problem.other_pose(), problem.small_errors(SHIFT)
-    if cost < min(small.cost, shifted.cost) - _POSE_GAIN and known.isdisjoint(pose.cameras):
-        return [pose]
+    shifted = problem.small_errors(SHIFT)
     turned, focal = _off(problem, small, shifted)
     off = np.flatnonzero(turned | focal)
     if len(off) == 0:
         return []
     # Three cameras cannot tell which of their small errors belong to which.
     tells_apart = look.cameras_used > 3
-    if len(off) == 1 and tells_apart:
+    if len(off) == 1 and tells_apart and int(off[0]) not in known:
         view = int(off[0])
-        if view in known:
-            return []
         if focal[view]:
             return [Finding(Kind.FOCAL, (view,), float(1 / small.focal[view]))]
         found = _turned(small, view)
-        if pose.cameras == (view,) and 1 - cost > _SINGLE * (1 - small.cost):
+        if 1 - problem.single(view, Kind.MOVED)[1] > _SINGLE * (1 - small.cost):
             return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []

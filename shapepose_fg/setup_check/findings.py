@@ -52,6 +52,8 @@ class Finding:
     """The axis that is up for the people."""
     frames: tuple[int | None, int | None] = (None, None)
     """The first frame in which it is so, and the one after the last; None where the recording begins or ends."""
+    sure: float = 1.0
+    """The probability that it is this, and not another mistake or none, as far as the detections tell."""
     same: str = ""
     """In what alone two cameras are one, if not in both: "pose" or "detections"."""
 
@@ -85,6 +87,7 @@ def sentence(finding: Finding, rig: Rig) -> str:
         when=_when(*finding.frames),
         up=rig.up,
     )
+    said += f" (probability {finding.sure:.2f})" if finding.sure < 0.95 else ""
     return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
 
 

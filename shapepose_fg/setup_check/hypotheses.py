@@ -11,11 +11,11 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import FOCAL, POSE, TURN, Others, Pinhole, match
+from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
 
-_MIN_AGREEMENT = 0.12
-_MIN_LAG_GAIN = 0.004
+_MIN_AGREEMENT, _MIN_LARGE = 0.12, 0.07
+_MIN_LAG_GAIN, _LARGE = 0.004, 0.012
 """An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
 _HALF = 0.2
 """A half of the recording in which people move this share of all that they move has a say."""
@@ -44,7 +44,8 @@ class Lag:
     @property
     def is_offset(self) -> bool:
         """Whether it is more than chance."""
-        return self.agreement > _MIN_AGREEMENT and self.gain > _MIN_LAG_GAIN
+        small = self.agreement > _MIN_AGREEMENT and self.gain > _MIN_LAG_GAIN
+        return small or (self.agreement > _MIN_LARGE and self.gain > _LARGE)
 
 
 NONE = Lag(0, 0.0, 0.0)
@@ -153,16 +154,17 @@ _FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 GOOD = 0.45
 """A camera that matches the others' people so well is where it is said to be, but for small errors."""
 GOOD_PAIR = 0.65
-"""Two cameras match so much of each other's people: less is needed for that, their rays have only to meet. 60 sound
-recordings of two cameras had 0.67 and more, most of those whose one camera was mirrored or turned less."""
-_GAIN = 0.25
-"""What a change must bring of a camera's score to be named."""
+"""Of two cameras more is asked, because rays have only to meet: sound pairs had 0.67 and more, most of those with
+one that was mirrored, or turned by 8 degrees half-way, less."""
+_GAIN, _LIKELY = 0.12, 10.0
+"""What a change must bring of a camera's score, and of the likelihood's logarithm, to be named."""
 _EXPLAINED = 0.65
 """Everything fits so well where nothing but detectors err, or little more: no other explanation is sought."""
 _FEW = 40
 """Frames that are enough for what all cameras share."""
 _PRICE = 0.02
 """What a fitted parameter must bring of the score: half a centimetre of a person's joints is 0.02."""
+_SLIGHT = 0.08
 _PLAIN_TURN_DEG = 3.0
 """A camera that is turned by more is called turned, wherever it is."""
 
@@ -189,7 +191,11 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
         return None
     found: list[tuple[float, Change]] = []
     for view in weak:
-        options = [change for change in _of_one(look, view, rng) if change.score - fits[view] > _GAIN]
+        worth = independent(look.others(view))
+        least = likelihood(fits[view], worth, 0) + _LIKELY
+        options = [each for each in _of_one(look, view, rng) if each.score - fits[view] > _GAIN]
+        options = [each for each in options if not _slight(each.finding)]
+        options = [each for each in options if likelihood(each.score, worth, each.freedom) > least]
         options.sort(key=lambda change: change.score - _PRICE * change.freedom, reverse=True)
         found += [(_judged(look, change), change) for change in options[:2]]
     for first, second in combinations(weak, 2):
@@ -208,7 +214,21 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
             for change in _of_all(few)
         ]
     found = [(gain, change) for gain, change in found if gain > _GAIN / look.view_count]
-    return max(found, key=lambda pair: pair[0])[1] if found else None
+    if len(found) == 0:
+        return None
+    # All that is seen bears on it: as many independent joints as people and cameras have.
+    gains = np.array([gain for gain, _ in found]) * GATE / ERROR
+    gains *= look.view_count * max(independent(look.others(view)) for view in range(look.view_count))
+    best = found[int(np.argmax(gains))][1].finding
+    same = [(each.finding.kind, each.finding.cameras) == (best.kind, best.cameras) for _, each in found]
+    weights = np.exp(gains - gains.max())
+    change = found[int(np.argmax(gains))][1]
+    return replace(change, finding=replace(best, sure=float(weights[same].sum() / weights.sum())))
+
+
+def _slight(finding: Finding) -> bool:
+    """Whether it is too small to be gross: no pictures are made 4 % smaller."""
+    return finding.kind in (Kind.FOCAL, Kind.RESIZED) and abs(np.log(finding.amount)) < _SLIGHT
 
 
 def _judged(look: Look, change: Change) -> float:

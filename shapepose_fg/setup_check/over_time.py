@@ -15,7 +15,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import POSE, TURN, Others, Pinhole, match
+from shapepose_fg.setup_check.fit import POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, Sightings
 
 _PIECES = 8
@@ -29,26 +29,6 @@ _LEAST_DEG = 1.2
 """A smaller step or way is not told from a detector that errs otherwise on a person who turns round."""
 _SURE = 6.0
 """By so much the logarithm of the likelihood must rise over that of the best turn that lasts."""
-_LASTS = 45
-"""Frames after which a detector's errors are new: their correlation is 0.75 to 0.85 after one frame and 0.35 after
-a second (measured on Shelf and on simulated recordings)."""
-_JOINTS = 5
-"""Independent joints of a person: errors of one person in one view have two to three times the variance."""
-_ERROR = 0.03
-"""A detector's usual error, as a part of a person's size."""
-
-
-def independent(others: Others) -> float:
-    """How many independent joints people who are seen at some frames are worth."""
-    if len(others) == 0:
-        return 0.0
-    frames = np.unique(others.frame)
-    return _JOINTS * len(others) / len(frames) * max(1.0, min(float(np.ptp(frames)) / _LASTS, len(frames)))
-
-
-def likelihood(score: float, worth: float, freedom: int) -> float:
-    """The likelihood's logarithm, up to a constant, of errors with this mean (`Match.score`), less BIC's price."""
-    return worth * score * GATE / _ERROR - 0.5 * freedom * float(np.log(max(worth, 2.0)))
 
 
 def warped(seen: Sightings, camera: Pinhole, turns: Array) -> Sightings:
@@ -284,7 +264,7 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
 
 
 def _agreement(look: Look) -> tuple[Array, Array]:
-    """For each frame how well people that could be matched fit (`Match.score` times their number), and how many."""
+    """How well people fit in each frame (`Match.score` times their number), and how many could."""
     views, last = np.unique(look.sightings.view).tolist(), int(look.sightings.frame.max()) + 1
     if len(views) == 2:
         groups, error, _ = look.pair(*views)

@@ -94,7 +94,7 @@ class SetupReport:
             names = ", ".join(rig.names[view] for view in sorted({view for view, _, _ in self.trust.doubted}))
             words.append(
                 f"nothing says which of {names} is wrong: rows that rest on them have the status"
-                f" {Status.CONTRADICTED!r}, not 'ok'"
+                f" {str(Status.CONTRADICTED)!r}, not 'ok'"
             )
         return words
 
@@ -202,6 +202,8 @@ _MOST_BETA = 5.0
 """A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
 """Of so many rows: fewer are single people that hardly any camera saw."""
+_FASTEST_M_S, _PAIRS = 12.0, 10
+"""The world's fastest sprinter is as fast for a second; fewer than so many steps say nothing."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -276,7 +278,7 @@ def result_check(
             if warnings
             else "Nobody was found; look with check-calibration whether cameras and detections fit"
         )
-    warnings += _shapes(people)
+    warnings += _shapes(people) + _speeds(people) + _too_many(people)
     if len(report.findings) == 0:
         warnings += _outlier(uses)
     return ResultCheck(report, uses, tuple(warnings))
@@ -334,6 +336,38 @@ def _shapes(people: Reconstruction) -> list[str]:
     return [
         f"{far.sum()} of {len(far)} bodies have a shape that nobody has (a component of {largest.max():.0f}"
         " standard deviations); check the calibration's unit, and whether its poses are inverted"
+    ]
+
+
+def _speeds(people: Reconstruction) -> list[str]:
+    """People who move as nobody does."""
+    hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
+    order = np.lexsort((people.frame, people.person))
+    x, t = people.joints[order][:, hips].mean(axis=1), people.time_s[order]
+    follows = (np.diff(people.person[order]) == 0) & (np.diff(t) > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed = np.linalg.norm(np.diff(x, axis=0), axis=1)[follows] / np.diff(t)[follows]
+    speed = np.sort(speed[np.isfinite(speed)])
+    if len(speed) < 2 * _PAIRS:
+        return []
+    fast = float(np.median(speed[-max(len(speed) // 10, 1) :]))
+    if fast < _FASTEST_M_S:
+        return []
+    rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
+    return [
+        f"people move at {fast:.0f} m/s, and nobody does: --fps is probably wrong ({rate:.0f} a second; a camera"
+        " gives 25 to 60), or frames are missing, or the calibration's unit is wrong"
+    ]
+
+
+def _too_many(people: Reconstruction) -> list[str]:
+    """Frames with more detections than people could make."""
+    frames = sum(last - first for first, last in people.run.get("thinned_frames", {}).get("detections", []))
+    if frames == 0:
+        return []
+    return [
+        f"{frames} frames have more detections than people could make: who is who is chance there, and rows have"
+        f" the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
     ]
 
 
