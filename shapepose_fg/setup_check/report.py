@@ -202,8 +202,8 @@ _MOST_BETA = 5.0
 """A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
 """Of so many rows: fewer are single people that hardly any camera saw."""
-_FASTEST_M_S, _PAIRS = 12.0, 10
-"""The world's fastest sprinter is as fast for a second; fewer than so many steps say nothing."""
+_FASTEST_M_S, _PAIRS = 10.0, 10
+"""Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
