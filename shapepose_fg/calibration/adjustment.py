@@ -111,8 +111,8 @@ def adjust(
         pose = diagonal(np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel)
         priors.addPriorPose3(X(each), gtsam.Pose3(before.wTc), pose)
         noise = gaussian(_lens_covariance(before, sigmas, free))
-        add = priors.addPriorCal3DS2 if free else priors.addPriorCal3_S2
-        add(C(each), _lens(before, free), noise)
+        factor = gtsam.PriorFactorCal3DS2 if free else gtsam.PriorFactorCal3_S2
+        priors.add(factor(C(each), _lens(before, free), noise))  # type: ignore[arg-type]
     last = [letter(each) for letter in (X, C) for each in range(len(start))]
     order = gtsam.Ordering()
     for each in [*dict.fromkeys(joints), *last]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
@@ -40,11 +40,11 @@ class People:
         return len(self.frame)
 
     @property
-    def seen(self) -> Array:
+    def seen(self) -> Mask:
         """(P, J, V) which detections place a joint."""
-        return np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1])
+        return np.asarray(np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1]))
 
-    def only(self, keep: Array) -> "People":
+    def only(self, keep: Mask) -> "People":
         """Some of the people."""
         return People(self.frame[keep], self.xy[keep], self.sigma_px[keep], self.points[keep])
 
@@ -103,7 +103,7 @@ class Footage:
         return People(groups.frame, xy, np.where(placeable[..., None], sigma, np.nan), points)
 
 
-def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Array:
+def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
     """(P, J) which points are known in all directions from views that know them across their rays by `sigma_m`."""
     rays = points[:, :, None] - rig.centres
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)

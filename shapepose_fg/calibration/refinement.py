@@ -141,11 +141,11 @@ def refine(
             known = np.isfinite(both[0]) & np.isfinite(both[1])
             before.append(both[0][known])
             after.append(both[1][known])
-    medians = [float(np.median(np.concatenate(each))) for each in (before, after)]
+    was, now = (float(np.median(np.concatenate(each))) for each in (before, after))
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
     stature = build_of(found[0].people.points, detections.skeleton).stature
     notes = tuple(_undetermined(found[0], freedom, counts))
-    return Refinement(rig, found[0], freedom, *medians, counts, notes, stature)
+    return Refinement(rig, found[0], freedom, was, now, counts, notes, stature)
 
 
 def _fitted(

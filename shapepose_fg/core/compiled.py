@@ -1,19 +1,23 @@
 """Functions over rows, joints and frames, compiled by Numba: once for a machine, then read from its cache.
 
 A kernel takes whole arrays (C-contiguous, float64, intp or bool: every other type is compiled anew) and writes
-into arrays that it is given, so that Python is entered once for many rows. It calls kernels of its own file only:
-Numba compiles a function anew when *its* file has changed.
+into arrays that it is given, so that Python is entered once for many rows. Kernels and parts of any file may call
+each other; what else a kernel has from another file, a number say, must not change (or changes its name).
 """
 
 import gc
+import hashlib
 import logging
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
 from numba.core.caching import FunctionCache
-from numba.core.runtime import rtsys
+from numba.core.dispatcher import Dispatcher
+from numba.core.runtime.nrt import rtsys
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -30,16 +34,39 @@ def kernel(function: F) -> F:
 
 def part(function: F) -> F:
     """A piece of kernels, which Python cannot call: compiled with them, sooner than a kernel is."""
-    return cast(F, cast(Any, numba.njit)(no_cpython_wrapper=True, **_OPTIONS)(function))
+    return cast(F, cast(Any, numba.njit)(no_cpython_wrapper=True, forceinline=True, **_OPTIONS)(function))
 
 
 class _Cache(FunctionCache):
-    """Loads what is compiled without what only compiling needs, which takes a fifth of a second."""
+    """Numba compiles a function anew when its own file has changed; here also when one has that it calls into.
+
+    What is compiled is loaded without what only compiling needs, which takes a fifth of a second.
+    """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)  # for kernels that make arrays
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        return (*super()._index_key(sig, codegen), *(_digest(path) for path in sorted(_files(self._py_func))))
+
+
+def _files(function: Any) -> set[str]:
+    """The files of all kernels and parts that a function calls, or these do, its own and this one."""
+    known, waiting = {function}, [function]
+    while waiting:
+        one = waiting.pop()
+        for other in map(one.__globals__.get, one.__code__.co_names):
+            if isinstance(other, Dispatcher) and other.py_func not in known:
+                known.add(other.py_func)
+                waiting.append(other.py_func)
+    return {__file__, *(each.__code__.co_filename for each in known)}
+
+
+@cache
+def _digest(path: str) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 class _Compiling(event.Listener):

@@ -65,6 +65,20 @@ class Detections:
         rank[np.lexsort((*self.xy.T, self.confidence))] = np.arange(len(self)) / max(len(self), 1)
         return rank
 
+    @cached_property
+    def order(self) -> Index:
+        """(D,) the candidates by joint, then by view, then from left to right."""
+        return np.lexsort((self.xy[:, 0], self.view, self.joint))
+
+    @cached_property
+    def ties(self) -> tuple[Index, Index, Array]:
+        """Where the pairs of each candidate begin (D + 1,), their other ends (2 E,) and affinities (2 E,)."""
+        ends = self.pairs.ravel()
+        by_end = np.argsort(ends, kind="stable")
+        begin = np.searchsorted(ends[by_end], np.arange(len(self) + 1))
+        other = np.require(self.pairs[:, ::-1], np.intp).ravel()[by_end]
+        return begin, other, np.repeat(np.require(self.affinity, float), 2)[by_end]
+
     def only(self, keep: Mask) -> "Detections":
         """The candidates of the mask `keep` (D,), and the affinities between them."""
         return self.rows(np.flatnonzero(keep))

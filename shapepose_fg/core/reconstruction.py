@@ -330,3 +330,10 @@ def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> 
     order = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
     joints = {kind.name.lower(): int(known[kind]) for kind in order}
     return {"found": status.total(), "status": dict(status), "joints": joints}
+
+
+def sigma_m(covariance: Array) -> Array:
+    """(...) standard deviation of positions with covariance (..., 3, 3): root mean square over the axes."""
+    variance = np.trace(covariance, axis1=-2, axis2=-1) / 3
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))

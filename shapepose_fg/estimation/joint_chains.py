@@ -13,8 +13,9 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.in_time import spanned
-from shapepose_fg.estimation.kernels import ROBUST, ready, solve_chains
+from shapepose_fg.estimation.kernels import ready, solve_chains
 from shapepose_fg.estimation.linearisation import Message, symmetric_roots
 from shapepose_fg.estimation.motion_model import Lasting
 

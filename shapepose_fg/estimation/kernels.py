@@ -9,10 +9,9 @@ import math
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
+from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
 
-ROBUST = {None: 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
-"""Robust kernels by their number in kernels."""
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-13, 1e-6, 1e-10
 """Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
@@ -28,52 +27,21 @@ def ready(values: Array) -> Array:
     return np.require(values, np.float64, ("C", "W"))
 
 
-@kernel
-def _weight(robust, ratio):
-    """`factors.kernel_weight` of the squared norm over the squared width."""
-    if robust == 0:
-        return 1.0
-    if robust == 1:
-        return 1.0 / math.sqrt(max(ratio, 1.0))
-    if robust == 2:
-        return 1.0 / (1.0 + ratio)
-    if robust == 3:
-        return 1.0 / (1.0 + ratio) ** 2
-    return max(1.0 - ratio, 0.0) ** 2
-
-
-@kernel
-def _project(camera, x):
-    """Pixel and depth of a point."""
-    depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
-    u = camera[0, 0] * x[0] + camera[0, 1] * x[1] + camera[0, 2] * x[2] + camera[0, 3]
-    v = camera[1, 0] * x[0] + camera[1, 1] * x[1] + camera[1, 2] * x[2] + camera[1, 3]
-    return u / depth, v / depth, depth
-
-
-@kernel
-def _add_view(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
-    """Add J^T w J and J^T w r, with J the derivative of the pixel (u, v) and r = (to_u, to_v).
-
-    With a `lead`, seconds, the pixel is of x + lead v, and the velocity v follows the position x.
-    """
+@part
+def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
+    """Add what `add_view` leaves out where the pixel is of x + lead v: the velocity v follows the position x."""
     for a in range(3):
         ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
-        slope = weight * (ua * to_u + va * to_v)
-        gradient[a] += slope
-        if lead != 0.0:
-            gradient[3 + a] += lead * slope
+        gradient[3 + a] += lead * weight * (ua * to_u + va * to_v)
         for b in range(3):
             ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
-            square = weight * (ua * ub + va * vb) / depth
-            information[a, b] += square
-            if lead != 0.0:
-                information[a, 3 + b] += lead * square
-                information[3 + a, b] += lead * square
-                information[3 + a, 3 + b] += lead * lead * square
+            square = lead * weight * (ua * ub + va * vb) / depth
+            information[a, 3 + b] += square
+            information[3 + a, b] += square
+            information[3 + a, 3 + b] += lead * square
 
 
-@kernel
+@part
 def _eigen(A, values, vectors):
     """Eigenvalues, rising, and eigenvectors (columns) of a symmetric (3, 3), which is lost: Jacobi's rotations."""
     for a in range(3):
@@ -109,6 +77,26 @@ def _eigen(A, values, vectors):
 
 
 @kernel
+def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, points):
+    """Fill in `points` (N, J, 3) that are NaN where two views see them and agree (`linearisation.triangulate`)."""
+    weight, x = np.empty(xy.shape[2]), np.empty(3)
+    for n in range(len(points)):
+        at = n if len(cameras) > 1 else 0
+        for j in range(points.shape[1]):
+            seen = 0
+            for v in range(xy.shape[2]):
+                if confidence[n, j, v] > 0.0:
+                    seen += 1
+            if seen < 2 or not math.isnan(points[n, j, 0] + points[n, j, 1] + points[n, j, 2]):
+                continue
+            agree = triangulated(
+                cameras[at], focal[at], xy[n, j], confidence[n, j], scale_m, reach_m, least_depth, weight, x
+            )
+            if agree >= 2:
+                points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
+
+
+@kernel
 def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
     inlier, residual, information, gradient, target, sigma_m,
@@ -127,7 +115,7 @@ def look(
                 if not sigmas[n, j, v] > 0.0:
                     continue
                 camera = cameras[n if cameras.shape[0] > 1 else 0, v]
-                at_u, at_v, depth = _project(camera, x)
+                at_u, at_v, depth = project(camera, x)
                 if not depth >= least_depth:
                     continue
                 to_u, to_v = at_u - xy[n, j, v, 0], at_v - xy[n, j, v, 1]
@@ -139,10 +127,10 @@ def look(
                 if inlier[n, j, v]:
                     weight = 1.0 / (sigmas[n, j, v] * sigmas[n, j, v])
                     if by_reach:
-                        weight *= _weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
+                        weight *= robust_weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
                     else:
-                        weight *= _weight(robust, far * weight / (width * width))
-                    _add_view(camera, at_u, at_v, depth, to_u, to_v, weight, 0.0, H, g)
+                        weight *= robust_weight(robust, far * weight / (width * width))
+                    add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
             for a in range(3):
                 target[n, j, a] = x[a]
                 for b in range(3):
@@ -158,7 +146,7 @@ def look(
             sigma_m[n, j] = 1.0 / math.sqrt(values[0]) if values[0] > _NOTHING * values[2] else np.inf
 
 
-@kernel
+@part
 def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, width, H, g, at):
     """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g.
 
@@ -178,17 +166,19 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, wi
                     at[a] = state[t, a]
                     if later != 0.0:
                         at[a] += later * state[t, 3 + a]
-                u, v, depth = _project(camera, at)
+                u, v, depth = project(camera, at)
                 if depth > 0.0:
                     off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
-                    w *= _weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
+                    w *= robust_weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
                     # J x, without the product: the derivative of a quotient.
                     at_u = (u * camera[2, 3] - camera[0, 3]) / depth - off_u
                     at_v = (v * camera[2, 3] - camera[1, 3]) / depth - off_v
-                    _add_view(camera, u, v, depth, at_u, at_v, w, later, H[t], g[t])
+                    add_view(camera, u, v, depth, at_u, at_v, w, H[t], g[t])
+                    if later != 0.0:
+                        _add_velocity(camera, u, v, depth, at_u, at_v, w, later, H[t], g[t])
 
 
-@kernel
+@part
 def _factored(H, below, Z):
     """Block Cholesky down a chain, in place: H_t = L_t L_t^T, Z_t = L_t^-1 B_t^T. False where it is singular."""
     T, d = H.shape[:2]
@@ -223,7 +213,7 @@ def _factored(H, below, Z):
     return True
 
 
-@kernel
+@part
 def _solve(H, Z, g, x):
     """Put the solution of `_factored` blocks and the right side `g` (T + 1, d), which is lost, into `x` (T, d) if
     it is near; how far positions move, metres.
@@ -256,7 +246,7 @@ def _solve(H, Z, g, x):
     return farthest
 
 
-@kernel
+@part
 def _marginals(H, Z, M, G, S, covariance):
     """The blocks on the diagonal of the inverse of `_factored` ones, `covariance` (T, d, d), from the end back."""
     T, d = H.shape[:2]
@@ -319,4 +309,7 @@ def solve_chains(
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):
-            covariance[c] = np.nan
+            for t in range(T):
+                for a in range(d):
+                    for b in range(d):
+                        covariance[c, t, a, b] = np.nan

@@ -12,7 +12,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.kernels import ROBUST, look, ready
+from shapepose_fg.core.pieces import ROBUST
+from shapepose_fg.estimation.kernels import complete, look, ready
 
 MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
@@ -238,32 +239,13 @@ def mean_confidence(observations: Observations, inlier: Mask) -> Array:
     return np.where(inlier, observations.confidence, 0.0).mean(axis=-1)
 
 
-def triangulate(observations: Observations, views: Views, config: ObservationConfig, steps: int = 3) -> Array:
+def triangulate(observations: Observations, views: Views, config: ObservationConfig) -> Array:
     """X_0 made complete: joints that at least two views saw but stage I did not place, (N, J, 3) metres.
 
     Linear triangulation, iterated with robust weights; joints that stage I placed keep their place, and what
     fewer than two views saw, or views that disagree, stays NaN.
     """
-    missing = np.isnan(observations.initial).any(axis=-1) & (observations.seen.sum(axis=-1) >= 2)
-    row, joint = np.nonzero(missing)
-    if len(row) == 0:
-        return observations.initial
-    xy, seen = observations.xy[row, joint], observations.seen[row, joint]
-    here = views.rows(row)
-    K_inverse = np.linalg.inv(here.K)
-    normalised = np.einsum("...ij,...j->...i", K_inverse[..., :2, :2], xy) + K_inverse[..., :2, 2]
-    equations = normalised[..., None] * here.cTw[..., 2:3, :] - here.cTw[..., :2, :]
-    weight = seen * observations.confidence[row, joint]
-    points = np.full((len(row), 3), np.nan)
-    for _ in range(steps):
-        A = np.einsum("mv,mvki,mvkj->mij", weight, equations, equations)
-        damping = 1e-9 * np.trace(A[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        points = np.linalg.solve(A[:, :3, :3] + damping, -A[:, :3, 3:])[..., 0]
-        camera = np.einsum("...ij,...j->...i", here.cTw[..., :3], points[:, None]) + here.cTw[..., 3]
-        error_m = np.linalg.norm(camera[..., :2] - normalised * camera[..., 2:], axis=-1)
-        weight = seen * observations.confidence[row, joint] / (1.0 + (error_m / (2.0 * config.sigma_m)) ** 2)
-        weight /= np.maximum(camera[..., 2], MIN_DEPTH_M) ** 2
-    agrees = (seen & (error_m < config.rho_2d_m) & (camera[..., 2] > MIN_DEPTH_M)).sum(axis=1) >= 2
-    complete = observations.initial.copy()
-    complete[row[agrees], joint[agrees]] = points[agrees]
-    return complete
+    points = np.array(observations.initial, dtype=float, order="C")
+    given = views.projection, views.focal, ready(observations.xy), ready(observations.confidence)
+    complete(*given, 2.0 * config.sigma_m, config.rho_2d_m, MIN_DEPTH_M, points)
+    return points

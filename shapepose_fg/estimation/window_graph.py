@@ -259,11 +259,13 @@ class WindowGraph:
         """Whether the error falls by no more than the tolerance in a step by Gauss and Newton; if so, take it."""
         linear = self.graph.linearize(self.values)
         try:
-            step = linear.eliminateSequential(ordering).optimize()
+            solved = linear.eliminateSequential(ordering)
+            step = solved.optimize()
         except RuntimeError:  # a joint is not determined: damped, the others are solved all the same
             return False
-        before, after = linear.error(gtsam.VectorValues.Zero(step)), linear.error(step)
-        settled = before - after <= self.config.tolerance * before
+        nowhere = gtsam.VectorValues.Zero(step)
+        # What is eliminated has no error left at the step: what it has without is what the step takes away.
+        settled = solved.error(nowhere) <= self.config.tolerance * linear.error(nowhere)
         if settled:
             self.values = self.values.retract(step)
         return settled

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
+from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, robust_weight
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -142,7 +142,7 @@ class MultiViewSmplify:
         energy, B = self._energy, len(free)
         xyz, held = self.model.keypoints(energy.complete(free)), energy.held_by_priors(B)
         _, forces = views.pull(xyz, scale, weight, only)
-        targets = WhitenedTargets(xyz - forces, np.broadcast_to(np.eye(3), (*xyz.shape, 3)))
+        targets = EnergyTargets(xyz - forces, np.broadcast_to(np.eye(3), (*xyz.shape, 3)))
         return energy.linearise(free, targets, _NO_KERNEL, held, slope_only=True).gradient
 
 

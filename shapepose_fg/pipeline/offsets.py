@@ -73,7 +73,7 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
     with book.stage("offsets"):
         spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
-        hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).by_hips()
+        hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).of_few()
         people = [hips(detections[detections.first + t], rig) for t in spread]
         if len(people) == 0:
             return KeypointOffsets.identity()

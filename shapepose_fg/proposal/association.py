@@ -11,7 +11,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import Candidates
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, nearby
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Sight, nearby
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals
 
 _NEAR_M = 0.08
@@ -54,9 +54,10 @@ def associate(
 def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
     """(P, J, V) what people with joints at `places` (P, J, 3) get, who are thought to have `own` (P, J, V)."""
     world, unplaced = np.zeros(len(own), dtype=np.intp), np.isnan(places[..., 0])
-    near = nearby(places, np.full(unplaced.shape, _FAR_M), world, rig, skeleton, detections)
+    sight = Sight.of(detections, rig, skeleton)
+    near = nearby(places, np.full(unplaced.shape, _FAR_M), world, sight)
     if unplaced.any():
-        near = near.with_tied(own, unplaced, detections, len(rig))
+        near = near.with_tied(own, unplaced, sight)
     lost, reachable = np.isinf(near.distance_m), np.ones(len(near.person), dtype=bool)
     (xy, depth), of = rig.project(places), near.detection[lost]
     beside, view = skeleton.tree_neighbours[detections.joint[of]], detections.view[of]
@@ -65,8 +66,8 @@ def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skelet
     reachable[lost] = ((beside >= 0) & (away_m < _REACH_M)).any(axis=1)
     nearness = np.where(reachable, np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2), -np.inf)
     rule = nearness, lost & reachable, LEAST_AFFINITY
-    chosen, claims = near.claimed(*rule, own, world, detections, skeleton)
-    near.share(claims.tied, chosen, detections)
+    chosen, claims = near.claimed(*rule, own, world, sight)
+    near.share(claims.tied, chosen)
     return chosen
 
 

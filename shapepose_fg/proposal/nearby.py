@@ -15,6 +15,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.pieces import project
 from shapepose_fg.core.skeleton import Skeleton
 
 LEAST_AFFINITY = 0.3
@@ -23,6 +24,45 @@ true ones above 0.4."""
 OVERLAP_M = 0.025
 """Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
 serves both. A detector is 2 to 3 cm off."""
+
+
+class Sight(NamedTuple):
+    """A frame as kernels take it: V cameras, D detections, and the limbs of J joints."""
+
+    cameras: Array
+    """(V, 3, 4) K [R | t] of each view."""
+    focal: Array
+    """(V,) pixels."""
+    sizes: Array
+    """(V, 2) width and height of the pictures, pixels."""
+    of_view: Index
+    """(D,) which view saw each detection."""
+    of_joint: Index
+    """(D,) of which joint."""
+    xy: Array
+    """(D, 2) undistorted pixels."""
+    confidence: Array
+    """(D,) the detector's score."""
+    order: Index
+    """(D,) `Detections.order`."""
+    rank: Array
+    """(D,) `Detections.rank`."""
+    begin: Index
+    """(D + 1,) and the next two (2 E,): `Detections.ties`."""
+    other: Index
+    value: Array
+    limb: Index
+    """(J + 1,) where the limbs of each joint begin."""
+    limb_ends: Index
+    """(2 L,) the joints at their other ends."""
+
+    @classmethod
+    def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "Sight":
+        """What a rig saw."""
+        view, joint, xy, _, _ = detections.columns
+        confidence = np.require(detections.confidence, float, ["C", "W"])
+        seen = view, joint, xy, confidence, detections.order, detections.rank, *detections.ties
+        return cls(rig.K @ rig.cTw, rig.focal_px, rig.image_sizes, *seen, *_limb_ends(skeleton))
 
 
 class Claims(NamedTuple):
@@ -50,14 +90,7 @@ class Nearby:
     """(N,) from the joint's projection, metres at its depth."""
 
     def claimed(
-        self,
-        nearness: Array,
-        lost: Mask,
-        sure: float,
-        own: Index,
-        world: Index,
-        detections: Detections,
-        skeleton: Skeleton,
+        self, nearness: Array, lost: Mask, sure: float, own: Index, world: Index, sight: Sight
     ) -> tuple[Index, Claims]:
         """The detections (A, J, V) that people get, -1 for none, who are thought to have `own` (A, J, V): the best
         score first, each detection once in a `world` (A,), each person one for a joint and view.
@@ -65,83 +98,73 @@ class Nearby:
         The score is `nearness` (N,), 1 on the joint and 0 far from it, and mean affinity to the person's own. Of
         joints that are `lost` (N,) only affinity tells, and so much of it must be there.
         """
-        tied, neighbours = own_affinity(self.person, self.detection, own, detections, skeleton)
-        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
-        score = nearness + np.where(neighbours > 0, tied, LEAST_AFFINITY)
-        likely = np.where(lost, (neighbours > 0) & (tied >= sure), score >= 2 * LEAST_AFFINITY)
-        # People whom the detector has grouped have affinities of exactly 1: equal scores are told apart.
-        key, chosen = np.round(score, 9) + 1e-10 * detections.rank[self.detection], np.full_like(own, -1)
-        queue, taken = np.empty(len(key), dtype=np.intp), np.empty(len(detections), dtype=np.intp)
-        _match(self.first, self.person, self.detection, key, likely, world, queue, taken, chosen)
-        return chosen, Claims(tied, score, likely)
+        N, chosen = len(self.person), np.empty(own.shape, dtype=np.intp)
+        claims, taken = (
+            Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool)),
+            np.empty(len(sight.of_view), np.intp),
+        )
+        room = np.empty(N), np.empty(N, dtype=np.intp), taken
+        claim(
+            self.first,
+            self.person,
+            self.detection,
+            nearness,
+            lost,
+            sure,
+            own,
+            world,
+            sight,
+            *claims,
+            *room,
+            chosen,
+        )
+        return chosen, claims
 
-    def with_tied(self, own: Index, unplaced: Mask, detections: Detections, views: int) -> "Nearby":
+    def with_tied(self, own: Index, unplaced: Mask, sight: Sight) -> "Nearby":
         """And detections of joints that are `unplaced` (A, J), infinitely far, which affinities tie to people's
         `own` (A, J, V).
         """
         person, joint, view = np.nonzero(own >= 0)
-        mine, ends = own[person, joint, view], np.concatenate([detections.pairs, detections.pairs[:, ::-1]])
-        ends = ends[np.argsort(ends[:, 0], kind="stable")]
-        start, stop = (np.searchsorted(ends[:, 0], mine, side=side) for side in ("left", "right"))
-        count = stop - start
+        mine, views = own[person, joint, view], len(sight.cameras)
+        start, count = sight.begin[mine], sight.begin[mine + 1] - sight.begin[mine]
         whose = np.repeat(person, count)
-        each = np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)
-        tied = ends[each, 1]
-        lacks = unplaced[whose, detections.joint[tied]]
-        key = np.unique(whose[lacks] * len(detections) + tied[lacks])
-        whose, tied = np.divmod(key, max(len(detections), 1))
+        tied = sight.other[np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)]
+        lacks = unplaced[whose, sight.of_joint[tied]]
+        key = np.unique(whose[lacks] * len(sight.of_view) + tied[lacks])
+        whose, tied = np.divmod(key, max(len(sight.of_view), 1))
         person, detection = np.append(self.person, whose), np.append(self.detection, tied)
-        slot = detections.joint[detection] * views + detections.view[detection]
+        slot = sight.of_joint[detection] * views + sight.of_view[detection]
         order = np.lexsort((person, slot))
         first = np.searchsorted(slot[order], np.arange(len(self.first)))
         distance_m = np.append(self.distance_m, np.full(len(tied), np.inf))
         return Nearby(first, person[order], detection[order], distance_m[order])
 
-    def share(self, tied: Array, chosen: Index, detections: Detections) -> None:
+    def share(self, tied: Array, chosen: Index) -> None:
         """Let a detection on a joint, `tied` (N,) to its person, serve this one too where nothing is `chosen`."""
-        on_it = np.flatnonzero((self.distance_m < OVERLAP_M) & (tied >= LEAST_AFFINITY))
-        on_it = on_it[np.argsort(-self.distance_m[on_it], kind="stable")]  # the nearest is written last
-        of = self.detection[on_it]
-        place = self.person[on_it], detections.joint[of], detections.view[of]
-        empty = chosen[place] < 0
-        chosen[tuple(each[empty] for each in place)] = of[empty]
+        share(self.first, self.person, self.detection, self.distance_m, tied, chosen)
 
 
-def nearby(
-    places: Array, reach_m: Array, world: Index, rig: Rig, skeleton: Skeleton, detections: Detections
-) -> Nearby:
+def nearby(places: Array, reach_m: Array, world: Index, sight: Sight) -> Nearby:
     """Detections within `reach_m` (A, J) of `places` (A, J, 3), metres, of people of a `world` (A,)."""
     people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(places)
-    slot = detections.joint * len(rig) + detections.view
-    order = np.lexsort((detections.xy[:, 0], slot))
-    first = np.searchsorted(slot[order], np.arange(len(skeleton) * len(rig) + 1))
-    begins, count, room = np.zeros_like(first), 4 * reach_m.size * len(rig), 0
+    slots = places.shape[1] * len(sight.cameras) + 1
+    first, begins = np.zeros((2, slots), dtype=np.intp)
+    room, count = 0, 4 * reach_m.size * len(sight.cameras)
     person = detection = np.zeros(0, dtype=np.intp)
     distance_m = np.zeros(0)
     while count > room:
         room = count
         person, detection, distance_m = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room)
-        found = begins, person, detection, distance_m
-        count = _near(
-            places, reach_m, people, rig.K @ rig.cTw, rig.focal_px, first, order, detections.columns[2], *found
-        )
+        count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
     return Nearby(begins, person[:count], detection[:count], distance_m[:count])
 
 
-def own_affinity(
-    person: Index, detection: Index, candidate: Index, detections: Detections, skeleton: Skeleton
-) -> tuple[Array, Index]:
+def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight) -> tuple[Array, Index]:
     """Mean affinity (N,) of each `detection` (N,) to what a `person` (N,) has of `candidate` (A, J, V) at the
     other ends of the joint's limbs, and how many (N,) of these there are.
     """
-    view, joint, _, pairs, affinity = detections.columns
-    begin, (limb, ends) = np.zeros(len(view) + 2, dtype=np.intp), _limb_ends(skeleton)
-    other, value = np.empty(pairs.size, dtype=np.intp), np.empty(pairs.size)
     mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
-    _tie(
-        person, detection, candidate, joint, view, pairs, affinity, limb, ends, begin, other, value, mean,
-        neighbours,
-    )  # fmt: skip
+    tie(person, detection, candidate, sight, mean, neighbours)
     return mean, neighbours
 
 
@@ -153,20 +176,26 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
 
 
 @kernel
-def _near(places, reach_m, people, P, focal, first, order, xy, begins, person, detection, distance_m):
+def find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m):
     """Fill in what `nearby` returns, as far as there is room; returns how much there is.
 
-    `order` (D,) sorts detections by joint and view, of which each begins at `first` (J V + 1,), and by x.
+    Into `first` (J V + 1,) goes where detections of each joint and view begin in `sight.order`.
     """
-    views, count = len(P), 0
+    views, count, xy, order, cameras = len(sight.cameras), 0, sight.xy, sight.order, sight.cameras
+    of_joint, of_view, focal = sight.of_joint, sight.of_view, sight.focal
+    for slot in range(len(first)):
+        first[slot] = begins[slot] = 0
+    for d in range(len(order)):
+        first[of_joint[d] * views + of_view[d] + 1] += 1
     for slot in range(len(first) - 1):
+        first[slot + 1] += first[slot]
         j, v, stop = slot // views, slot % views, first[slot + 1]
         for n in range(len(people) if first[slot] < stop else 0):
-            place, reach = places[people[n], j], reach_m[people[n], j]
-            depth = _along(P[v, 2], place)
+            reach = reach_m[people[n], j]
+            x, y, depth = project(cameras[v], places[people[n], j])
             if not depth > 0:
                 continue
-            x, y, m_per_px = _along(P[v, 0], place) / depth, _along(P[v, 1], place) / depth, depth / focal[v]
+            m_per_px = depth / focal[v]
             reach_px = 1.000001 * reach / m_per_px
             low, high = first[slot], stop
             while low < high:  # the first that is not too far to the left
@@ -188,46 +217,47 @@ def _near(places, reach_m, people, P, focal, first, order, xy, begins, person, d
 
 
 @kernel
-def _along(row, place):
-    """A row (4,) of a projection times a place (3,), in the world."""
-    return row[0] * place[0] + row[1] * place[1] + row[2] * place[2] + row[3]
-
-
-@kernel
-def _tie(
-    person, detection, own, joint, view, pairs, affinity, limb, ends, begin, other, value, mean, neighbours
-):  # fmt: skip
-    """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`.
-
-    On the way `begin` (D + 2,), zeros before, `other` and `value` (2 E,): the pairs of each detection.
-    """
-    for e in range(len(pairs)):
-        for end in range(2):
-            begin[pairs[e, end] + 2] += 1
-    for d in range(2, len(begin)):
-        begin[d] += begin[d - 1]
-    for e in range(len(pairs)):
-        for end in range(2):
-            place = begin[pairs[e, end] + 1]
-            other[place], value[place] = pairs[e, 1 - end], affinity[e]
-            begin[pairs[e, end] + 1] += 1
+def tie(person, detection, own, sight, mean, neighbours):
+    """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
+    of_joint, of_view, begin, other, value = sight.of_joint, sight.of_view, sight.begin, sight.other, sight.value
+    limb, limb_ends = sight.limb, sight.limb_ends
     for e in range(len(person)):
-        a, d, count, total = person[e], detection[e], 0, 0.0
-        for n in range(limb[joint[d]], limb[joint[d] + 1]):
-            if own[a, ends[n], view[d]] >= 0:
-                count += 1
-        if count > 0:
+        a, d = person[e], detection[e]
+        j, v, total, there = of_joint[d], of_view[d], 0.0, 0
+        for n in range(limb[j], limb[j + 1]):
+            if own[a, limb_ends[n], v] >= 0:
+                there += 1
+        if there > 0:
             for n in range(begin[d], begin[d + 1]):
-                if own[a, joint[other[n]], view[other[n]]] == other[n]:
+                if own[a, of_joint[other[n]], v] == other[n]:
                     total += value[n]
-            total /= count
-        mean[e], neighbours[e] = total, count
+            total /= there
+        mean[e], neighbours[e] = total, there
 
 
 @kernel
-def _match(first, person, detection, key, likely, world, queue, taken, chosen):
-    """Give each detection of a joint and view to one person, and each person one, the best `key` first."""
-    views = chosen.shape[2]
+def claim(
+    first, person, detection, nearness, lost, sure, own, world, sight, tied, score, likely, key, queue, taken,
+    chosen,
+):  # fmt: skip
+    """Fill in what `Nearby.claimed` returns; `key` and `queue` (N,) and `taken` (D,) are room to work in."""
+    people, joints, views = chosen.shape
+    rank, count = sight.rank, first[len(first) - 1]
+    tie(person[:count], detection[:count], own, sight, tied, queue)
+    for e in range(count):
+        neighbours = queue[e]
+        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+        score[e] = nearness[e] + (tied[e] if neighbours > 0 else LEAST_AFFINITY)
+        if lost[e]:
+            likely[e] = neighbours > 0 and tied[e] >= sure
+        else:
+            likely[e] = score[e] >= 2 * LEAST_AFFINITY
+        # People whom the detector has grouped have affinities of exactly 1: equals are told apart.
+        key[e] = np.rint(score[e] * 1e9) / 1e9 + 1e-10 * rank[detection[e]]
+    for a in range(people):
+        for j in range(joints):
+            for v in range(views):
+                chosen[a, j, v] = -1
     for slot in range(len(first) - 1):
         j, v, end = slot // views, slot % views, first[slot]
         while end < first[slot + 1]:  # worlds stand one after the other, and do not compete
@@ -254,3 +284,20 @@ def _match(first, person, detection, key, likely, world, queue, taken, chosen):
                 a, d = person[queue[n]], detection[queue[n]]
                 if chosen[a, j, v] < 0 and taken[d] < 0:
                     chosen[a, j, v], taken[d] = d, a
+
+
+@kernel
+def share(first, person, detection, distance_m, tied, chosen):
+    """`Nearby.share`: the nearest of each person's detections of a joint and view."""
+    views = chosen.shape[2]
+    for slot in range(len(first) - 1):
+        j, v, e = slot // views, slot % views, first[slot]
+        while e < first[slot + 1]:
+            a, nearest = person[e], -1
+            while e < first[slot + 1] and person[e] == a:
+                on_it = distance_m[e] < OVERLAP_M and tied[e] >= LEAST_AFFINITY
+                if on_it and (nearest < 0 or distance_m[e] <= distance_m[nearest]):
+                    nearest = e
+                e += 1
+            if nearest >= 0 and chosen[a, j, v] < 0:
+                chosen[a, j, v] = detection[nearest]

@@ -1,7 +1,7 @@
 """People who may be there: the detections that each would explain, and where the joints then are."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.pieces import solved
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import nearby
+from shapepose_fg.proposal.nearby import Sight, nearby
 
 _NEAR_M = 0.06
 """How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
@@ -42,26 +43,36 @@ class Frame:
     """(J,) the longest distance of a joint to its parent on the skeleton."""
 
     @cached_property
+    def sight(self) -> Sight:
+        """The same as kernels take it."""
+        return Sight.of(self.detections, self.rig, self.skeleton)
+
+    @cached_property
     def rays(self) -> Array:
         """(D, 3) directions of length one, in the world, in which the detections lie."""
         return self.rig.rays(self.detections.view, self.detections.xy)
 
-    @cached_property
+    @property
     def spans(self) -> tuple[Index, Array]:
         """Pairs of joints (E, 2) at most three bones apart, and how far they are at most (E,), metres."""
-        joints = np.arange(len(self.skeleton))
-        bones = np.where(joints[:, None] == joints, 0, len(joints))
-        length = np.where(bones == 0, 0.0, np.inf)
-        children = [joint for joint in joints if self.skeleton.parents[joint] >= 0]
-        parents = [self.skeleton.parents[joint] for joint in children]
-        bones[children, parents] = bones[parents, children] = 1
-        length[children, parents] = length[parents, children] = self.longest_m[children]
-        for over in joints:  # the shortest ways, as Floyd and Warshall find them
-            bones = np.minimum(bones, bones[:, [over]] + bones[over])
-            length = np.minimum(length, length[:, [over]] + length[over])
-        near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
-        first, second = near.T
-        return near, np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
+        return _spans(self.skeleton, tuple(self.longest_m.tolist()))
+
+
+@cache
+def _spans(skeleton: Skeleton, longest_m: tuple[float, ...]) -> tuple[Index, Array]:
+    joints = np.arange(len(skeleton))
+    bones = np.where(joints[:, None] == joints, 0, len(joints))
+    length = np.where(bones == 0, 0.0, np.inf)
+    children = [joint for joint in joints if skeleton.parents[joint] >= 0]
+    parents = [skeleton.parents[joint] for joint in children]
+    bones[children, parents] = bones[parents, children] = 1
+    length[children, parents] = length[parents, children] = np.array(longest_m)[children]
+    for over in joints:  # the shortest ways, as Floyd and Warshall find them
+        bones = np.minimum(bones, bones[:, [over]] + bones[over])
+        length = np.minimum(length, length[:, [over]] + length[over])
+    near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
+    first, second = near.T
+    return near, np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
 
 
 @dataclass(frozen=True)
@@ -126,17 +137,17 @@ def settled(places: Array, own: Index, frame: Frame, passes: int, *, exclusive: 
 
 def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Index:
     """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the own."""
-    found, (H, J, V) = frame.detections, own.shape
+    H, J, _ = own.shape
     world = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)
-    near = nearby(places, np.full((H, J), _FAR_M), world, frame.rig, frame.skeleton, found)
+    near = nearby(places, np.full((H, J), _FAR_M), world, frame.sight)
     unplaced = np.isnan(places[..., 0])
     if unplaced.any():
-        near = near.with_tied(own, unplaced, found, V)
+        near = near.with_tied(own, unplaced, frame.sight)
     nearness = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2)
     lost = np.isinf(near.distance_m)
-    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, found, frame.skeleton)
+    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, frame.sight)
     if exclusive:
-        near.share(claims.tied, chosen, found)
+        near.share(claims.tied, chosen)
     return chosen
 
 
@@ -172,7 +183,7 @@ def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
                         weight[v] = confidence[d] / (1 + off * off)
 
 
-@kernel
+@part
 def _nearest(chosen, rays, weight, centres, place):
     """The point that is nearest to weighted rays of views: sum w (1 - r r^T) (x - c) = 0."""
     xx = yy = zz = 1e-9
@@ -186,15 +197,10 @@ def _nearest(chosen, rays, weight, centres, place):
             xx, yy, zz = xx + w * (1 - x * x), yy + w * (1 - y * y), zz + w * (1 - z * z)
             xy, xz, yz = xy - w * x * y, xz - w * x * z, yz - w * y * z
             px, py, pz = px + w * (a - along * x), py + w * (b - along * y), pz + w * (c - along * z)
-    # A matrix of three is solved by its cofactors.
-    first, second, third = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    over = 1.0 / (xx * first + xy * second + xz * third)
-    place[0] = (first * px + second * py + third * pz) * over
-    place[1] = (second * px + (xx * zz - xz * xz) * py + (xy * xz - xx * yz) * pz) * over
-    place[2] = (third * px + (xy * xz - xx * yz) * py + (xx * yy - xy * xy) * pz) * over
+    solved(xx, xy, xz, yy, yz, zz, px, py, pz, place)
 
 
-@kernel
+@part
 def _gap(ray, centre, place):
     """How far a ray passes a place, metres; infinite behind the camera."""
     x, y, z = place[0] - centre[0], place[1] - centre[1], place[2] - centre[2]

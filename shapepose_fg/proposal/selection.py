@@ -77,7 +77,7 @@ class Evidence:
         chosen, detections = people.chosen, frame.detections
         has, worth = chosen >= 0, np.zeros(chosen.shape)
         whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
-        affinity, neighbours = own_affinity(whose, which, chosen, detections, frame.skeleton)
+        affinity, neighbours = own_affinity(whose, which, chosen, frame.sight)
         near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / _GAP_M) ** 2)
         worth[has] = detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
         xy, depth = frame.rig.project(people.places)

@@ -18,8 +18,8 @@ from shapepose_fg.proposal.proposals import ProposalConfig, propose
 from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
 
-_POINTS_LEFT, _CANDIDATES_LEFT = 1000, 50
-"""Points and candidates of one joint at the most among what evidence leaves over."""
+_POINTS_OF_FEW, _CANDIDATES_OF_FEW = 1000, 50
+"""Points and candidates of one joint at the most where few people are wanted."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,15 @@ class StageOne:
         """The same with people sought by their hips, as in the paper, and not judged by evidence."""
         return replace(self, proposals=replace(self.proposals, evidence=False))
 
-    def of_the_rest(self) -> "StageOne":
-        """`by_hips` for what evidence leaves over: hips that two views saw, of few people; little is kept."""
-        few = replace(self.candidates, min_votes=1, most_points=_POINTS_LEFT, most_candidates=_CANDIDATES_LEFT)
+    def of_few(self) -> "StageOne":
+        """`by_hips` where few people are wanted, of however many there are: little is kept."""
+        few = replace(self.candidates, most_points=_POINTS_OF_FEW, most_candidates=_CANDIDATES_OF_FEW)
         return replace(self.by_hips(), candidates=few)
+
+    def of_the_rest(self) -> "StageOne":
+        """`of_few` for what evidence leaves over: hips that two views saw."""
+        few = self.of_few()
+        return replace(few, candidates=replace(few.candidates, min_votes=1))
 
     def __call__(self, detections: Detections, rig: Rig) -> Observations:
         """The people of a frame."""
@@ -53,6 +58,9 @@ class StageOne:
         with self.book.stage("propose"):
             frame = Frame(once, rig, self.skeleton, longest_bones(self.skeleton))
             people, _ = choose(points, frame, self.proposals.min_probability)
+            most = self.proposals.most_people
+            self.book.thin("people", len(people) > most)
+            people = people.rows(np.arange(min(len(people), most)))  # the surest come first
         chosen = np.where(people.chosen >= 0, np.append(index, -1)[people.chosen], -1)
         return Observations.of(chosen, detections, people.places)
 

@@ -206,7 +206,8 @@ def _triangulate(
                     _solve(A, b, gu)
                     for i in range(3):
                         x[i] -= gu[i]
-            points[p, j] = x
+            for i in range(3):
+                points[p, j, i] = x[i]
 
 
 @kernel

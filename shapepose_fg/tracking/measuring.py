@@ -1,139 +1,175 @@
 """Joints of people after a frame, by the detections that are theirs: Kalman's update, linearised anew in turn."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA
-from shapepose_fg.core.arrays import Index, Mask
-from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.compiled import kernel
-from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig, triangulate
-from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.compiled import kernel, part
+from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
+from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
+from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
+from shapepose_fg.tracking.plausibility import tear
+from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
 _ITERATIONS = 3
 """How often gates and linearisation are made anew in one frame."""
-_KERNELS = ("none", "huber", "cauchy", "geman_mcclure", "tukey")
-"""Robust kernels, by the number that stands for them in `_weight`."""
+MIN_SEEN_TWICE = 4
+"""Core joints that two views must see for a frame to count as evidence of the person."""
+MIN_IN_A_VIEW = 9
+"""Core joints of which one view sees enough for the same: more than half of a body is no chance."""
+
+
+class Trust(NamedTuple):
+    """How far detections are trusted, as kernels take it (`ObservationConfig`)."""
+
+    scatter: Array
+    """(J,) what sigma is multiplied with for each joint."""
+    sigma_m: float
+    floor_rad: float
+    rho_2d_m: float
+    fixed_depth_m: float
+    robust: int
+    width: float
+    """The robust kernel and its width, standard deviations."""
+
+    @classmethod
+    def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "Trust":
+        """The settings, for `joints` of these names."""
+        return cls(
+            config.scatter(joints), float(config.sigma_m), float(config.floor_rad), float(config.rho_2d_m),
+            float(config.fixed_depth_m or 0.0), ROBUST[config.kernel], DEFAULT_WIDTH_SIGMA.get(config.kernel, 1.0),
+        )  # fmt: skip
 
 
 def measured(
-    joints: JointStates,
-    lost: Mask,
-    candidate: Index,
-    detections: Detections,
-    rig: Rig,
-    config: ObservationConfig,
-    names: tuple[str, ...],
-) -> tuple[JointStates, Mask]:
-    """A people's joints, of these `names`, after a frame in which they have the detections `candidate` (A, J, V),
-    -1 for none; and which of these (A, J, V) are within the gate.
+    joints: JointStates, lost: Mask, candidate: Index, weight: Array, sight: Sight, trust: Trust, bones: Bones
+) -> tuple[JointStates, Index, Mask]:
+    """A people's joints after a frame in which they have the detections `candidate` (A, J, V), -1 for none; those
+    of them that are within the gate, and of joints that can be the person's own; and for whom they are evidence
+    (A,): enough core joints are seen by two views, or by one.
 
-    It is what `observation_sigmas` and `linearise` say at the joints, as the measurement of a Kalman filter.
-    Joints that are `lost` (A, J) begin where the views put them, if two or more do.
+    It is what `observation_sigmas` and `linearise` say at the joints, as the measurement of a Kalman filter;
+    `weight` (D,) is that of each detection, 0 for none. Joints that are `lost` (A, J) begin where the views put
+    them, if two or more do.
     """
-    at = joints.position.copy()
-    unplaced = lost & ((candidate >= 0).sum(axis=-1) >= 2)
-    rows = np.flatnonzero(unplaced.any(axis=1))
-    if len(rows) > 0:
-        begin = np.where(unplaced[rows][..., None], np.nan, at[rows])
-        placed = triangulate(Observations.of(candidate[rows], detections, begin), Views.of(rig), config)
-        at[rows] = np.where(np.isfinite(placed), placed, at[rows])
-    weight = np.where(detections.confidence > 0, config.weight(detections.confidence), 0.0)
-    wide = DEFAULT_WIDTH_SIGMA.get(config.kernel, 1.0)
-    sigma, gate = (config.sigma_m, config.floor_rad), (config.rho_2d_m, config.fixed_depth_m)
-    numbers = np.array([*sigma, *gate, _KERNELS.index(config.kernel), wide, MIN_DEPTH_M])
-    mean, covariance = joints.mean.copy(), joints.covariance.copy()
-    inlier = np.zeros(candidate.shape, dtype=bool)
-    seen = detections.columns[2], weight, config.scatter(names)
-    _measure(mean, covariance, at, candidate, *seen, rig.K @ rig.cTw, rig.focal_px, numbers, inlier)
-    return JointStates(mean, covariance), inlier
+    mean, covariance, kept = joints.mean.copy(), joints.covariance.copy(), candidate.copy()
+    evident = np.empty(len(mean), dtype=bool)
+    _measure(mean, covariance, lost, kept, weight, sight, trust, bones, evident)
+    return JointStates(mean, covariance), kept, evident
 
 
 @kernel
-def _measure(mean, covariance, at, candidate, xy, confident, scatter, P, focal, numbers, inlier):
-    """Update `mean` (A, J, S) and `covariance` (A, J, S, S) by views `P` (V, 3, 4), pixels from the world."""
-    sigma_m, floor_rad, nearest_m = numbers[0], numbers[1], numbers[6]
+def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, evident):
+    """Update `mean` (A, J, S) and `covariance` (A, J, S, S), take out of `candidate` what does not fit, fill in
+    `evident` (A,).
+    """
     people, joints, views = candidate.shape
-    sigma, depths = np.empty(views), np.empty(views)
+    sigma_px, depths, room, inlier = (
+        np.empty(views),
+        np.empty(views),
+        np.empty(views),
+        np.empty((joints, views), dtype=np.bool_),
+    )
     L, g, M, gain = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, mean.shape[2], 3))
+    trusted, torn = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
+    seen_by, above = np.empty(joints, dtype=np.intp), np.empty(joints, dtype=np.intp)
+    way_m, count, too_long = np.empty(joints), np.empty(joints), np.empty(joints)
+    cameras, focal, xy, core, scatter = sight.cameras, sight.focal, sight.xy, bones.core, trust.scatter
+    numbers, fixed_m = trust[1:], trust.fixed_depth_m
+    longest_m, parents, at, uv, sure = (
+        bones.longest_m,
+        bones.parents,
+        np.empty(3),
+        np.empty((views, 2)),
+        np.empty(views),
+    )
     for a in range(people):
         for v in range(views):
-            depths[v] = _mean_depth(mean[a], P[v, 2], nearest_m)
+            depths[v] = _mean_depth(mean[a], cameras[v])
         for j in range(joints):
-            seen = False
+            seen, at[0], at[1], at[2] = 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             for v in range(views):
-                d, sigma[v] = candidate[a, j, v], 0.0
+                d, sigma_px[v], inlier[j, v] = candidate[a, j, v], 0.0, False
                 if d >= 0 and confident[d] > 0:
-                    depth = _along(P[v, 2], mean[a, j])
-                    depth = numbers[3] if numbers[3] > 0 else depth if depth >= nearest_m else depths[v]
-                    px = np.sqrt((floor_rad * focal[v]) ** 2 + (sigma_m * focal[v] / depth) ** 2)
-                    sigma[v], seen = px * scatter[j] / np.sqrt(confident[d]), True
-            if seen:
+                    depth = project(cameras[v], mean[a, j])[2]
+                    depth = depth if depth >= MIN_DEPTH_M else depths[v]
+                    depth = fixed_m if fixed_m > 0 else depth
+                    px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
+                    sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
+            if lost[a, j] and seen >= 2:
+                for v in range(views):
+                    d = candidate[a, j, v]
+                    sure[v] = sight.confidence[d] if d >= 0 else 0.0
+                    uv[v, 0], uv[v, 1] = xy[d, 0], xy[d, 1]
+                scale_m, reach_m = 2.0 * trust.sigma_m, trust.rho_2d_m
+                if triangulated(cameras, focal, uv, sure, scale_m, reach_m, MIN_DEPTH_M, room, at) < 2:
+                    at[0], at[1], at[2] = mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
+            if seen > 0:
                 for _ in range(_ITERATIONS):
-                    _linearise(at[a, j], candidate[a, j], xy, sigma, P, focal, numbers, L, g, inlier[a, j])
-                    _move(mean[a, j], covariance[a, j], at[a, j], L, g, M, gain)
+                    _linearise(at, candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j])
+                    _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
+            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, 0
+            for v in range(views):
+                seen_by[j] += inlier[j, v]
+        tear(mean[a], trusted, seen_by, longest_m, parents, FARTHEST_M, above, way_m, count, too_long, torn)
+        twice, most = 0, 0
+        for j in range(joints):
+            for v in range(views):
+                if torn[j] or not inlier[j, v]:
+                    candidate[a, j, v] = -1
+            if torn[j]:
+                for x in range(3):
+                    covariance[a, j, x, x] += FARTHEST_M**2
+            elif core[j] and seen_by[j] >= 2:
+                twice += 1
+        for v in range(views):
+            in_view = 0
+            for j in range(joints):
+                if core[j] and candidate[a, j, v] >= 0:
+                    in_view += 1
+            most = max(most, in_view)
+        evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
 
 
-@kernel
-def _along(row, place):
-    """A row (4,) of a projection times a place (3,), in the world."""
-    return row[0] * place[0] + row[1] * place[1] + row[2] * place[2] + row[3]
-
-
-@kernel
-def _mean_depth(mean, row, nearest_m):
+@part
+def _mean_depth(mean, camera):
     """Of the joints in front of a view."""
     total, count = 0.0, 0
     for j in range(len(mean)):
-        depth = _along(row, mean[j])
-        if depth >= nearest_m:
+        depth = project(camera, mean[j])[2]
+        if depth >= MIN_DEPTH_M:
             total += depth
             count += 1
-    return total / count if count > 0 else nearest_m
+    return total / count if count > 0 else MIN_DEPTH_M
 
 
-@kernel
-def _linearise(place, candidate, xy, sigma, P, focal, numbers, L, g, inlier):
+@part
+def _linearise(place, candidate, sigma_px, cameras, focal, xy, numbers, L, g, inlier):
     """Sum up what views say of a joint at `place`: information L (3, 3) and gradient g (3,)."""
+    rho_m, fixed_m, robust, width = numbers[2], numbers[3], numbers[4], numbers[5]
     for i in range(3):
         g[i] = L[i, 0] = L[i, 1] = L[i, 2] = 0.0
-    for v in range(len(P)):
-        depth, d = _along(P[v, 2], place), candidate[v]
+    for v in range(len(sigma_px)):
         inlier[v] = False
-        if sigma[v] == 0 or not depth >= numbers[6]:
+        if sigma_px[v] == 0:
             continue
-        x, y = _along(P[v, 0], place) / depth, _along(P[v, 1], place) / depth
+        (x, y, depth), d = project(cameras[v], place), candidate[v]
+        if not depth >= MIN_DEPTH_M:
+            continue
         to_x, to_y = x - xy[d, 0], y - xy[d, 1]
-        off = np.sqrt(to_x * to_x + to_y * to_y)
-        if not off < numbers[2] * focal[v] / (numbers[3] if numbers[3] > 0 else depth):
-            continue
-        inlier[v] = True
-        weight = _weight(numbers[4], off / sigma[v] / numbers[5]) / (sigma[v] * depth) ** 2
-        for i in range(3):
-            dx, dy = P[v, 0, i] - x * P[v, 2, i], P[v, 1, i] - y * P[v, 2, i]
-            g[i] += weight * depth * (dx * to_x + dy * to_y)
-            for k in range(3):
-                L[i, k] += weight * (dx * (P[v, 0, k] - x * P[v, 2, k]) + dy * (P[v, 1, k] - y * P[v, 2, k]))
+        squared = to_x * to_x + to_y * to_y
+        inlier[v] = np.sqrt(squared) < rho_m * focal[v] / (fixed_m if fixed_m > 0 else depth)
+        if inlier[v]:
+            weight = 1 / (sigma_px[v] * sigma_px[v])
+            weight *= robust_weight(robust, squared * weight / (width * width))
+            add_view(cameras[v], x, y, depth, to_x, to_y, weight, L, g)
 
 
-@kernel
-def _weight(shape, ratio):
-    """What a robust kernel leaves of a residual of `ratio` times its width (`factors.kernel_weight`)."""
-    squared = ratio * ratio
-    if shape == 0 or (shape == 1 and squared <= 1):
-        return 1.0
-    if shape == 1:
-        return 1.0 / ratio
-    if shape == 2:
-        return 1.0 / (1.0 + squared)
-    if shape == 3:
-        return 1.0 / (1.0 + squared) ** 2
-    return (1.0 - squared) ** 2 if squared < 1 else 0.0
-
-
-@kernel
+@part
 def _move(mean, P, place, L, g, M, gain):
     """Put `place` where a joint is after the measurement, by the gain P (1 + L P)^-1.
 
@@ -153,7 +189,7 @@ def _move(mean, P, place, L, g, M, gain):
         place[i] = mean[i] + gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
 
 
-@kernel
+@part
 def _update(mean, P, L, M, gain):
     """A joint's state after `_move`: P less (gain L) P, symmetric."""
     for i in range(len(mean)):
@@ -170,7 +206,7 @@ def _update(mean, P, L, M, gain):
             P[k, i] = P[i, k]
 
 
-@kernel
+@part
 def _invert(M):
     """The inverse of a matrix (3, 3), in its place."""
     a, b, c, d, e, f, g, h, i = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2], M[2, 0], M[2, 1], M[2, 2]

@@ -1,17 +1,16 @@
 """Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
-from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.compiled import kernel, part
+from shapepose_fg.core.pieces import project
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import own_affinity
+from shapepose_fg.proposal.nearby import Sight, tie
 
 _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
@@ -68,7 +67,7 @@ class Chosen:
 
 
 def weighed(
-    candidate: Index, places: Array, detections: Detections, rig: Rig, skeleton: Skeleton, world: Index
+    candidate: Index, places: Array, sight: Sight, skeleton: Skeleton, world: Index
 ) -> tuple[Array, Array]:
     """What each detection of A people counts (A, J, V), and what being there costs (A,), both as shares of the
     places where they should be seen.
@@ -78,37 +77,63 @@ def weighed(
     person's others, and pays for its place. A place is a joint in the picture of a view; joints whose place is
     unknown are thought to be where the others are in the mean.
     """
-    weight, price, seen = np.zeros(candidate.shape), np.zeros(len(candidate)), np.nonzero(candidate >= 0)
-    whose = np.ascontiguousarray(seen[0])
-    affinity, neighbours = own_affinity(whose, candidate[seen], candidate, detections, skeleton)
-    weight[seen] = np.where(neighbours > 0, np.clip(affinity / _SURE_AFFINITY, 0.0, 1.0), _ALONE)
-    known = np.asarray(np.isfinite(places).all(axis=-1))
-    centre = np.where(known[..., None], places, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
-    at, P, core = np.where(known[..., None], places, centre[:, None]), rig.K @ rig.cTw, set(skeleton.core)
-    limbs = np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
-    room = np.empty((3, *known.shape)), np.empty((len(at), 3)), np.zeros(len(at))
-    _weigh(at, known, world, P, rig.focal_px, rig.image_sizes, limbs, *room, weight, price)
+    (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
+    whole, real = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
+    weight, price = np.zeros(candidate.shape), np.zeros(A)
+    _weigh(
+        candidate, places, known, world, sight, limbs_of(skeleton), whole[0], whole[1], whole[2], real,
+        np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A), weight, price,
+    )  # fmt: skip
     return weight, price
 
 
+@cache
+def limbs_of(skeleton: Skeleton) -> Index:
+    """(L, 2) the limbs of core joints, and the spine: what hides others."""
+    core = set(skeleton.core)
+    return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
+
+
 @kernel
-def _weigh(places, known, world, P, focal, sizes, limbs, seen, box, expected, weight, price):
-    """Make what detections count, `weight` (A, J, V), a share of the places; fill in `price` (A,).
+def _weigh(
+    candidate, places, known, world, sight, limbs, whose, which, neighbours, tied, at, seen, box, expected, weight,
+    price,
+):  # fmt: skip
+    """Fill in what `weighed` returns, zeros before; `expected` (A,) is how many places there are.
 
     For one view after the other: `seen` (3, A, J) x, y and depth of all joints, and between what they are, `box`
-    (A, 3): left, right and the nearest.
+    (A, 3): left, right and the nearest. Joints are `at` (A, J, 3), or where the others are in the mean.
     """
     people, joints, views = weight.shape
+    cameras, count = sight.cameras, 0
+    for a in range(people):
+        for j in range(joints):
+            for v in range(views):
+                if candidate[a, j, v] >= 0:
+                    whose[count], which[count] = a, candidate[a, j, v]
+                    count += 1
+    tie(whose[:count], which[:count], candidate, sight, tied, neighbours)
+    count = 0
+    for a in range(people):
+        for j in range(joints):
+            for v in range(views):
+                if candidate[a, j, v] >= 0:
+                    counts = min(max(tied[count] / _SURE_AFFINITY, 0.0), 1.0)
+                    weight[a, j, v] = counts if neighbours[count] > 0 else _ALONE
+                    count += 1
+    for a in range(people):
+        _fill(places[a], known[a], at[a])
     for v in range(views):
+        width, height, focal = sight.sizes[v, 0], sight.sizes[v, 1], sight.focal[v]
         for a in range(people):
-            _picture(places[a], known[a], P[v], focal[v], a, seen, box[a])
+            _picture(at[a], known[a], cameras[v], focal, a, seen, box[a])
         for a in range(people):
             for j in range(joints):
                 x, y, depth = seen[0, a, j], seen[1, a, j], seen[2, a, j]
-                if not (depth > 0 and 0 <= x < sizes[v, 0] and 0 <= y < sizes[v, 1]):
+                if not (depth > 0 and 0 <= x < width and 0 <= y < height):
                     continue
                 place = a, x, y, depth - _IN_FRONT_M
-                hidden = not known[a, j] or _behind(place, known, world, limbs, seen, box, focal[v])
+                hidden = not known[a, j] or _behind(place, known, world, limbs, seen, box, focal)
                 cost = _PRICE_HIDDEN if hidden else _PRICE
                 weight[a, j, v] *= 1 + cost
                 price[a] += cost
@@ -120,27 +145,36 @@ def _weigh(places, known, world, P, focal, sizes, limbs, seen, box, expected, we
                 weight[a, j, v] /= max(expected[a], 1.0)
 
 
-@kernel
-def _picture(places, known, P, focal, a, seen, box):
+@part
+def _fill(places, known, at):
+    """A person's joints (J, 3), those that are not known where the others are in the mean."""
+    for x in range(3):
+        total, count = 0.0, 0
+        for j in range(len(places)):
+            if known[j]:
+                total += places[j, x]
+                count += 1
+        for j in range(len(places)):
+            at[j, x] = places[j, x] if known[j] else total / max(count, 1)
+
+
+@part
+def _picture(places, known, camera, focal, a, seen, box):
     """Put a person's joints in a view, in `seen` and in `box`, which has a limb's width more on both sides."""
     box[0], box[1], box[2] = np.inf, -np.inf, np.inf
     for j in range(len(places)):
-        X, Y, Z = places[j, 0], places[j, 1], places[j, 2]
-        depth = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
-        over = 1.0 / depth if depth > 0 else np.nan
-        seen[2, a, j] = depth
-        for n in range(2):
-            seen[n, a, j] = (P[n, 0] * X + P[n, 1] * Y + P[n, 2] * Z + P[n, 3]) * over
+        x, y, depth = project(camera, places[j])
+        seen[0, a, j], seen[1, a, j], seen[2, a, j] = x, y, depth
         if known[j]:
             box[2] = min(box[2], depth)
             if depth > 0:
-                box[0], box[1] = min(box[0], seen[0, a, j]), max(box[1], seen[0, a, j])
+                box[0], box[1] = min(box[0], x), max(box[1], x)
     margin = _LIMB_M * focal / max(box[2], _LIMB_M)
     box[0] -= margin
     box[1] += margin
 
 
-@kernel
+@part
 def _behind(place, known, world, limbs, seen, box, focal):
     """Whether the `place` (whose, x, y, depth) is behind a limb of somebody else of the same world, both of whose
     ends are known.
@@ -186,7 +220,7 @@ def probability(evidence: float) -> float:
 class Account:
     """H hypotheses as detections with weights, in T frames: who of them is there is chosen from this."""
 
-    place: Index
+    place: NDArray[np.int32]
     """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) what it counts."""
@@ -213,9 +247,10 @@ class Account:
         `price` (H, T) of `weighed`.
         """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
-        first, count = np.cumsum(counts) - counts, int(counts.sum())
-        place = np.where(candidate >= 0, candidate + first[:, None, None], count).reshape(shape)
-        weights = np.where(candidate >= 0, weight, 0.0).reshape(shape).astype(np.float32)
+        first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())
+        place = np.where(candidate >= 0, candidate + first[:, None, None], np.int32(count)).reshape(shape)
+        weights = np.where(candidate >= 0, weight, np.float32(0)).reshape(shape)
+        place, weights = place.astype(np.int32, copy=False), weights.astype(np.float32, copy=False)
         seen = np.append(np.flatnonzero(counts), 0)
         span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
         return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
@@ -268,13 +303,13 @@ class Account:
         return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
 
     @cached_property
-    def holders(self) -> tuple[Index, Index, Array]:
+    def holders(self) -> tuple[Index, NDArray[np.int32], NDArray[np.float32]]:
         """Where those who have each detection begin, (D + 1,), who they are, and what it counts for them, one
         detection after the other.
         """
         counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
         begin = np.cumsum(np.concatenate([[0, 0], counts]))
-        who, what = np.empty(begin[-1], dtype=np.intp), np.empty(begin[-1])
+        who, what = np.empty(begin[-1], dtype=np.int32), np.empty(begin[-1], dtype=np.float32)
         _holders(self.place, self.weight, begin, who, what)
         return begin[:-1], who, what
 
@@ -343,7 +378,7 @@ def _in_turn(
     return count
 
 
-@kernel
+@part
 def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
     """Somebody is there for some frames: their detections are evidence of nobody else."""
     person = chosen[0]

@@ -11,6 +11,7 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
+from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.tracking.following import core_distance
@@ -67,7 +68,7 @@ def changed(before: Observations, now: Observations) -> float:
 def _given_out(frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton) -> tuple[Index, Array]:
     """(P, J, V) the detections of one frame's people, and how probably they are theirs."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
-    return assign_with_probability(predicted, frame.detections, frame.rig, skeleton)
+    return assign_with_probability(predicted, Sight.of(frame.detections, frame.rig, skeleton))
 
 
 def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:

@@ -7,6 +7,7 @@ of whom each detection has one; worlds know nothing of each other.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,14 @@ from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.proposal.association import seen_twice
-from shapepose_fg.tracking.measuring import measured
-from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.plausibility import torn_joints
-from shapepose_fg.tracking.view_assignment import FARTHEST_M, Predicted, assign
+from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.tracking.measuring import Trust, measured
+from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
+from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 FindPeople = Callable[[Detections, Rig], Observations]
 """Stage I of one frame: detections and rig to people."""
@@ -32,23 +31,10 @@ NoteDropped = Callable[[str, list[int]], None]
 """Notes down a reason, and the frames in which somebody was not kept for it."""
 
 
-_LOST_M = 0.2
-"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton. A
-joint that one view sees is not, however far along the ray it may be."""
-_TRUSTED_M = 0.1
-"""A joint with a smaller sigma is judged by the length of its bones, and is not lost in the next frame, however
-long that is in coming: at 10 frames a second the velocity of a new person's joints alone makes it uncertain by 20
-cm."""
-_FOLLOW_S = 0.25
-"""Time constant with which the velocity of an unseen joint becomes that of the person."""
-_FOLLOW_SIGMA_M = 0.05
-"""Sigma from which on a joint counts as unseen in this sense."""
-_MIN_SEEN_TWICE = 4
-"""Core joints that two views must see for a frame to count as evidence of the person."""
-_MIN_IN_A_VIEW = 9
-"""Core joints of which one view sees enough for the same: more than half of a body is no chance."""
 _APART_M = 0.25
 """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
+_MOST_PEOPLE = 64
+"""Where stage I finds as many as it may (`ProposalConfig.most_people`), nobody is sought among the rest."""
 _BIRTH_SIGMA_M = 0.04
 """Sigma of a new person's joints as stage I places them."""
 
@@ -144,16 +130,25 @@ class Tracker:
         """The next frame, at `time_s` (earlier than the last where time runs backwards), and the detections of
         each track (A, J, V), -1 for none. No track ends here.
         """
-        before = tracks.joints.across_m
-        joints = self.predict(tracks.joints, time_s - tracks.time_s) if len(tracks) > 0 else tracks.joints
-        lost = (joints.across_m > _LOST_M) & (before > _TRUSTED_M)
-        lost &= ~lost[:, list(self.skeleton.core)].all(axis=1, keepdims=True)  # beside whom would they be sought?
-        joints = self.beside_neighbours(joints, lost)
-        predicted = Predicted(joints.position, joints.sigma_m, lost, tracks.world)
-        candidate = assign(predicted, detections, rig, self.skeleton)
-        joints, candidate = self._measure(joints, lost, candidate, detections, rig)
-        evident_s = np.where(self.evident(candidate), time_s, tracks.evident_s)
+        if len(tracks) == 0:
+            return replace(tracks, time_s=time_s), np.zeros((0, len(self.skeleton), len(rig)), dtype=np.intp)
+        sight, bones = Sight.of(detections, rig, self.skeleton), self._bones
+        step_s = time_s - tracks.time_s
+        joints, lost = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, bones)
+        candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), sight)
+        certain = detections.confidence
+        weight = np.where(certain > 0, self.observation.weight(certain), 0.0)
+        joints, candidate, evident = measured(joints, lost, candidate, weight, sight, self._trust, bones)
+        evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
+
+    @cached_property
+    def _bones(self) -> Bones:
+        return Bones.of(self.skeleton, self.scale.longest_m)
+
+    @cached_property
+    def _trust(self) -> Trust:
+        return Trust.of(self.observation, self.skeleton.joints)
 
     def alive(self, tracks: Tracks) -> Mask:
         """(A,) tracks that had evidence lately."""
@@ -164,7 +159,7 @@ class Tracker:
         known = np.asarray(np.isfinite(places).all(axis=-1))
         count = np.maximum(known.sum(axis=1), 1)[:, None]
         centre = (np.where(known[..., None], places, 0.0).sum(axis=1) / count)[:, None]
-        sigma = np.where(known, _BIRTH_SIGMA_M, 2 * _LOST_M)
+        sigma = np.where(known, _BIRTH_SIGMA_M, 2 * LOST_M)
         joints = JointStates.at(np.where(known[..., None], places, centre), sigma, self.scale.motion.start)
         return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
 
@@ -177,7 +172,7 @@ class Tracker:
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
         for find in self.find:
-            if not self.enough(detections, free):
+            if not self.enough(detections, free) or sum(map(len, found)) >= _MOST_PEOPLE:
                 break
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)
@@ -189,45 +184,6 @@ class Tracker:
             there = np.concatenate([there, people.initial[new]])
             free[own[new][own[new] >= 0]] = False
         return np.concatenate(found), np.concatenate(theirs)
-
-    def predict(self, joints: JointStates, step_s: float) -> JointStates:
-        """Joints `step_s` later; an unseen joint comes to move as the person does, straight on."""
-        core = list(self.skeleton.core)
-        certainty = 1 / joints.sigma_m[:, core, None] ** 2
-        at_rest = 1 / _TRUSTED_M**2  # what nothing is known of stands still: it must not drift along a ray
-        person = (joints.velocity[:, core] * certainty).sum(1) / (certainty.sum(1) + at_rest)
-        decay = np.exp(-abs(step_s) / _FOLLOW_S)
-        unseen = (joints.sigma_m > _FOLLOW_SIGMA_M)[..., None]
-        following = person[:, None] + decay * (joints.velocity - person[:, None])
-        fading = np.where(unseen, decay, 1.0) * joints.mean[..., 6:]
-        joints = joints.with_derivatives(np.where(unseen, following, joints.velocity), fading)
-        return joints.predicted(step_s, self.scale.motion, self.scale.density)
-
-    def beside_neighbours(self, joints: JointStates, lost: Mask) -> JointStates:
-        """Lost joints are put where their parents are, known to a bone's length; a lost root between its hips."""
-        if not lost.any():
-            return joints
-        mean, covariance = joints.mean.copy(), joints.covariance.copy()
-        reach_m = self.scale.longest_m / 1.5  # the sigma of a direction that is not known
-        order, parents = np.concatenate(self.skeleton.tree_levels), np.array(self.skeleton.parents)
-        _put_beside(mean, covariance, lost, order, parents, *self.skeleton.hips, reach_m)
-        return JointStates(mean, covariance)
-
-    def _measure(
-        self, joints: JointStates, lost: Mask, candidate: Index, detections: Detections, rig: Rig
-    ) -> tuple[JointStates, Index]:
-        """Joints after this frame's observations, and those of them that were kept."""
-        joints, inlier = measured(joints, lost, candidate, detections, rig, self.observation, self.skeleton.joints)
-        trusted, views = joints.sigma_m < _TRUSTED_M, inlier.sum(axis=-1)
-        torn = torn_joints(joints.position, trusted, views, self.scale.longest_m, self.skeleton, FARTHEST_M)
-        joints.covariance[torn, :3, :3] += FARTHEST_M**2 * np.eye(3)
-        return joints, np.where(inlier & ~torn[..., None], candidate, -1)
-
-    def evident(self, candidate: Index) -> Mask:
-        """(A,) whether enough core joints are seen by two views, or by one."""
-        seen = candidate >= 0
-        in_a_view = seen[:, list(self.skeleton.core)].sum(axis=1).max(axis=1, initial=0)
-        return (seen_twice(seen, self.skeleton).sum(axis=1) >= _MIN_SEEN_TWICE) | (in_a_view >= _MIN_IN_A_VIEW)
 
     def enough(self, detections: Detections, free: Mask) -> bool:
         """Whether the free detections can be a person: enough core joints, each in two views."""
@@ -246,24 +202,3 @@ def standing_apart(places: Array, others: Array) -> Mask:
     known = np.isfinite(distance)
     mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
     return (mean > _APART_M).all(axis=1)
-
-
-@kernel
-def _put_beside(mean, covariance, lost, order, parents, right, left, reach_m):
-    """`Tracker.beside_neighbours` of states (A, J, S), with all joints in `order` (J,), parents first."""
-    people, size = len(mean), mean.shape[2]
-    for a in range(people):
-        for j in order:
-            if not lost[a, j]:
-                continue
-            above = parents[j]
-            for i in range(size):
-                mean[a, j, i] = mean[a, above, i] if above >= 0 else (mean[a, right, i] + mean[a, left, i]) / 2
-                for k in range(size):
-                    if above < 0:
-                        covariance[a, j, i, k] = (covariance[a, right, i, k] + covariance[a, left, i, k]) / 2
-                    else:
-                        apart = (i < 3) != (k < 3)
-                        covariance[a, j, i, k] = 0.0 if apart else covariance[a, above, i, k]
-                if above >= 0:
-                    covariance[a, j, i, i] += reach_m[j] ** 2 if i < 3 else 1.0

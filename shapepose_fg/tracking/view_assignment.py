@@ -1,15 +1,13 @@
 """Which detections are whose when it is known where people's joints should be: one-to-one in every view."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel
-from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, OVERLAP_M, Nearby, nearby
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, OVERLAP_M, Sight, claim, find_near, share
 
 _NEAR_M = 0.06
 """How closeness to the predicted joint falls off where the prediction is exact: sigma of a Gaussian, as a length
@@ -48,77 +46,128 @@ class Predicted:
     """(A,) people of different worlds do not compete for detections."""
 
 
-@dataclass(frozen=True)
-class Scored:
-    """What speaks for each of N detections being people's."""
+class Scored(NamedTuple):
+    """What speaks for each of N detections being people's, by joint and view, then by world, then by person."""
 
-    near: Nearby
-    """Which, and whose."""
+    first: Index
+    """(J V + 1,) where those of each joint and view begin."""
+    person: Index
+    """(N,) whose joint it is."""
+    detection: Index
+    """(N,) which of the frame's."""
+    distance_m: Array
+    """(N,) from the joint's projection, metres at its depth."""
     score: Array
     """(N,) nearness, and affinity to what the person has at the other ends of the joint's limbs."""
     possible: Mask
     """(N,) near enough to a joint whose place is known, or likely by affinity."""
 
+    def cut(self, count: int) -> "Scored":
+        """The first `count` of them."""
+        return Scored(
+            self.first, self.person[:count], self.detection[:count], self.distance_m[:count], self.score[:count],
+            self.possible[:count],
+        )  # fmt: skip
 
-def assign(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
+
+def assign(predicted: Predicted, sight: Sight) -> Index:
     """The detection (A, J, V) of each person's joint in each view, -1 where there is none: the best score first,
     each detection once, but for those on which several people's joints lie.
     """
-    return _assigned(predicted, detections, rig, skeleton)[0]
+    return _assigned(predicted, sight)[0]
 
 
-def assign_with_probability(
-    predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton
-) -> tuple[Index, Array]:
+def assign_with_probability(predicted: Predicted, sight: Sight) -> tuple[Index, Array]:
     """What `assign` gives, and how probably (A, J, V) each of these detections is the person's; 0 where none is.
 
     A detection that serves two people, because it lies on the joints of both, is in the right place for either if
     it is anybody's.
     """
-    chosen, scored = _assigned(predicted, detections, rig, skeleton)
-    probable, near = probabilities(scored, len(detections)), scored.near
-    of, count = near.detection, len(detections)
+    chosen, near = _assigned(predicted, sight)
+    probable = probabilities(near, len(sight.of_view))
+    of, count = near.detection, len(sight.of_view)
     serves = np.bincount(chosen[chosen >= 0], minlength=count)[of] > 1
     # Marginals of competitors that form a cycle are not exact: their sum may be over 1 by a little.
     together = np.minimum(np.bincount(of, probable, count)[of], 1.0)
-    place = near.person, detections.joint[of], detections.view[of]
+    place = near.person, sight.of_joint[of], sight.of_view[of]
     taken, probability = chosen[place] == of, np.zeros(chosen.shape)
     probability[tuple(each[taken] for each in place)] = np.where(serves, together, probable)[taken]
     return chosen, probability
 
 
-def probabilities(scored: Scored, detections: int) -> Array:
+def probabilities(near: Scored, detections: int) -> Array:
     """(N,) how probably each detection is the person's, of those that are possible, by their score.
 
     A person has at most one detection of a joint in a view, and a detection is one person's or nobody's: the
     marginals of all ways to give them out, by belief propagation (Williams and Lau, 2014), which is exact where
     who competes for what has no cycle.
     """
-    weight, near = np.where(scored.possible, np.exp(_ODDS * (scored.score - _EVEN)), 0.0), scored.near
+    weight = np.where(near.possible, np.exp(_ODDS * (near.score - _EVEN)), 0.0)
     probable = np.empty_like(weight)
     people = int(near.person.max(initial=-1)) + 1
     _marginals(near.first, near.person, near.detection, weight, people, detections, _MESSAGES, probable)
     return probable
 
 
-def _assigned(predicted: Predicted, detections: Detections, rig: Rig, skeleton: Skeleton) -> tuple[Index, Scored]:
+def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
     """The detections (A, J, V), and what speaks for all that are near."""
-    gate_m = np.where(predicted.lost, _REACH_M, np.minimum(_FAR_M + 2 * predicted.sigma_m, FARTHEST_M))
-    world = np.zeros(len(gate_m), dtype=np.intp) if predicted.world is None else predicted.world
-    near = nearby(predicted.places, np.maximum(gate_m, OVERLAP_M), world, rig, skeleton, detections)
-    at = near.person, detections.joint[near.detection]
-    within, lost, sigma_m = near.distance_m < gate_m[at], predicted.lost[at], predicted.sigma_m[at]
-    nearness = np.where(within, np.exp(-0.5 * near.distance_m**2 / (_NEAR_M**2 + sigma_m**2)), -np.inf)
-    rule = nearness, lost & within, LEAST_AFFINITY
-    before = np.full((len(gate_m), len(skeleton), len(rig)), -1, dtype=np.intp)
-    chosen, claims = near.claimed(*rule, before, world, detections, skeleton)
-    for _ in range(_PASSES):
-        if (chosen == before).all():
+    (A, J), V = predicted.sigma_m.shape, len(sight.cameras)
+    world = np.zeros(A, dtype=np.intp) if predicted.world is None else predicted.world
+    people, given = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
+    chosen, first = np.empty((2, A, J, V), dtype=np.intp), np.empty((2, J * V + 1), dtype=np.intp)
+    count, near = 4 * A * J * V, None
+    while near is None or count > len(near.person):
+        whole, real, flag = np.empty((3, count), np.intp), np.empty((5, count)), np.empty((2, count), dtype=bool)
+        near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
+        count = _assign(
+            given, predicted.sigma_m, predicted.lost, world, people, sight, near, np.empty((2, A, J)), first[1],
+            whole[2], np.empty(len(sight.of_view), np.intp), real[2], real[3], real[4], flag[1], chosen[0],
+            chosen[1],
+        )  # fmt: skip
+    return chosen[0], near.cut(count)
+
+
+@kernel
+def _assign(
+    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, nearness, tied, key, sought,
+    chosen, before,
+):  # fmt: skip
+    """Fill in `near` and `chosen`, as far as there is room for what is near; returns how much there is."""
+    people_count, joints, views = chosen.shape
+    gate_m, reach_m = gates[0], gates[1]
+    for a in range(people_count):
+        for j in range(joints):
+            gate_m[a, j] = _REACH_M if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
+            reach_m[a, j] = max(gate_m[a, j], OVERLAP_M)
+            for v in range(views):
+                before[a, j, v] = -1
+    begins, person, detection, distance_m, score, possible = near
+    count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
+    if count > len(person):
+        return count
+    of_joint = sight.of_joint
+    for e in range(count):
+        a, j = person[e], of_joint[detection[e]]
+        within = distance_m[e] < gate_m[a, j]
+        sought[e] = lost[a, j] and within
+        nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2)) if within else -np.inf
+    for _ in range(1 + _PASSES):
+        claim(
+            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied, score,
+            possible, key, queue, taken, chosen,
+        )  # fmt: skip
+        changed = False
+        for a in range(people_count):
+            for j in range(joints):
+                for v in range(views):
+                    changed = changed or chosen[a, j, v] != before[a, j, v]
+                    before[a, j, v] = chosen[a, j, v]
+        if not changed:
             break
-        before = chosen
-        chosen, claims = near.claimed(*rule, before, world, detections, skeleton)
-    near.share(claims.tied, chosen, detections)
-    return chosen, Scored(near, claims.score, (within & ~lost) | claims.likely)
+    share(begins, person, detection, distance_m, tied, chosen)
+    for e in range(count):
+        possible[e] = possible[e] or (nearness[e] > -np.inf and not sought[e])
+    return count
 
 
 @kernel

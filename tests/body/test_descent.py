@@ -155,7 +155,7 @@ def test_networks_know_their_step_and_refuse_nonsense():
 
 @pytest.mark.parametrize("name", ["BODY_25", "COCO_17"])
 def test_what_the_network_sees(any_body, name):
-    """Against dense inverses and the Jacobian of the points; the detector's joints lie elsewhere than the body's."""
+    """Against dense inverses and the points' Jacobian; the detector's joints lie elsewhere than the body's."""
     offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LWrist": (0.0, 0.0, -0.05)})
     model, places = any_body.with_keypoints(TARGET_SKELETONS[name]), slots(TARGET_SKELETONS[name])
     model = model.with_keypoint_offsets(offsets)

@@ -5,8 +5,8 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.fitting import evidence
 from shapepose_fg.body.fitting.energy import (
     BodyEnergy,
+    EnergyTargets,
     Held,
-    WhitenedTargets,
     robust_cost,
     robust_weight,
     visible_joints,
@@ -51,7 +51,7 @@ def free(energy) -> np.ndarray:
 
 
 @pytest.fixture
-def targets(energy, free) -> WhitenedTargets:
+def targets(energy, free) -> EnergyTargets:
     """Targets some centimetres off, with full, ray-like and no information."""
     rng = np.random.default_rng(1)
     xyz = energy.model.keypoints(energy.complete(free))
@@ -59,7 +59,7 @@ def targets(energy, free) -> WhitenedTargets:
     root = root + root.swapaxes(-1, -2)
     root[:, 3] = np.diag([40.0, 40.0, 0.0])
     root[1, 7] = 0
-    return WhitenedTargets(xyz + rng.normal(0, 0.03, xyz.shape), root)
+    return EnergyTargets(xyz + rng.normal(0, 0.03, xyz.shape), root @ root)
 
 
 def test_gradient_is_the_slope_of_the_energy(energy, free, targets):
@@ -90,7 +90,7 @@ def test_jacobian_of_the_free_parameters_is_the_numeric_one(energy, free, target
 
 def test_hessian_is_information_and_priors(energy, free, targets):
     found = energy.linearise(free, targets, 1e6, energy.held_by_priors(ROWS))
-    information = targets.root @ targets.root
+    information = targets.information
     J = found.jacobian.reshape(ROWS, 25, 3, -1)
     expected = np.einsum("bkip,bkij,bkjq->bpq", J, information, J)
     expected[:, :10, :10] += np.eye(10)
@@ -128,7 +128,7 @@ def test_pose_energy_is_the_squared_distance_of_the_visible_angles(model, apart)
     energy = BodyEnergy(model, apart)
     error = np.random.default_rng(0).normal(0, 0.4, (4, energy.num_angles))
     P = np.linalg.inv(apart.covariance[np.ix_(energy.angles, energy.angles)])
-    nothing = WhitenedTargets(np.zeros((4, 25, 3)), np.zeros((4, 25, 3, 3)))
+    nothing = EnergyTargets(np.zeros((4, 25, 3)), np.zeros((4, 25, 3, 3)))
     anchor = np.tile(apart.mean[energy.angles] + 1.0, (4, 1))
     for around, held in (
         (apart.mean[energy.angles], energy.held_by_priors(4)),
@@ -179,8 +179,7 @@ def test_model_error_is_added_to_covariances_and_rays_stay_rays():
     information = (information + information.swapaxes(-1, -2)) / 2
     information[0, 5] = np.diag([1e4, 1e4, 0.0])
     information[0, 6] = 0
-    root = weigh(JointTargets(rng.normal(size=(1, 25, 3)), information), 0.02).root
-    weighed = root @ root
+    weighed = weigh(JointTargets(rng.normal(size=(1, 25, 3)), information), 0.02).information
     full = np.setdiff1d(np.arange(25), [5, 6])
     expected = np.linalg.inv(covariance[0, full] + 0.02**2 * np.eye(3))
     np.testing.assert_allclose(weighed[0, full], expected, rtol=1e-7)

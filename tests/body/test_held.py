@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, EnergyTargets, Held
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.kernels.solving import LIMB_M
 from shapepose_fg.body.model.body_model import BodyModel
@@ -22,8 +22,8 @@ def draw(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def targets() -> WhitenedTargets:
-    return WhitenedTargets(0.4 * draw(ROWS, 25, 3, seed=1), np.tile(20 * np.eye(3), (ROWS, 25, 1, 1)))
+def targets() -> EnergyTargets:
+    return EnergyTargets(0.4 * draw(ROWS, 25, 3, seed=1), np.tile(400 * np.eye(3), (ROWS, 25, 1, 1)))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_the_gradient_is_that_of_the_energy(energy, targets, free, held):
 
 def test_where_it_is_held_it_is_not_pulled(energy, free):
     held = Held(free[:, :10], np.full(ROWS, 5.0), free[:, 13:-3])
-    nothing = WhitenedTargets(np.zeros((ROWS, 25, 3)), np.zeros((ROWS, 25, 3, 3)))
+    nothing = EnergyTargets(np.zeros((ROWS, 25, 3)), np.zeros((ROWS, 25, 3, 3)))
     here = energy.linearise(free, nothing, SCALE, held)
     assert not here.gradient.any() and not here.energy.any()
     # As tightly as the priors: the stiffness on betas, positive definite on angles, nothing on where it stands.

@@ -229,8 +229,8 @@ def test_passes_are_what_rows_need(people):
     assert len({pools[0, each] for each in (-1, 0, 1, 3, 4)}) == 5
     part = np.array([4, 5])
     given, variance = passes.given(part)
-    assert not given.root[passes.without[part]].any() and np.isinf(variance[passes.without[part]]).all()
-    assert given.root[~passes.without[part]].any(axis=(1, 2)).mean() > 0.7
+    assert not given.information[passes.without[part]].any() and np.isinf(variance[passes.without[part]]).all()
+    assert given.information[~passes.without[part]].any(axis=(1, 2)).mean() > 0.7
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.compiled core.errors core.moved",
-    "core.camera core.skeleton core.trust",
+    "core.camera core.skeleton core.pieces core.trust",
     "core.drawing",
     "core.storage.files core.bounds",
     "core.storage.npz",

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Nearby, own_affinity
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Nearby, Sight, own_affinity
 from shapepose_fg.proposal.proposals import ProposalConfig, Search, standing_apart
 
 CONFIG = CandidateConfig()
@@ -270,29 +269,29 @@ def test_the_settings_of_growth_make_a_difference_here(candidates, links):
 
 def test_an_overlap_serves_only_joints_that_have_nothing_of_their_own():
     """Two noses in one view: who has the first of all detections keeps it, who has none gets the nearer one."""
-    nose, none = BODY_25.index("Nose"), np.zeros((0, 2), dtype=np.intp)
-    two = Detections(np.zeros(2, int), np.full(2, nose), np.zeros((2, 2)), np.ones(2), none, np.zeros(0))
+    nose = BODY_25.index("Nose")
     chosen = np.full((2, 25, 1), -1, dtype=np.intp)
     chosen[0, nose, 0] = 0
     first = np.where(np.arange(26) > nose, 4, 0)
     near = Nearby(first, np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([0.03, 0.01, 0.02, 0.024]))
-    near.share(np.full(4, LEAST_AFFINITY), chosen, two)
+    near.share(np.full(4, LEAST_AFFINITY), chosen)
     assert chosen[:, nose, 0].tolist() == [0, 0]
     chosen[1] = -1
     near = replace(near, distance_m=np.array([0.03, 0.01, 0.024, 0.02]))
-    near.share(np.full(4, LEAST_AFFINITY), chosen, two)
+    near.share(np.full(4, LEAST_AFFINITY), chosen)
     assert chosen[:, nose, 0].tolist() == [0, 1] and (np.delete(chosen, nose, axis=1) == -1).all()
 
 
-def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(crowded):
+def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(crowded, five_cameras):
     """A pair that is not listed counts 0; without a neighbour there is none, and the mean is 0."""
     rng = np.random.default_rng(0)
     own, owns = np.full((3, 25, 5), -1), np.zeros((3, len(crowded)), dtype=bool)
     for person, row in np.argwhere(rng.random(owns.shape) < 0.3).tolist():
         own[person, crowded.joint[row], crowded.view[row]] = row  # the last of a joint in a view
     owns[np.nonzero(own >= 0)[0], own[own >= 0]] = True
+    sight = Sight.of(crowded, five_cameras, BODY_25)
     every = [np.ascontiguousarray(index.ravel()) for index in np.indices(owns.shape)]
-    affinity, neighbours = (each.reshape(owns.shape) for each in own_affinity(*every, own, crowded, BODY_25))
+    affinity, neighbours = (each.reshape(owns.shape) for each in own_affinity(*every, own, sight))
     listed = {tuple(pair): value for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)}
     for person, row in zip(*(index.ravel() for index in np.indices(owns.shape)), strict=True):
         total, there = 0.0, set()

@@ -13,7 +13,7 @@ from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
-from shapepose_fg.proposal.nearby import nearby
+from shapepose_fg.proposal.nearby import Sight, nearby
 from shapepose_fg.proposal.possible_people import Frame, _claimed
 from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.tracking.following import FollowState, finish
@@ -36,7 +36,7 @@ def test_what_is_near_and_in_order(people, crowded, five_cameras):
     at = crowded.view, slice(None), crowded.joint
     away = np.linalg.norm(xy[at] - crowded.xy[:, None], axis=-1) * depth[at]
     away_m = (away / five_cameras.focal_px[crowded.view][:, None]).T
-    near = nearby(places, np.full((4, 25), 0.3), world, five_cameras, BODY_25, crowded)
+    near = nearby(places, np.full((4, 25), 0.3), world, Sight.of(crowded, five_cameras, BODY_25))
     inside = np.zeros(away_m.shape, dtype=bool)
     inside[near.person, near.detection] = True
     np.testing.assert_array_equal(inside, away_m < 0.3)
@@ -74,7 +74,7 @@ def test_without_hips_nobody_is_sought_by_hips(five_cameras, two_people, seen_ex
 
 def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_people, seen_exactly, monkeypatch):
     """14 people on whom no affinities speak, nobody by evidence: over 100 points of a joint, and 50 candidates."""
-    monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_LEFT", 100)
+    monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_OF_FEW", 100)
     beside = np.array([[0.0, 0.3 * n, 0.0] for n in range(7)])
     seen = seen_exactly(five_cameras, (two_people[:, None] + beside[:, None]).reshape(-1, 25, 3))
     seen = replace(seen, pairs=np.zeros((0, 2), dtype=np.intp), affinity=np.zeros(0))
@@ -83,3 +83,18 @@ def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_peop
     tracker = Setup(five_cameras, BODY_25, config, fitter).engine(book).tracker
     finish(tracker, FollowState(tracker.nobody(), pending=(Input(7, np.zeros(5), seen, five_cameras),)))
     assert book.torn_off().thinned_frames == {"points": [7], "candidates": [7]}
+
+
+def test_the_surest_of_many_people_are_taken_and_that_is_said(five_cameras, two_people, seen_exactly):
+    """Of two people, where one may be found, the one whom all views see: the other one is seen by two."""
+    config, book = PipelineConfig(), Notebook()
+    xy, _ = five_cameras.project(two_people)
+    seen = seen_exactly(five_cameras, two_people)
+    second = np.linalg.norm(xy[seen.view, 1, seen.joint] - seen.xy, axis=1) < 1e-6
+    seen = seen.only(~second | (seen.view < 2))
+    book.search(7)
+    every = StageOne(BODY_25, config.candidates, config.proposals, book)
+    assert len(every(seen, five_cameras)) == 2
+    one = replace(every, proposals=replace(config.proposals, most_people=1))(seen, five_cameras)
+    np.testing.assert_allclose(one.initial, two_people[:1], atol=1e-6)
+    assert book.torn_off().thinned_frames == {"people": [7]}

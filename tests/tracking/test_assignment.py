@@ -5,17 +5,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba import njit
 
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.nearby import Nearby
+from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking import view_assignment
-from shapepose_fg.tracking.plausibility import torn_joints
+from shapepose_fg.tracking.plausibility import tear
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
 from shapepose_fg.tracking.view_assignment import Predicted, Scored, assign, assign_with_probability
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
+
+
+@njit
+def _torn(places, trusted, views, longest, parents, reach, above, way, count, too_long, torn):
+    for a in range(len(places)):
+        tear(places[a], trusted[a], views[a], longest, parents, reach, above, way, count, too_long, torn[a])
+
+
+def torn_joints(places, trusted, views, longest_m, reach_m):
+    """(A, J) by `tear`."""
+    torn, parents = np.ones(trusted.shape, dtype=bool), np.array(BODY_25.parents)
+    _torn(places, trusted, views, longest_m, parents, reach_m, np.empty(25, np.intp), *np.empty((3, 25)), torn)
+    return torn
 
 
 def own(detections, rig, people, candidate):
@@ -33,7 +47,7 @@ def test_everybody_gets_their_own_detection_once(five_cameras, two_people, seen_
     rng = np.random.default_rng(0)
     predicted = two_people + rng.normal(0, 0.02, two_people.shape)
     sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
-    candidate = assign(Predicted(predicted, sigma, lost), detections, five_cameras, BODY_25)
+    candidate = assign(Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25))
     share, total = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and total == 2 * 25 * 5
     taken = candidate[candidate >= 0]
@@ -47,7 +61,7 @@ def test_a_lost_wrist_is_found_by_its_elbow(five_cameras, two_people, seen_exact
     lost[:, WRIST] = True
     predicted[:, WRIST] = predicted[:, ELBOW]
     sigma[:, WRIST] = 0.3
-    candidate = assign(Predicted(predicted, sigma, lost), detections, five_cameras, BODY_25)
+    candidate = assign(Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25))
     share, _ = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and (candidate[:, WRIST] >= 0).all()
 
@@ -56,7 +70,7 @@ def test_nobody_gets_what_is_too_far_away(five_cameras, two_people, seen_exactly
     detections = seen_exactly(five_cameras, two_people[:1])
     beside = two_people[:1] + np.array([0.0, 0.0, 0.4])
     predicted = Predicted(beside, np.full((1, 25), 0.02), np.zeros((1, 25), bool))
-    nothing = assign(predicted, detections, five_cameras, BODY_25)
+    nothing = assign(predicted, Sight.of(detections, five_cameras, BODY_25))
     # 0.4 m up is farther than 0.12 + 2 x 0.02 m, but for other joints of the same kind; there are none.
     assert (nothing < 0).all()
 
@@ -65,17 +79,15 @@ def test_a_wrist_a_metre_from_its_elbow_is_torn_and_its_neighbours_are_not(two_p
     places = two_people.copy()
     places[0, WRIST] += 1.0
     longest, views = np.full(25, 0.7), np.full((2, 25), 4)
-    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25, 0.5)
+    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, 0.5)
     assert torn.sum() == 1 and torn[0, WRIST]
     # A shoulder that is off takes two bones with it: it goes, and nothing else.
     shoulder = BODY_25.index("RShoulder")
     places = two_people.copy()
     places[1, shoulder] += [0.0, 0.0, 1.0]
-    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, BODY_25, 0.5)
+    torn = torn_joints(places, np.ones((2, 25), bool), views, longest, 0.5)
     assert np.argwhere(torn).tolist() == [[1, shoulder]]
-    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, BODY_25, 0.5).any(), (
-        "nothing is judged"
-    )
+    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, 0.5).any(), "nothing is judged"
 
 
 def test_the_legs_of_somebody_else_are_torn_off(two_people):
@@ -86,11 +98,11 @@ def test_the_legs_of_somebody_else_are_torn_off(two_people):
     places[0, legs] = places[1, legs] + [0.0, 6.0, 0.0]
     trusted, longest, views = np.ones((2, 25), bool), np.full(25, 0.7), np.full((2, 25), 4)
     trusted[:, BODY_25.root] = False
-    torn = torn_joints(places, trusted, views, longest, BODY_25, 0.5)
+    torn = torn_joints(places, trusted, views, longest, 0.5)
     assert sorted(np.flatnonzero(torn[0])) == sorted(legs) and not torn[1].any()
     # So they are with a shoulder that is not judged either, or with no shoulder: by the next joint that is.
     trusted[0, [BODY_25.index(joint) for joint in ("Neck", "LShoulder", "RShoulder")]] = False
-    torn = torn_joints(places, trusted, views, longest, BODY_25, 0.5)
+    torn = torn_joints(places, trusted, views, longest, 0.5)
     assert set(legs) <= set(np.flatnonzero(torn[0])) and not torn[1].any()
     # Legs that are 0.3 m farther off than bones allow may be put right by a whole body: they stay.
     trusted[:] = True
@@ -101,7 +113,7 @@ def test_the_legs_of_somebody_else_are_torn_off(two_people):
         places[0, legs] -= [0.0, 0.0, 5.0]
         below = places[0, hips].mean(axis=0)
         places[0, legs] += places[0, neck] - below - [0.0, 0.0, 1.4 + beyond_m]
-        assert torn_joints(places, trusted, views, longest, BODY_25, 0.5)[0, hips].sum() == gone
+        assert torn_joints(places, trusted, views, longest, 0.5)[0, hips].sum() == gone
 
 
 def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people, seen_exactly):
@@ -188,8 +200,8 @@ def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
         by_view = np.lexsort((person, view[order[place]]))
         person, detection = person[by_view], order[place[by_view]]
         first = np.searchsorted(view[detection], np.arange(3))
-        near = Nearby(first, person, detection, np.zeros(len(person)))
-        given = Scored(near, score[person, detection], possible[person, detection])
+        near = first, person, detection, np.zeros(len(person))
+        given = Scored(*near, score[person, detection], possible[person, detection])
         probable = np.zeros(score.shape)
         probable[person, detection] = view_assignment.probabilities(given, len(view))
         return probable
@@ -213,7 +225,7 @@ def test_two_people_side_by_side_are_less_certain_than_one_alone(five_cameras, t
         detections = replace(seen, pairs=np.zeros((0, 2), dtype=int), affinity=np.zeros(0))
         sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
         chosen, probability = assign_with_probability(
-            Predicted(people, sigma, lost), detections, five_cameras, BODY_25
+            Predicted(people, sigma, lost), Sight.of(detections, five_cameras, BODY_25)
         )
         assert (chosen >= 0).all()
         median.append(np.median(probability))

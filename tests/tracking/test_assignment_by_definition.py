@@ -10,6 +10,7 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal import nearby
+from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, probabilities_of, reassociate, who_goes
 from shapepose_fg.tracking.view_assignment import Predicted, assign
@@ -49,6 +50,9 @@ def settle(monkeypatch):
     """Sets constants by the names that they have in `DEFAULTS`."""
 
     def settle(**settings):
+        for module, name in ((view_assignment, "_assign"), (view_assignment, "claim"), (view_assignment, "share")):
+            # As Python runs it: constants are compiled in.
+            monkeypatch.setattr(module, name, getattr(getattr(module, name), "py_func", getattr(module, name)))
         for name, value in settings.items():
             for module in (view_assignment, nearby):
                 for constant in (name.upper(), f"_{name.upper()}"):
@@ -121,11 +125,14 @@ def test_detections_are_taken_best_first_by_nearness_and_affinity(
 ):
     expected = assigned(predicted, crowded, five_cameras, SimpleNamespace(**DEFAULTS | settings))
     settle(**settings)
-    found = assign(predicted, crowded, five_cameras, BODY_25)
+    sight = Sight.of(crowded, five_cameras, BODY_25)
+    found = assign(predicted, sight)
     np.testing.assert_array_equal(found, expected)
     assert (found >= 0).mean() > 0.5 and (found[predicted.lost] >= 0).any(), "lost joints are found, too"
     settle(overlap_m=0.005)
-    assert (assign(predicted, crowded, five_cameras, BODY_25) != found).any() or "overlap_m" not in settings
+    assert (
+        assign(predicted, Sight.of(crowded, five_cameras, BODY_25)) != found
+    ).any() or "overlap_m" not in settings
 
 
 def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most(
@@ -134,7 +141,8 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
     monkeypatch.setattr(view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6))
     settle(passes=1, overlap_m=0.3, farthest_m=0.2)
-    chosen, probability = view_assignment.assign_with_probability(predicted, crowded, five_cameras, BODY_25)
+    sight = Sight.of(crowded, five_cameras, BODY_25)
+    chosen, probability = view_assignment.assign_with_probability(predicted, sight)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
     assert (owners > 1).any(), "overlaps happen here"
     expected = np.where(owners[chosen] > 1, 1.0, 0.6)
@@ -148,7 +156,7 @@ def three(five_cameras, two_people, seen_exactly):
     places = np.stack([*two_people, two_people[0] + [0.15, 0.0, 0.0]])
     candidate = np.full((3, 25, 5), -1)
     sure = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
-    candidate[:2] = assign(Predicted(two_people, *sure), detections, five_cameras, BODY_25)
+    candidate[:2] = assign(Predicted(two_people, *sure), Sight.of(detections, five_cameras, BODY_25))
     return Input(0, np.zeros(5), detections, five_cameras), candidate, places
 
 
@@ -205,7 +213,7 @@ def test_nothing_farther_than_12_cm_and_two_sigma_or_half_a_metre_is_taken(
     sigma = np.full((1, 25), 1e-6)
     sigma[0, wrist] = sigma_m
     lost = np.zeros((1, 25), dtype=bool)
-    found = assign(Predicted(predicted, sigma, lost), detections, five_cameras, BODY_25)
+    found = assign(Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25))
     assert (found[0, wrist, 0] >= 0) == taken
     assert (np.delete(found, wrist, axis=1) >= 0).all()
 

@@ -29,6 +29,7 @@ def result(tracks: dict[int, range]) -> Reconstruction:
         residual_px=np.zeros((N, 25, 2, 2)),
         probability=np.ones((N, 25, 2)),
         gate=np.ones((N, 25, 2), dtype=int),
+        lead_s=np.zeros((N, 2)),
     )
     return Reconstruction(
         frame=frame,

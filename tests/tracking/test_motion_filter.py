@@ -8,35 +8,44 @@ import pytest
 from factors import CONSTANT_VELOCITY, kernel_weight
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.pieces import ROBUST, robust_weight
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
-from shapepose_fg.tracking import measuring
-from shapepose_fg.tracking.measuring import measured
-from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.tracking.measuring import Trust, measured
+from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
-PSD = np.array([4.0, 9.0])
+PSD = np.array([4e-4, 9e-4])
+TWO = Bones(np.array([True, False]), np.arange(2), np.array([-1, 0]), (0, 1), np.ones(2))
+"""Two joints, one of them a core joint."""
+
+
+BONES = Bones.of(BODY_25, np.full(25, 10.0))
+"""Bones so long that no joint is torn off."""
 
 
 def states(seed=0):
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(3, 2, 6, 6))
-    return JointStates(rng.normal(size=(3, 2, 6)), A @ A.swapaxes(-1, -2) + np.eye(6))
+    return JointStates(rng.normal(size=(3, 2, 6)), 1e-4 * (A @ A.swapaxes(-1, -2) + np.eye(6)))
 
 
 def test_a_step_ahead_is_constant_velocity_with_white_acceleration():
     before, h = states(), 0.1
-    after = before.predicted(h, CONSTANT_VELOCITY, PSD)
+    after, lost = predicted(before, h, CONSTANT_VELOCITY, PSD, TWO)
+    assert not lost.any()
     np.testing.assert_allclose(after.position, before.position + h * before.velocity)
     np.testing.assert_allclose(after.velocity, before.velocity)
     F = np.kron(np.array([[1.0, h], [0.0, 1.0]]), np.eye(3))
-    Q = np.kron(9.0 * np.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]]), np.eye(3))
+    Q = np.kron(PSD[1] * np.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]]), np.eye(3))
     np.testing.assert_allclose(after.covariance[1, 1], F @ before.covariance[1, 1] @ F.T + Q)
 
 
 def test_a_step_back_returns_to_where_it_came_from_less_certain():
     before = states()
-    there_and_back = before.predicted(0.2, CONSTANT_VELOCITY, PSD).predicted(-0.2, CONSTANT_VELOCITY, PSD)
+    there, _ = predicted(before, 0.02, CONSTANT_VELOCITY, PSD, TWO)
+    there_and_back, _ = predicted(there, -0.02, CONSTANT_VELOCITY, PSD, TWO)
     np.testing.assert_allclose(there_and_back.mean, before.mean, atol=1e-12)
     grown = there_and_back.covariance - before.covariance
     assert (np.linalg.eigvalsh(grown) > -1e-9).all() and np.trace(grown, axis1=2, axis2=3).min() > 0
@@ -48,7 +57,8 @@ def test_a_measurement_is_the_information_filter_s_also_for_a_ray(five_cameras, 
     seen = seen_exactly(five_cameras, two_people)
     seen = replace(seen, xy=seen.xy + rng.normal(0, 4, seen.xy.shape), confidence=rng.uniform(0.2, 1, len(seen)))
     sure, lost = np.full((2, 25), 0.05), np.zeros((2, 25), dtype=bool)
-    candidate = assign(Predicted(two_people, sure, lost), seen, five_cameras, BODY_25)
+    sight = Sight.of(seen, five_cameras, BODY_25)
+    candidate = assign(Predicted(two_people, sure, lost), sight)
     wrist, knee, ankle = (names.index(name) for name in ("RWrist", "RKnee", "LAnkle"))
     candidate[:, wrist, 1:] = candidate[:, knee] = -1
     candidate[0, ankle] = candidate[1, ankle]  # all of them outside the gate
@@ -67,7 +77,11 @@ def test_a_measurement_is_the_information_filter_s_also_for_a_ray(five_cameras, 
         right[..., :3] += pull
         mean = np.einsum("...ij,...j->...i", covariance, right)
         at = mean[..., :3]
-    after, inlier = measured(before, lost, candidate, seen, five_cameras, config, names)
+    weight = config.weight(seen.confidence)
+    given = before, lost, candidate, weight, sight, Trust.of(config, names), BONES
+    after, kept, evident = measured(*given)
+    inlier = kept >= 0
+    assert evident.all()
     np.testing.assert_allclose(after.mean, mean, atol=1e-9)
     np.testing.assert_allclose(after.covariance, covariance, atol=1e-9)
     np.testing.assert_array_equal(inlier, said.inlier)
@@ -82,10 +96,12 @@ def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, se
     """Half a metre beside, where no gate would let its detections through."""
     seen, sure = seen_exactly(five_cameras, two_people), np.full((2, 25), 0.4)
     lost = np.arange(50).reshape(2, 25) == 4
-    candidate = assign(Predicted(two_people, sure / 20, lost & False), seen, five_cameras, BODY_25)
+    sight, config = Sight.of(seen, five_cameras, BODY_25), ObservationConfig()
+    candidate = assign(Predicted(two_people, sure / 20, lost & False), sight)
     before = JointStates.at(two_people + 0.5 * lost[..., None], sure, (2.0,))
-    after, inlier = measured(before, lost, candidate, seen, five_cameras, ObservationConfig(), BODY_25.joints)
-    assert inlier.all()
+    trust = Trust.of(config, BODY_25.joints)
+    after, kept, _ = measured(before, lost, candidate, config.weight(seen.confidence), sight, trust, BONES)
+    assert (kept >= 0).all()
     np.testing.assert_allclose(after.position, two_people, atol=2e-3)
 
 
@@ -93,4 +109,4 @@ def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, se
 def test_robust_kernels_are_those_of_the_factors(name):
     for ratio in (0.0, 0.3, 0.99, 1.5, 4.0):
         expected = kernel_weight(None if name == "none" else name, ratio, 1.0)
-        assert measuring._weight(measuring._KERNELS.index(name), ratio) == pytest.approx(float(expected))
+        assert robust_weight.py_func(ROBUST[name], ratio**2) == pytest.approx(float(expected))

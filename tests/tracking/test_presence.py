@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.presence import Account, Chosen, own_evidence, probability, weighed
 from shapepose_fg.tracking.worlds import lasting
 
@@ -184,7 +185,7 @@ def test_detections_count_by_the_affinity_to_the_same_person_s(five_cameras, two
     candidate[0, wrist, 1] = own[1, wrist, 1]
     candidate[1, :, 2] = -1
     candidate[1, elbow, 2] = own[1, elbow, 2]
-    weight, _ = weighed(candidate, two_people, detections, five_cameras, BODY_25, np.arange(2))
+    weight, _ = weighed(candidate, two_people, Sight.of(detections, five_cameras, BODY_25), BODY_25, np.arange(2))
     whole = weight[0, wrist, 0]
     assert weight[0, wrist, 1] == 0.0 and weight[1, elbow, 2] == whole / 2
     assert weight[1, :, 2].sum() == whole / 2, "what nobody has counts nothing"
@@ -197,12 +198,12 @@ def test_who_is_seen_wholly_has_a_second_of_evidence_in_a_second(five_cameras, t
     own = np.full((1, 25, 5), -1)
     own[0, detections.joint, detections.view] = np.arange(len(detections))
     beside = np.concatenate([two_people[:1], two_people[:1] + 0.3])
+    sight = Sight.of(detections, five_cameras, BODY_25)
     for places, candidate in ((two_people[:1], own), (beside, np.concatenate([own, np.full_like(own, -1)]))):
-        weight, price = weighed(candidate, places, detections, five_cameras, BODY_25, np.zeros(len(places), int))
+        weight, price = weighed(candidate, places, sight, BODY_25, np.zeros(len(places), int))
         np.testing.assert_allclose(weight[0].sum() - price[0], 1.0)
-    assert weighed(np.full_like(own, -1), two_people[:1], detections, five_cameras, BODY_25, np.zeros(1, int))[
-        1
-    ] == pytest.approx(0.4)
+    none = np.full_like(own, -1), two_people[:1], sight, BODY_25, np.zeros(1, int)
+    assert weighed(*none)[1] == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(("metres", "hides"), [(0.6, True), (0.05, False), (-0.6, False)])
@@ -215,9 +216,9 @@ def test_a_joint_behind_somebody_else_costs_little_unseen(five_cameras, two_peop
     other = person + metres * to_camera / np.linalg.norm(to_camera)
     places, none = np.concatenate([person, other]), np.full((2, 25, 5), -1)
     detections = seen_exactly(five_cameras, person)
-    price = weighed(none, places, detections, five_cameras, BODY_25, np.zeros(2, int))[1][0]
+    price = weighed(none, places, Sight.of(detections, five_cameras, BODY_25), BODY_25, np.zeros(2, int))[1][0]
     assert (price < 0.4 - 0.8 * 0.35 / 5) == hides
-    apart = weighed(none, places, detections, five_cameras, BODY_25, np.arange(2))[1]
+    apart = weighed(none, places, Sight.of(detections, five_cameras, BODY_25), BODY_25, np.arange(2))[1]
     np.testing.assert_allclose(apart, 0.4)
 
 
@@ -226,10 +227,10 @@ def test_joints_outside_the_picture_cost_nothing_and_unknown_ones_little(five_ca
     far = two_people[:1] + np.array([0.0, 0.0, 100.0])
     detections = seen_exactly(five_cameras, two_people)
     none, zero = np.full((1, 25, 5), -1), np.zeros(1, dtype=np.intp)
-    assert weighed(none, far, detections, five_cameras, BODY_25, zero)[1].tolist() == [0]
+    assert weighed(none, far, Sight.of(detections, five_cameras, BODY_25), BODY_25, zero)[1].tolist() == [0]
     half = two_people[:1].copy()
     half[0, 10:] = np.nan
-    price = weighed(none, half, detections, five_cameras, BODY_25, zero)[1]
+    price = weighed(none, half, Sight.of(detections, five_cameras, BODY_25), BODY_25, zero)[1]
     np.testing.assert_allclose(price, (10 * 0.4 + 15 * 0.05) / 25)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from factors import Motion
 from shapepose_fg.body.fitting.chains import ChainRows, Segment, cut_segments
-from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, Held, WhitenedTargets
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, EnergyTargets, Held
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
     BodyConfig,
@@ -105,7 +105,7 @@ class SequenceFitter:
                 free[mine] = free[nearest]
                 free[mine, -3:] = np.stack(place, axis=1)
                 angles[mine] = held[np.searchsorted(ok, nearest)]
-        targets = WhitenedTargets(evidence.xyz - origin[:, None], evidence.root)
+        targets = EnergyTargets(evidence.xyz - origin[:, None], evidence.information)
         rows = ChainRows(self.energy, self.config.kernel_scale, targets, angles, time_s, self.law)
         return free, origin, rows, found
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import Motion
-from shapepose_fg.body.fitting.energy import BodyEnergy, Held, WhitenedTargets, nothing
+from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
@@ -142,7 +142,7 @@ class ChainRows:
     """Of a row."""
     kernel_scale: float
     """Of the robust kernel."""
-    targets: WhitenedTargets
+    targets: EnergyTargets
     """(R) where the joints should be."""
     angles: Array
     """(R, A) around where the pose prior holds them."""

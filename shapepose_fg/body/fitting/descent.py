@@ -97,9 +97,10 @@ class Sight:
     def __call__(self, state: BodyState, target: Array, information: Array, scale: Any) -> NDArray[np.float32]:
         """(B, `UpdateNetwork.num_inputs`); gradients are multiplied by `scale` (79,)."""
         given = (state.betas, state.local, state.transl, target, information)
+        betas, local, transl, xyz, known = (np.require(each, float, ["C", "W"]) for each in given)
         inputs = np.empty((len(state.betas), UpdateNetwork.num_inputs), dtype=np.float32)
         seen(
-            self._limbs, self._own, *(np.require(part, float, ["C", "W"]) for part in given), self._kernel_scale,
+            self._limbs, self._own, betas, local, transl, xyz, known, self._kernel_scale,
             np.asarray(scale, dtype=np.float64), inputs, Work.of(self._limbs, NUM_COLUMNS),
         )  # fmt: skip
         return inputs

@@ -1,8 +1,8 @@
 """The energy of a body given joint targets: what `body/kernels/bodies.py` linearises and minimises, over rows.
 
-    E(Theta) = sum_i rho(|S_i (x_i(Theta) - z_i)|²) + |betas|² - 2 log p(theta) + constant
+    E(Theta) = sum_i rho((x_i(Theta) - z_i)ᵀ M_i (x_i(Theta) - z_i)) + |betas|² - 2 log p(theta) + constant
 
-with S_iᵀ S_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian: SMPLify
+with M_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian: SMPLify
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
 """
 
@@ -29,13 +29,13 @@ VISIBLE_M_PER_RAD = 1e-3
 
 
 @dataclass(frozen=True)
-class WhitenedTargets(FitRows):
+class EnergyTargets(FitRows):
     """Targets as the energy wants them."""
 
     xyz: Array
     """(B, K, 3) metres, finite."""
-    root: Array
-    """(B, K, 3, 3) symmetric square root S_i of the information, 1/m."""
+    information: Array
+    """(B, K, 3, 3) inverse covariances M_i, 1/m²."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class BodyEnergy:
         return Held(np.zeros((count, 10)), np.ones(count), np.tile(self.priors.mean, (count, 1)))
 
     def linearise(
-        self, free: Array, targets: WhitenedTargets, scale: Array | float, held: Held, asked: Index | None = None,
+        self, free: Array, targets: EnergyTargets, scale: Array | float, held: Held, asked: Index | None = None,
         *, slope_only: bool = False,
     ) -> Linear:  # fmt: skip
         """The energy at free parameters (B, P), the robust kernel having this scale, or one for each row (B,).
@@ -175,7 +175,7 @@ class BodyEnergy:
         return linear
 
     def evaluate(
-        self, free: Array, targets: WhitenedTargets, scale: float, held: Held, asked: Index | None = None
+        self, free: Array, targets: EnergyTargets, scale: float, held: Held, asked: Index | None = None
     ) -> Evaluated:
         """Bodies at free parameters (B, P), and the energy around them; `asked` as in `linearise`."""
         linear = self.linearise(free, targets, scale, held, asked)
@@ -200,9 +200,9 @@ def _plain(array: Array) -> Array:
     return array if array.flags.writeable else array.copy()
 
 
-def _rows(targets: WhitenedTargets, held: Held) -> Rows:
+def _rows(targets: EnergyTargets, held: Held) -> Rows:
     """For kernels."""
-    return Rows(*map(_plain, (targets.xyz, targets.root, held.betas, held.stiffness, held.angles)))
+    return Rows(*map(_plain, (targets.xyz, targets.information, held.betas, held.stiffness, held.angles)))
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> Index:

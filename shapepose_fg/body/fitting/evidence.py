@@ -1,5 +1,6 @@
 """Which joint targets can be believed, and how much: what every fitter does before it fits."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets, Rows
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.compiled import kernel, part
 
 _ROUNDING = 1e-4
 """Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
@@ -27,8 +29,9 @@ class Evidence(Rows):
     """(B,) OK or why not."""
     xyz: Array
     """(B, K, 3) targets, zero where there is no information, metres."""
-    root: Array
-    """(B, K, 3, 3) symmetric square root of (information^-1 + sigma² I)^-1, 1/m."""
+    information: Array
+    """(B, K, 3, 3) inverse of (information^-1 + sigma² I), which holds for a direction in which nothing was
+    measured, too, 1/m²."""
     variance_m2: Array
     """(B, K) mean variance over the axes of joints with full information, else infinite."""
     centre: Array
@@ -37,31 +40,68 @@ class Evidence(Rows):
     @property
     def total_information(self) -> Array:
         """(B,) of all joints of a row, mean over the axes, 1/m²."""
-        return np.square(self.root).sum(axis=(1, 2, 3)) / 3
+        return np.asarray(np.trace(self.information, axis1=2, axis2=3).sum(axis=1) / 3)
 
 
 def weigh(targets: JointTargets, model_sigma_m: float) -> Evidence:
-    """Judge the rows, and add the model's error, a sigma in metres, to every target.
-
-    An eigenvalue l of the information becomes l / (1 + l sigma²), which is the inverse of 1 / l + sigma² and
-    holds for l = 0 too: a direction in which nothing was measured.
-    """
+    """Judge the rows, and add the model's error, a sigma in metres, to every target."""
     xyz, information, valid = _refuse_nonsense(targets)
-    values, vectors = np.linalg.eigh((information + information.swapaxes(-1, -2)) / 2)
-    tolerance = _ROUNDING * np.maximum(np.abs(values).max(axis=-1), 1.0)
-    asymmetry = np.abs(information - information.swapaxes(-1, -2)).max(axis=(-1, -2))
-    valid &= ((values[..., 0] > -tolerance) & (asymmetry <= tolerance)).all(axis=1)
-    values = np.maximum(values, 0.0)
-    full = values[..., 0] > 1 / _SEEN_SIGMA_M**2
+    weighed, variance, full = (
+        np.empty_like(information),
+        np.empty(xyz.shape[:2]),
+        np.empty(xyz.shape[:2], dtype=bool),
+    )
+    _weighed(information, model_sigma_m**2, weighed, variance, full, valid)
     count = full.sum(axis=1)
     centre = np.where(full[..., None], xyz, 0.0).sum(axis=1) / np.maximum(count, 1)[:, None]
     status = np.full(len(xyz), FitStatus.OK, dtype=STATUS_TYPE)
     status[~determine_pose(xyz, full)] = FitStatus.TOO_FEW_JOINTS
     status[~valid] = FitStatus.INVALID_TARGETS
-    half = np.sqrt(values / (1 + values * model_sigma_m**2))
-    root = (vectors * half[..., None, :]) @ vectors.swapaxes(-1, -2)
-    variance = (1 / np.where(full[..., None], values, 1.0)).mean(axis=-1) + model_sigma_m**2
-    return Evidence(status, xyz, root, np.where(full, variance, np.inf), centre)
+    return Evidence(status, xyz, weighed, variance, centre)
+
+
+@part
+def _positive(a, b, c, d, e, f):
+    """Whether the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) is positive definite, by its minors."""
+    return a > 0 and a * d - b * b > 0 and a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d) > 0
+
+
+@kernel
+def _weighed(information, v, found, variance, full, valid):
+    """Fill in, for B rows of targets with `information` L (B, K, 3, 3): (L^-1 + v I)^-1, `found`, the mean
+    `variance` (B, K) over the axes where a target is `full`, else infinite; and which rows are not `valid` (B,).
+    """
+    least = 1 / _SEEN_SIGMA_M**2
+    for n in range(len(information)):
+        for k in range(information.shape[1]):
+            L, M = information[n, k], found[n, k]
+            a, d, f = L[0, 0], L[1, 1], L[2, 2]
+            b, c, e = (L[0, 1] + L[1, 0]) / 2, (L[0, 2] + L[2, 0]) / 2, (L[1, 2] + L[2, 1]) / 2
+            t = _ROUNDING * max(math.sqrt(a * a + d * d + f * f + 2 * (b * b + c * c + e * e)), 1.0)
+            askew = max(abs(L[0, 1] - L[1, 0]), abs(L[0, 2] - L[2, 0]), abs(L[1, 2] - L[2, 1]))
+            if askew > t or not _positive(a + t, b, c, d + t, e, f + t):
+                valid[n] = False
+            full[n, k] = _positive(a - least, b, c, d - least, e, f - least)
+            # L (I + v L)^-1, by minors.
+            A, D, F, B, C, E = 1 + v * a, 1 + v * d, 1 + v * f, v * b, v * c, v * e
+            p, q, r, s, u, w = (
+                D * F - E * E,
+                C * E - B * F,
+                B * E - C * D,
+                A * F - C * C,
+                B * C - A * E,
+                A * D - B * B,
+            )
+            scale = 1 / (A * p + B * q + C * r)
+            M[0, 0], M[1, 1] = scale * (a * p + b * q + c * r), scale * (b * q + d * s + e * u)
+            M[2, 2] = scale * (c * r + e * u + f * w)
+            M[0, 1] = M[1, 0] = scale * (a * q + b * s + c * u)
+            M[0, 2] = M[2, 0] = scale * (a * r + b * u + c * w)
+            M[1, 2] = M[2, 1] = scale * (b * r + d * u + e * w)
+            variance[n, k] = math.inf
+            if full[n, k]:
+                det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
+                variance[n, k] = (d * f - e * e + a * f - c * c + a * d - b * b) / (3 * det) + v
 
 
 def determine_pose(xyz: Array, used: Mask) -> Mask:

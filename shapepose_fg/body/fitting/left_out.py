@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets
+from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets
 from shapepose_fg.body.fitting.evidence import Evidence, determine_pose
 from shapepose_fg.body.fitting.fitter import BodyConfig
 from shapepose_fg.body.fitting.priors import PosePrior
@@ -50,7 +50,7 @@ class Passes:
         A set without a target in any row of a group (R,) needs no pass. Where what is left would not determine the
         pose, the joints of the set are left out one by one; these passes take the shape of their group's others.
         """
-        seen, full = evidence.root.any(axis=(2, 3)), np.isfinite(evidence.variance_m2)
+        seen, full = evidence.information.any(axis=(2, 3)), np.isfinite(evidence.variance_m2)
         R, J, S = *seen.shape, sets.max() + 1
         member = sets == np.arange(S)[:, None]  # (S, J)
         _, group = np.unique(groups, return_inverse=True)
@@ -79,13 +79,14 @@ class Passes:
             return np.broadcast_to(np.arange(without.shape[1]), without.shape)
         return np.argsort(~without, axis=1, kind="stable")[:, : self.without.sum(axis=1).max()]
 
-    def given(self, index: Index) -> tuple[WhitenedTargets, Array]:
+    def given(self, index: Index) -> tuple[EnergyTargets, Array]:
         """The targets of some passes around their rows' centres, and the variance of each (B, J): infinite where a
         target is left out.
         """
         evidence, row, without = self.evidence, self.row[index], self.without[index]
-        xyz, root = evidence.xyz[row] - evidence.centre[row, None], evidence.root[row] * ~without[..., None, None]
-        return WhitenedTargets(xyz, root), np.where(without, np.inf, evidence.variance_m2[row])
+        xyz = evidence.xyz[row] - evidence.centre[row, None]
+        information = evidence.information[row] * ~without[..., None, None]
+        return EnergyTargets(xyz, information), np.where(without, np.inf, evidence.variance_m2[row])
 
 
 def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> Index:
@@ -124,7 +125,7 @@ def _coupling(energy: BodyEnergy, prior: PosePrior) -> Array:
     poses = prior.sample(np.random.default_rng(0), _POSES).reshape(_POSES, -1)
     free[:, 13:-3] = poses[:, energy.angles]
     count = len(energy.model.keypoint_names)
-    nothing = WhitenedTargets(np.zeros((_POSES, count, 3)), np.zeros((_POSES, count, 3, 3)))
+    nothing = EnergyTargets(np.zeros((_POSES, count, 3)), np.zeros((_POSES, count, 3, 3)))
     linear = energy.linearise(free, nothing, 1.0, energy.held_by_priors(_POSES))
     H, J = linear.hessian, linear.jacobian
     root = [10, 11, 12, -3, -2, -1]

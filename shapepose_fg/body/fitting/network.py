@@ -1,5 +1,6 @@
 """The update network of learned gradient descent: its size, its weights, its layers."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
@@ -19,6 +20,7 @@ NUM_PARAMETERS = 10 + 6 * NUM_ROTATIONS + 3
 NUM_TANGENT = 10 + 3 * NUM_ROTATIONS + 3
 """betas, tangents of the rotations, translation."""
 _NUM_POINTS = len(BODY_POINTS)
+_NONE, _LITTLE, _ROOT_HALF, _HALF, _ONE, _FAR = map(np.float32, (0.0, 1e-5, 0.5**0.5, 0.5, 1.0, 3.9))
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,9 @@ class UpdateNetwork:
         hidden = _applied(inputs, self._enter, W["enter.bias"] + enter[:, self.num_inputs + step])
         for block in range(self.config.blocks):
             scaling, one, two = ((W[f"{at}.weight"], W[f"{at}.bias"]) for at in _layers(block))
-            away = hidden - hidden.mean(axis=1, keepdims=True)
-            away /= np.sqrt(np.square(away).mean(axis=1, keepdims=True) + np.float32(1e-5))
-            x = _applied(away * scaling[0] + scaling[1], *one)
+            x = np.empty_like(hidden)
+            _normalised(hidden, *scaling, x)
+            x = _applied(x, *one)
             _gelu(x.reshape(-1))
             hidden = hidden + _applied(x, *two)
         return _applied(hidden, W["leave.weight"], W["leave.bias"])
@@ -126,7 +128,22 @@ def _layer(x, weight, bias, y):
                 y[i, q], y[j, q], y[k, q], y[m, q] = e, f, g, h
 
 
-_ROOT_HALF, _HALF, _ONE, _FAR = (np.float32(value) for value in (0.5**0.5, 0.5, 1.0, 3.9))
+@kernel
+def _normalised(x, weight, bias, y):
+    """Fill y with the layer normalisation of x."""
+    B, count = x.shape
+    for i in range(B):
+        mean, square = _NONE, _NONE
+        for p in range(count):
+            mean += x[i, p]
+        mean /= np.float32(count)
+        for p in range(count):
+            square += (x[i, p] - mean) * (x[i, p] - mean)
+        scale = _ONE / math.sqrt(square / np.float32(count) + _LITTLE)
+        for p in range(count):
+            y[i, p] = (x[i, p] - mean) * scale * weight[p] + bias[p]
+
+
 _ABOVE = tuple(np.float32(value) for value in (
     -2.72614225801306e-10, 2.77068142495902e-08, -2.10102402082508e-06, -5.69250639462346e-05,
     -7.34990630326855e-04, -2.95459980854025e-03, -1.60960333262415e-02))  # fmt: skip

@@ -8,9 +8,9 @@ import numpy as np
 from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent
 from shapepose_fg.body.fitting.energy import (
     BodyEnergy,
+    EnergyTargets,
     Evaluated,
     Held,
-    WhitenedTargets,
     nothing,
     robust_weight,
 )
@@ -55,7 +55,7 @@ class NetworkDescent:
             others=body.points.part(rest) if rest else None, offsets=model.offsets_of_keypoints,
         )  # fmt: skip
 
-    def arrive(self, targets: WhitenedTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
+    def arrive(self, targets: EnergyTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
         """Parameters (B, P) where the network arrives from the closed form on, and that bodies are held there.
 
         `variance` (B, J) is that of each target, infinite where it is not known in all directions, m².
@@ -66,11 +66,11 @@ class NetworkDescent:
         # What is hardly seen is left to the polish: the pull of a guess that had seen it would count it twice.
         well_seen = variance < WELL_SEEN_M**2
         well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
-        root = targets.root @ rotation[:, None] * well_seen[..., None, None]
+        information = rotation[:, None].swapaxes(-1, -2) @ targets.information @ rotation[:, None]
         local = np.broadcast_to(frame.local, (count, 24, 3, 3))
         state = BodyState(np.zeros((count, 10)), local, np.broadcast_to(frame.transl, (count, 3)))
         with np.errstate(all="ignore"):  # who goes wild ends in NaN, and is fitted by the other
-            *_, arrived = self._descent.unroll(state, inside, root.swapaxes(-1, -2) @ root)
+            *_, arrived = self._descent.unroll(state, inside, information * well_seen[..., None, None])
         # From the person's frame to that of the targets.
         orient = log_so3(rotation @ arrived.local[:, 0])
         angles = log_so3(arrived.local[:, 1:]).reshape(count, -1)[:, self._energy.angles]
@@ -81,13 +81,11 @@ class NetworkDescent:
         free[~(np.abs(arrived.betas).max(axis=1) < _NOBODY)] = np.nan
         return free, Held(arrived.betas, np.ones(count), angles)
 
-    def evaluated(
-        self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None
-    ) -> Evaluated:
+    def evaluated(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
         """The bodies of `arrive` (B, P), polished, and the energy around them for the keypoints `asked` or all."""
         return self.again(free, targets, held, asked)
 
-    def again(self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None) -> Evaluated:
+    def again(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
         """Gauss-Newton steps from `free` (B, P); one that does not lower a row's energy is not taken.
 
         The energy is linearised before each step. After the last, only rows are in which the weight of some joint
@@ -116,7 +114,7 @@ class LevenbergMarquardt:
         self._frame = PersonFrame.of_angles(energy.model, prior.mean, prior.covariance)
         self._mean_angles = prior.mean[energy.angles]
 
-    def arrive(self, targets: WhitenedTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
+    def arrive(self, targets: EnergyTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
         """The optimum (B, P), each with its own shape, held by the priors; from `start` where that is no NaN."""
         rotation, pelvis = self._frame.place(targets.xyz, variance, self._slots)
         count = len(variance)
@@ -129,18 +127,16 @@ class LevenbergMarquardt:
         held = self._energy.held_by_priors(count)
         return self.solve(free, targets, warm, held), held
 
-    def evaluated(
-        self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None
-    ) -> Evaluated:
+    def evaluated(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
         """The bodies of `arrive` (B, P), and the energy around them for the keypoints `asked` or all."""
         return self._energy.evaluate(free, targets, self._scale, held, asked)
 
-    def again(self, free: Array, targets: WhitenedTargets, held: Held, asked: Index | None = None) -> Evaluated:
+    def again(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
         """The optimum from `free` (B, P) on, held by something else."""
         free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
         return self.evaluated(free, targets, held, asked)
 
-    def solve(self, free: Array, targets: WhitenedTargets, warm: Mask, held: Held) -> Array:
+    def solve(self, free: Array, targets: EnergyTargets, warm: Mask, held: Held) -> Array:
         """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
         energy, rows = self._energy, np.arange(len(free))
         result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)

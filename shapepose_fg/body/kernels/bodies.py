@@ -60,7 +60,7 @@ def _product(A, B, C):
 
 @part
 def _bent(slope, L, T, q, c):
-    """What turning joint q about its axis c does by the pose blend shapes, along which this is the `slope` (207,)."""
+    """What turning joint q about its axis c does by the pose blend shapes: `slope` (207,) is along these."""
     x, y, z, at, total = T[0, c], T[1, c], T[2, c], 9 * q - 9, 0.0
     for i in range(3):
         total += slope[at + 3 * i] * (L[i, 1] * z - L[i, 2] * y)
@@ -247,19 +247,17 @@ def _energy(limbs, priors, free, rows, b, scale, w):
         g[n] = rows.stiffness[b] * away
         energy += g[n] * away
     for k in range(len(w.squared)):
-        S, r0, r1, r2 = rows.root[b, k], w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
+        M, r0, r1, r2 = rows.information[b, k], w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
         r0, r1, r2 = r0 - rows.xyz[b, k, 0], r1 - rows.xyz[b, k, 1], r2 - rows.xyz[b, k, 2]
-        u0 = S[0, 0] * r0 + S[0, 1] * r1 + S[0, 2] * r2
-        u1 = S[1, 0] * r0 + S[1, 1] * r1 + S[1, 2] * r2
-        u2 = S[2, 0] * r0 + S[2, 1] * r1 + S[2, 2] * r2
-        w.squared[k] = u0 * u0 + u1 * u1 + u2 * u2
+        f0 = M[0, 0] * r0 + M[0, 1] * r1 + M[0, 2] * r2
+        f1 = M[1, 0] * r0 + M[1, 1] * r1 + M[1, 2] * r2
+        f2 = M[2, 0] * r0 + M[2, 1] * r1 + M[2, 2] * r2
+        w.squared[k] = r0 * f0 + r1 * f1 + r2 * f2
         robust = c2 / (c2 + w.squared[k])
         energy += robust * w.squared[k]
         w.weight[k] = v = robust * robust
         if w.squared[k] != 0.0:
-            f0 = v * (S[0, 0] * u0 + S[0, 1] * u1 + S[0, 2] * u2)
-            f1 = v * (S[1, 0] * u0 + S[1, 1] * u1 + S[1, 2] * u2)
-            _pulled(limbs, k, f0, f1, v * (S[2, 0] * u0 + S[2, 1] * u1 + S[2, 2] * u2), w)
+            _pulled(limbs, k, v * f0, v * f1, v * f2, w)
     _gathered(limbs, w)
     return energy
 
@@ -286,10 +284,10 @@ def _normal(priors, rows, b, asked, H, w):
             for j in range(3):
                 H[P + 1 + 3 * n + j, column[i]] = J[j, i]
     for k in range(K):
-        S, J, column, m = rows.root[b, k], w.J[k], w.column[k], w.count[k]
+        J, column, m = w.J[k], w.column[k], w.count[k]
         for i in range(3):
             for j in range(3):
-                M[i, j] = w.weight[k] * (S[i, 0] * S[0, j] + S[i, 1] * S[1, j] + S[i, 2] * S[2, j])
+                M[i, j] = w.weight[k] * rows.information[b, k, i, j]
         for i in range(m if M[0, 0] + M[1, 1] + M[2, 2] > 0.0 else 0):
             row, x, y, z = H[column[i]], J[0, i], J[1, i], J[2, i]
             t0 = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z

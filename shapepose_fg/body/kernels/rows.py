@@ -67,8 +67,8 @@ class Rows(NamedTuple):
 
     xyz: Array
     """(B, K, 3) targets, metres."""
-    root: Array
-    """(B, K, 3, 3) symmetric square roots S of their information, 1/m."""
+    information: Array
+    """(B, K, 3, 3) of these, 1/m²."""
     betas: Array
     """(B, 10) around which shape."""
     stiffness: Array

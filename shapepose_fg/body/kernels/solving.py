@@ -25,20 +25,27 @@ def _reduced(H, n, first, end):
     """Reduce the rows `first` to `end` of a system with n unknowns; False where H is not positive definite."""
     for i in range(first, end, 4):
         stop, begin = min(i + 4, end), 0
-        if stop == i + 4:  # four rows at a time
-            begin = min(i, n)
-            for j in range(begin):
-                a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        if stop == i + 4:  # four rows and two columns at a time
+            begin = min(i, n) // 2 * 2
+            for j in range(0, begin, 2):
+                a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for p in range(j):
-                    a += H[i, p] * H[j, p]
-                    b += H[i + 1, p] * H[j, p]
-                    c += H[i + 2, p] * H[j, p]
-                    d += H[i + 3, p] * H[j, p]
-                scale = 1 / H[j, j]
-                H[i, j] = (H[i, j] - a) * scale
-                H[i + 1, j] = (H[i + 1, j] - b) * scale
-                H[i + 2, j] = (H[i + 2, j] - c) * scale
-                H[i + 3, j] = (H[i + 3, j] - d) * scale
+                    v, w = H[j, p], H[j + 1, p]
+                    a += H[i, p] * v
+                    b += H[i + 1, p] * v
+                    c += H[i + 2, p] * v
+                    d += H[i + 3, p] * v
+                    e += H[i, p] * w
+                    f += H[i + 1, p] * w
+                    g += H[i + 2, p] * w
+                    h += H[i + 3, p] * w
+                v, w, scale = 1 / H[j, j], H[j + 1, j], 1 / H[j + 1, j + 1]
+                a, b, c, d = (H[i, j] - a) * v, (H[i + 1, j] - b) * v, (H[i + 2, j] - c) * v, (H[i + 3, j] - d) * v
+                H[i, j], H[i + 1, j], H[i + 2, j], H[i + 3, j] = a, b, c, d
+                H[i, j + 1] = (H[i, j + 1] - e - a * w) * scale
+                H[i + 1, j + 1] = (H[i + 1, j + 1] - f - b * w) * scale
+                H[i + 2, j + 1] = (H[i + 2, j + 1] - g - c * w) * scale
+                H[i + 3, j + 1] = (H[i + 3, j + 1] - h - d * w) * scale
         for r in range(i, stop):
             for j in range(begin, min(r + 1, n)):
                 total = H[r, j]
@@ -180,19 +187,29 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
             front[M - 1, M - 1] = math.nan  # and so in all that follows
         for i in range(N, M, 4):
             stop = min(i + 4, M)
-            for j in range(N, i if stop == i + 4 else N):
-                a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            even = N + (i - N) // 2 * 2 if stop == i + 4 else N
+            for j in range(N, even, 2):
+                a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for p in range(K.shape[1]):
-                    a += K[i, p] * K[j, p]
-                    b += K[i + 1, p] * K[j, p]
-                    c += K[i + 2, p] * K[j, p]
-                    d += K[i + 3, p] * K[j, p]
+                    v, w = K[j, p], K[j + 1, p]
+                    a += K[i, p] * v
+                    b += K[i + 1, p] * v
+                    c += K[i + 2, p] * v
+                    d += K[i + 3, p] * v
+                    e += K[i, p] * w
+                    f += K[i + 1, p] * w
+                    g += K[i + 2, p] * w
+                    h += K[i + 3, p] * w
                 front[i, j] -= a
                 front[i + 1, j] -= b
                 front[i + 2, j] -= c
                 front[i + 3, j] -= d
+                front[i, j + 1] -= e
+                front[i + 1, j + 1] -= f
+                front[i + 2, j + 1] -= g
+                front[i + 3, j + 1] -= h
             for r in range(i, stop):
-                for j in range(i if stop == i + 4 else N, r + 1):
+                for j in range(even, r + 1):
                     a = 0.0
                     for p in range(N):
                         a += K[r, p] * K[j, p]

@@ -4,9 +4,12 @@ Everything takes leading batch dimensions and is exact at angle 0 (no epsilon).
 The tangent convention of the whole package is the right one: `R exp(delta)`.
 """
 
+import math
+
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.compiled import kernel
 
 _SERIES_BELOW = 1e-2
 """Squared angle (rad^2) under which closed forms lose digits to cancellation and their series is used."""
@@ -21,30 +24,16 @@ def hat(v: Array) -> Array:
 
 def exp_so3(axis_angle: Array) -> Array:
     """Rotation matrices of axis-angle vectors in radians, any norm; (..., 3) -> (..., 3, 3) (Rodrigues)."""
-    angle = np.linalg.norm(axis_angle, axis=-1)[..., None, None]
-    first = np.sinc(angle / np.pi)  # sin(t) / t
-    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 - cos(t)) / t^2 without cancellation
-    cross = hat(axis_angle)
-    return np.eye(3) + first * cross + second * (cross @ cross)
+    R = np.empty((*axis_angle.shape, 3))
+    _exp(np.require(axis_angle, float, ["C", "W"]).reshape(-1, 3), R.reshape(-1, 3, 3))
+    return R
 
 
-def _quaternion(R: Array) -> Array:
+def quaternion(R: Array) -> Array:
     """Unit quaternions (w, x, y, z) with w >= 0 of rotation matrices; (..., 3, 3) -> (..., 4)."""
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R, (-2, -1), (0, 1))
-    # Each row is the quaternion times four times one of its own components; the longest row divides best.
-    rows = np.stack(
-        (
-            np.stack((1 + a + e + i, h - f, c - g, d - b), -1),
-            np.stack((h - f, 1 + a - e - i, b + d, c + g), -1),
-            np.stack((c - g, b + d, 1 - a + e - i, f + h), -1),
-            np.stack((d - b, c + g, f + h, 1 - a - e + i), -1),
-        ),
-        -2,
-    )
-    best = np.diagonal(rows, axis1=-2, axis2=-1).argmax(-1)
-    chosen = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    unit = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
-    return np.where(unit[..., :1] < 0, -unit, unit)
+    turn = log_so3(R)
+    half = np.linalg.norm(turn, axis=-1, keepdims=True) / 2
+    return np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * turn], axis=-1)
 
 
 def log_so3(R: Array) -> Array:
@@ -52,11 +41,50 @@ def log_so3(R: Array) -> Array:
 
     Goes by way of the quaternion, so that nothing is lost near pi; at exactly pi either axis may come out.
     """
-    quaternion = _quaternion(R)
-    real, xyz = quaternion[..., :1], quaternion[..., 1:]
-    sine = np.linalg.norm(xyz, axis=-1, keepdims=True)
-    safe = np.where(sine > 0, sine, 1.0)
-    return xyz * np.where(sine > 0, 2 * np.arctan2(sine, real) / safe, 2.0)
+    found = np.empty(R.shape[:-1])
+    _log(np.require(R, float, ["C", "W"]).reshape(-1, 3, 3), found.reshape(-1, 3))
+    return found
+
+
+@kernel
+def _exp(vectors, R):
+    """Fill R (N, 3, 3) from axis-angle vectors (N, 3)."""
+    for n in range(len(R)):
+        x, y, z = vectors[n]
+        s = x * x + y * y + z * z
+        if s < _SERIES_BELOW:  # closed forms lose digits to cancellation
+            first, second = 1 - s / 6 * (1 - s / 20 * (1 - s / 42)), 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56))
+        else:
+            t = math.sqrt(s)
+            first, second = math.sin(t) / t, (1 - math.cos(t)) / s
+        R[n, 0, 0], R[n, 1, 1], R[n, 2, 2] = (
+            1 - second * (y * y + z * z), 1 - second * (x * x + z * z), 1 - second * (x * x + y * y),
+        )  # fmt: skip
+        R[n, 0, 1], R[n, 1, 0] = second * x * y - first * z, second * x * y + first * z
+        R[n, 0, 2], R[n, 2, 0] = second * x * z + first * y, second * x * z - first * y
+        R[n, 1, 2], R[n, 2, 1] = second * y * z - first * x, second * y * z + first * x
+
+
+@kernel
+def _log(R, vectors):
+    """Fill axis-angle vectors (N, 3) from R (N, 3, 3)."""
+    for n in range(len(R)):
+        a, e, i = R[n, 0, 0], R[n, 1, 1], R[n, 2, 2]
+        x, y, z = R[n, 2, 1] - R[n, 1, 2], R[n, 0, 2] - R[n, 2, 0], R[n, 1, 0] - R[n, 0, 1]
+        b, c, f = R[n, 0, 1] + R[n, 1, 0], R[n, 0, 2] + R[n, 2, 0], R[n, 1, 2] + R[n, 2, 1]
+        # The quaternion times four times one of its components: the largest divides best.
+        if a + e + i >= max(a, e, i):
+            w = 1 + a + e + i
+        elif a >= e and a >= i:
+            w, x, y, z = x, 1 + a - e - i, b, c
+        elif e >= i:
+            w, x, y, z = y, b, 1 - a + e - i, f
+        else:
+            w, x, y, z = z, c, f, 1 - a - e + i
+        sine = math.sqrt(x * x + y * y + z * z)
+        sign = -1.0 if w < 0 else 1.0
+        scale = 2 * math.atan2(sine, sign * w) / sine if sine > 0 else 0.0
+        vectors[n, 0], vectors[n, 1], vectors[n, 2] = sign * scale * x, sign * scale * y, sign * scale * z
 
 
 def right_jacobian_inverse(axis_angle: Array) -> Array:

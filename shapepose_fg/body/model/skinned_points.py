@@ -118,9 +118,9 @@ class SkinnedPoints:
 
     def _placed(self, local: Array, betas: Array, transl: Array, *, jacobian: bool) -> tuple[Array, Array]:
         B, K = len(betas), len(self.root)
-        given = (np.require(part, float, ["C", "W"]) for part in (local, betas, transl))
+        local, betas, transl = (np.require(part, float, ["C", "W"]) for part in (local, betas, transl))
         xyz, slopes = np.zeros((B, K, 3)), np.zeros((B if jacobian else 0, K, 3, NUM_COLUMNS))
-        placed(self._limbs, *given, xyz, slopes, Work.of(self._limbs, NUM_COLUMNS))
+        placed(self._limbs, local, betas, transl, xyz, slopes, Work.of(self._limbs, NUM_COLUMNS))
         return xyz, slopes
 
 

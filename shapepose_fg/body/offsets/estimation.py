@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, WhitenedTargets, robust_weight
+from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
@@ -97,10 +97,10 @@ def _solved(
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
-        seen = WhitenedTargets(centred, evidence.root[part])
+        seen = EnergyTargets(centred, evidence.information[part])
         here = _eliminate(energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale)
         hessian, gradient, prior = hessian + here[0], gradient + here[1], prior + here[2] / len(rows)
-    count = (np.abs(evidence.root[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
+    count = (np.abs(evidence.information[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
     current = energy.model.keypoint_offsets.xyz_m.ravel()
     hessian, gradient = hessian / _ROWS_PER_DRAW, gradient / _ROWS_PER_DRAW
     hessian[:75, :75] += precision
@@ -120,7 +120,7 @@ def _made(xyz_m: Real, precision: Real, count: Real) -> KeypointOffsets:
 
 
 def _eliminate(
-    energy: BodyEnergy, free: Array, targets: WhitenedTargets, kernel_scale: float
+    energy: BodyEnergy, free: Array, targets: EnergyTargets, kernel_scale: float
 ) -> tuple[Real, Real, Real]:
     """Sums over the rows (R, P) `free`, each row's body eliminated.
 
@@ -129,22 +129,21 @@ def _eliminate(
     (R, P), K = free.shape, len(BODY_25)
     linear = energy.linearise(free, targets, kernel_scale, energy.held_by_priors(R))
     here, jacobian = linear.hessian, linear.jacobian
-    root = np.sqrt(robust_weight(linear.squared, kernel_scale))[..., None, None] * targets.root
-    rotations = energy.model.bone_rotations(energy.complete(free))[:, RIDES_ON]
-    by_offset = root @ rotations  # (R, 25, 3, 3), whitened
-    residual = (root @ (targets.xyz - linear.xyz)[..., None])[..., 0]
-    by_body = (root @ jacobian.reshape(R, K, 3, P)).reshape(R, 3 * K, P)
-    prior_hessian = here - by_body.swapaxes(1, 2) @ by_body
-    prior_gradient = linear.gradient + (by_body.swapaxes(1, 2) @ residual.reshape(R, -1, 1))[..., 0]
-    crossed = (by_offset.swapaxes(-1, -2) @ by_body.reshape(R, K, 3, P)).reshape(R, 3 * K, P)
+    information = robust_weight(linear.squared, kernel_scale)[..., None, None] * targets.information
+    by_offset = energy.model.bone_rotations(energy.complete(free))[:, RIDES_ON]  # (R, 25, 3, 3)
+    force = information @ (targets.xyz - linear.xyz)[..., None]
+    weighed = information @ jacobian.reshape(R, K, 3, P)
+    prior_hessian = here - jacobian.swapaxes(1, 2) @ weighed.reshape(R, 3 * K, P)
+    prior_gradient = linear.gradient + (jacobian.swapaxes(1, 2) @ force.reshape(R, -1, 1))[..., 0]
+    crossed = (by_offset.swapaxes(-1, -2) @ weighed).reshape(R, 3 * K, P)
     both = np.concatenate([crossed, -prior_hessian], axis=1)  # (R, 75 + P, P): second derivatives with the body
-    by_own = -(by_offset.swapaxes(-1, -2) @ residual[..., None]).reshape(R, -1)
+    by_own = -(by_offset.swapaxes(-1, -2) @ force).reshape(R, -1)
     gradient = np.concatenate([by_own, -prior_gradient], axis=1)
     system = np.concatenate([here, both, linear.gradient[:, None]], axis=1)
     reduce_systems(system)
     half = system[:, P:].swapaxes(0, 1).reshape(76 + P, -1)  # all rows' in one matrix
     hessian = -(half[:-1] @ half[:-1].T)
-    own = (by_offset.swapaxes(-1, -2) @ by_offset).sum(axis=0)
+    own = (by_offset.swapaxes(-1, -2) @ information @ by_offset).sum(axis=0)
     for joint in range(K):
         here_ = slice(3 * joint, 3 * joint + 3)
         hessian[here_, here_] += own[joint]

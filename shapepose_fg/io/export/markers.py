@@ -15,7 +15,7 @@ from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.skeleton import MID_HIP, SMPL_24
 from shapepose_fg.io.export.registry import Job, MarkerSet, Written, optional
 from shapepose_fg.io.export.skinned import motion_of
@@ -72,13 +72,6 @@ def opensim_names(joints: tuple[str, ...]) -> tuple[str, ...]:
     """
     hip = "Hip" if "Head" in joints else "CHip"
     return tuple(hip if name == MID_HIP else name for name in joints)
-
-
-def sigma_m(covariance: Array) -> Array:
-    """(...) standard deviation of positions with covariance (..., 3, 3): root mean square over the axes."""
-    variance = np.trace(covariance, axis1=-2, axis2=-1) / 3
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
 def write_trc(job: Job) -> Written:

@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
+from shapepose_fg.body.model.rotation import exp_so3, hat, quaternion
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.reconstruction import BODY, with_body
@@ -89,6 +89,8 @@ class Motion:
             given, rotations, pelvis = self.index[part], self.rotations[part], self.pelvis[part]
             index = np.arange(given[0], given[-1] + 1)
             if len(index) > len(given):
+                from scipy.spatial.transform import Rotation, Slerp  # a sixth of a second, and no hole in most
+
                 turns = [Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)]
                 rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)
                 pelvis = np.stack([np.interp(index, given, axis) for axis in pelvis.T], axis=1)
@@ -103,9 +105,9 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motio
         return None
     betas, orient, pose, transl = (part[index] for part in parts)
     own = rest_joints(arrays, betas)
-    vectors = np.concatenate([orient[:, None], pose], axis=1)
-    quaternions = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_quat().reshape(-1, BONES, 4)
-    quaternions[:, 0] = (Rotation.from_matrix(axes) * Rotation.from_quat(quaternions[:, 0])).as_quat()
+    turned = exp_so3(np.concatenate([orient[:, None], pose], axis=1))
+    turned[:, 0] = axes @ turned[:, 0]
+    quaternions = np.roll(quaternion(turned), -1, axis=-1)
     pelvis = (own[:, 0] + transl) @ axes.T
     motion = Motion(RestBody(arrays, betas.mean(axis=0)), index, quaternions, pelvis)
     if (betas == betas[0]).all():
@@ -179,7 +181,8 @@ def _offsets(rest: Array) -> Array:
 
 def _accumulated(rotations: Array) -> Array:
     """(F, 24, 3, 3) world from bone, of quaternions (F, 24, 4) against the parent."""
-    local = Rotation.from_quat(rotations.reshape(-1, 4)).as_matrix().reshape(-1, BONES, 3, 3)
+    cross = hat(rotations[..., :3])
+    local = np.eye(3) + 2 * (rotations[..., 3:, None] * cross + cross @ cross)
     world = [local[:, 0]]
     for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
         world.append(world[parent] @ local[:, joint])

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Index, Mask, Real, Whole
 from shapepose_fg.core.observation_table import Gate, ObservationTable
-from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.io.export.markers import sigma_m
 from shapepose_fg.viz.report.facts import lists, number, objects
 
 _BINS = 60

@@ -11,8 +11,7 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import PALETTE, bones_of, thinned
-from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.io.export.markers import sigma_m
+from shapepose_fg.core.reconstruction import Known, sigma_m
 from shapepose_fg.io.export.skinned import BONES, motion_of
 from shapepose_fg.io.export.take import Take, z_up
 
