@@ -7,7 +7,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.core.trust import BELIEVED, Trust
+from shapepose_fg.core.trust import Trust, trust_in
 
 _LEAST = 4
 """Detections that two pictures must have in common: the odd one may be of something that stands still."""
@@ -25,8 +25,6 @@ class WithoutRepeats:
     """The recording as it is."""
     views: int
     """V, its cameras."""
-    trust: Trust = BELIEVED
-    """Which cameras are left out besides, and when."""
     _before: dict[int, Detections] = field(default_factory=dict, init=False, repr=False, compare=False)
     """The frame that was read last, by its number."""
 
@@ -34,6 +32,11 @@ class WithoutRepeats:
     def skeleton(self) -> Skeleton:
         """The detector's joints."""
         return self.frames.skeleton
+
+    @property
+    def trust(self) -> Trust:
+        """Which cameras are left out besides, and when."""
+        return trust_in(self.frames)
 
     @property
     def first(self) -> int:

@@ -18,7 +18,6 @@ from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.core.trust import BELIEVED, Trust
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
@@ -63,7 +62,6 @@ def reconstruct(
     shapes: SubjectShapes | None = None,
     fitter: BodyFitter | None = None,
     extra_factors: ExtraFactors | None = None,
-    trust: Trust | None = None,
     execution: Execution | None = None,
 ) -> Reconstruction:
     """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
@@ -72,8 +70,7 @@ def reconstruct(
     without it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut:
     nothing carries over to them, identities least of all. `shapes` are people known from other recordings.
     `fitter` replaces the body fitter, and `extra_factors` adds factors of your own to every person's window.
-    `trust` says which cameras are left out, and when, because they contradict the others: that of
-    `setup_check.report.check_setup(detections, rig)`, for example.
+    `Trusted(detections, check_setup(detections, rig).trust)` leaves out cameras that contradict the others.
     `execution` says what runs it: processes, a cluster, chunks, who is told how far it is.
 
     In the result `person` is an identity over time (without time, the number of a person within the frame). Its
@@ -83,7 +80,7 @@ def reconstruct(
     ValueError where an argument does not fit the recording.
     """
     config = PipelineConfig() if config is None else config
-    task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors, trust)
+    task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     return reconstruct_parts(InMemory(), task, execution).reconstruction(consume=True)
 
 
@@ -100,7 +97,6 @@ class Task:
     shapes: SubjectShapes | None = None
     fitter: BodyFitter | None = None
     extra_factors: ExtraFactors | None = None
-    trust: Trust | None = None
 
     def whole(self) -> tuple[range, FrameTimes, list[int]]:
         """Frames, times and cuts, those that are not given filled in; ValueError where they do not fit."""
@@ -130,7 +126,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             f" got {chunk}"
         )
     book, fitter = Notebook(), task.fitter
-    pictures = WithoutRepeats(task.detections, len(rig), task.trust or BELIEVED)
+    pictures = WithoutRepeats(task.detections, len(rig))
     detections = ThinnedFrames(pictures, len(rig), config.candidates)
     with book.stage("load"):
         if fitter is None:

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.compiled core.errors core.moved",
-    "core.camera core.skeleton core.pieces core.trust",
+    "core.camera core.skeleton core.pieces",
     "core.drawing",
     "core.storage.files core.bounds",
     "core.storage.npz",
@@ -26,6 +26,7 @@ LEVELS = (
     "body.fitting body.shapes",
     "body.offsets",
     "core.detections core.frame_times",
+    "core.trust",
     "core.observations core.notes core.repeated_pictures",
     "core.observation_table",
     "core.reconstruction",

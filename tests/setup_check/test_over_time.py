@@ -8,7 +8,7 @@ import pytest
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Status
-from shapepose_fg.core.trust import Trust
+from shapepose_fg.core.trust import Trust, Trusted
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.setup_check.findings import Kind
 from shapepose_fg.setup_check.report import check_setup, result_check
@@ -70,12 +70,12 @@ def test_of_two_cameras_nothing_says_which_is_wrong(recording, room):
 def test_rows_that_rest_on_doubted_cameras_are_not_ok(recording, room):
     seen, rig = some_cameras(recording, room, [0, 2, 3])
     seen = Recording(seen.skeleton, seen.frames[:20])
-    people = reconstruct(seen, rig, trust=Trust(doubted=((0, 10, 20), (1, 10, 20))))
+    people = reconstruct(Trusted(seen, Trust(doubted=((0, 10, 20), (1, 10, 20)))), rig)
     assert set(people.status[people.frame < 10]) == {Status.OK}
     assert set(people.status[people.frame >= 10]) == {Status.CONTRADICTED}
-    one = reconstruct(seen, rig, trust=Trust(doubted=((0, 0, 20),), left_out=()))
+    one = reconstruct(Trusted(seen, Trust(doubted=((0, 0, 20),), left_out=())), rig)
     assert set(one.status) == {Status.OK}
-    without = reconstruct(seen, rig, trust=Trust(left_out=((0, 0, 20),)))
+    without = reconstruct(Trusted(seen, Trust(left_out=((0, 0, 20),))), rig)
     assert len(without) == len(people) and without.observations is not None
     assert (without.observations.candidate[:, :, 0] < 0).all()
 

@@ -27,6 +27,7 @@ from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
+from shapepose_fg.core.trust import Trusted, trust_in
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
@@ -96,7 +97,7 @@ def carry_out(
             inputs |= checksums([fitter.weights.file])
         del reading  # of half a million files it is large
         report = check_setup(known, task) if asked.check else None
-        task = task if report is None else replace(task, trust=report.trust)
+        task = task if report is None else replace(task, detections=Trusted(recording, report.trust))
         return _Run(task, recording, known, inputs, execution, report).carried_out(resume=resume, restart=restart)
 
 
@@ -140,7 +141,7 @@ class _Run:
             "frames": [frames.start, frames.stop],
             "time": {**times.as_dict(), "sha256": _digest(times.time_s)},
             "cuts": cuts,
-            "trust": None if task.trust is None else asdict(task.trust),
+            "trust": asdict(trust_in(task.detections)),
             "chunk_frames": self.execution.chunk_frames,
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
