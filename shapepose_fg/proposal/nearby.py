@@ -99,25 +99,10 @@ class Nearby:
         joints that are `lost` (N,) only affinity tells, and so much of it must be there.
         """
         N, chosen = len(self.person), np.empty(own.shape, dtype=np.intp)
-        claims, taken = (
-            Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool)),
-            np.empty(len(sight.of_view), np.intp),
-        )
-        room = np.empty(N), np.empty(N, dtype=np.intp), taken
-        claim(
-            self.first,
-            self.person,
-            self.detection,
-            nearness,
-            lost,
-            sure,
-            own,
-            world,
-            sight,
-            *claims,
-            *room,
-            chosen,
-        )
+        claims = Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool))
+        room = np.empty(N), np.empty(N, dtype=np.intp), np.empty(len(sight.of_view), dtype=np.intp)
+        near = self.first, self.person, self.detection
+        claim(*near, nearness, lost, sure, own, world, sight, *claims, *room, chosen)
         return chosen, claims
 
     def with_tied(self, own: Index, unplaced: Mask, sight: Sight) -> "Nearby":
@@ -173,6 +158,13 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
     """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin."""
     joint, other = np.nonzero(skeleton.adjacency)
     return np.searchsorted(joint, np.arange(len(skeleton) + 1)), other
+
+
+@cache
+def limbs_of(skeleton: Skeleton) -> Index:
+    """(L, 2) the limbs of core joints, and the spine: what hides others."""
+    core = set(skeleton.core)
+    return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 
@@ -39,18 +39,19 @@ def group_people(found: Detections) -> list[Index]:
     count = len(found)
     order, stop = np.empty(count, dtype=np.intp), np.empty(count, dtype=np.intp)
     has = np.zeros((count, joint.max(initial=-1) + 1), dtype=bool)
-    groups = _group(pairs[np.argsort(-affinity, kind="stable")], joint, has, order, stop)
+    chains = np.arange(count), np.full(count, -1), np.arange(count)
+    groups = _group(pairs[np.argsort(-affinity, kind="stable")], joint, *chains, has, order, stop)
     return np.split(order, stop[: groups - 1]) if count > 0 else []
 
 
 @kernel
-def _group(pairs: Index, joint: Index, has: Mask, order: Index, stop: Index) -> int:
+def _group(pairs, joint, group, after, last, has, order, stop):
     """`group_people`: its groups one after the other into `order` (N,), their ends into `stop`; their number.
 
-    `has` (N, J) is False everywhere: which kinds of joints each group has.
+    To begin with each is a `group` (N,) of its own, with none `after` (N,) it, the `last` (N,) of it itself, and
+    `has` (N, J), which kinds of joints a group has, is False.
     """
     count = len(joint)
-    group, after, last = np.arange(count), np.full(count, -1), np.arange(count)
     for row in range(count):
         has[row, joint[row]] = True
     for pair in range(len(pairs)):

@@ -152,7 +152,9 @@ def _triangulate(
     for p in range(prior.shape[0]):
         for j in range(prior.shape[1]):
             # The point nearest to all rays d from c: sum of (1 - d d') x = sum of (1 - d d') c.
-            A[:], b[:], seen = 0.0, 0.0, 0
+            seen = 0
+            for i in range(3):
+                b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
             for v in range(views):
                 weight[p, j, v] = prior[p, j, v]
                 if prior[p, j, v] > 0:
@@ -171,9 +173,10 @@ def _triangulate(
             if seen >= 2:
                 _solve(A, b, x)
             else:
-                x[:] = math.nan
+                x[0] = x[1] = x[2] = math.nan
             for step in range(steps + 1):
-                A[:], b[:] = 0.0, 0.0
+                for i in range(3):
+                    b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
                 for v in range(views):
                     M = cameras[v]
                     z = M[2, 0] * x[0] + M[2, 1] * x[1] + M[2, 2] * x[2] + M[2, 3]
@@ -206,8 +209,7 @@ def _triangulate(
                     _solve(A, b, gu)
                     for i in range(3):
                         x[i] -= gu[i]
-            for i in range(3):
-                points[p, j, i] = x[i]
+            points[p, j, 0], points[p, j, 1], points[p, j, 2] = x[0], x[1], x[2]
 
 
 @kernel

@@ -39,9 +39,14 @@ class Trust(NamedTuple):
     def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "Trust":
         """The settings, for `joints` of these names."""
         return cls(
-            config.scatter(joints), float(config.sigma_m), float(config.floor_rad), float(config.rho_2d_m),
-            float(config.fixed_depth_m or 0.0), ROBUST[config.kernel], DEFAULT_WIDTH_SIGMA.get(config.kernel, 1.0),
-        )  # fmt: skip
+            scatter=config.scatter(joints),
+            sigma_m=float(config.sigma_m),
+            floor_rad=float(config.floor_rad),
+            rho_2d_m=float(config.rho_2d_m),
+            fixed_depth_m=float(config.fixed_depth_m),
+            robust=ROBUST[config.kernel],
+            width=DEFAULT_WIDTH_SIGMA.get(config.kernel, 1.0),
+        )
 
 
 def measured(
@@ -67,25 +72,15 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
     `evident` (A,).
     """
     people, joints, views = candidate.shape
-    sigma_px, depths, room, inlier = (
-        np.empty(views),
-        np.empty(views),
-        np.empty(views),
-        np.empty((joints, views), dtype=np.bool_),
-    )
+    sigma_px, depths, sure, room = np.empty(views), np.empty(views), np.empty(views), np.empty(views)
+    at, uv, inlier = np.empty(3), np.empty((views, 2)), np.empty((joints, views), dtype=np.bool_)
     L, g, M, gain = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, mean.shape[2], 3))
     trusted, torn = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
     seen_by, above = np.empty(joints, dtype=np.intp), np.empty(joints, dtype=np.intp)
     way_m, count, too_long = np.empty(joints), np.empty(joints), np.empty(joints)
     cameras, focal, xy, core, scatter = sight.cameras, sight.focal, sight.xy, bones.core, trust.scatter
     numbers, fixed_m = trust[1:], trust.fixed_depth_m
-    longest_m, parents, at, uv, sure = (
-        bones.longest_m,
-        bones.parents,
-        np.empty(3),
-        np.empty((views, 2)),
-        np.empty(views),
-    )
+    longest_m, parents = bones.longest_m, bones.parents
     for a in range(people):
         for v in range(views):
             depths[v] = _mean_depth(mean[a], cameras[v])

@@ -79,8 +79,8 @@ class Bones(NamedTuple):
     """(J,) all joints, parents first."""
     parents: Index
     """(J,) -1 for the root."""
-    hips: Index
-    """(2,) right and left."""
+    hips: tuple[int, int]
+    """Right and left."""
     longest_m: Array
     """(J,) the longest distance of a joint to its parent, metres; the root's counts nothing."""
 
@@ -89,9 +89,7 @@ class Bones(NamedTuple):
         """A detector's."""
         core, order = np.zeros(len(skeleton), dtype=bool), np.concatenate(skeleton.tree_levels).astype(np.intp)
         core[list(skeleton.core)] = True
-        return cls(
-            core, order, np.array(skeleton.parents), np.array(skeleton.hips), np.array(longest_m, dtype=float)
-        )
+        return cls(core, order, np.array(skeleton.parents), skeleton.hips, np.array(longest_m, dtype=float))
 
 
 def predicted(

@@ -1,7 +1,7 @@
 """Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.pieces import project
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import Sight, tie
+from shapepose_fg.proposal.nearby import Sight, limbs_of, tie
 
 _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
@@ -78,26 +78,16 @@ def weighed(
     unknown are thought to be where the others are in the mean.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
-    whole, real = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
-    weight, price = np.zeros(candidate.shape), np.zeros(A)
-    _weigh(
-        candidate, places, known, world, sight, limbs_of(skeleton), whole[0], whole[1], whole[2], real,
-        np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A), weight, price,
-    )  # fmt: skip
+    weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
+    lists, tied = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
+    room = np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
+    _weigh(candidate, places, known, world, sight, limbs, lists, tied, *room, weight, price)
     return weight, price
-
-
-@cache
-def limbs_of(skeleton: Skeleton) -> Index:
-    """(L, 2) the limbs of core joints, and the spine: what hides others."""
-    core = set(skeleton.core)
-    return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
 
 
 @kernel
 def _weigh(
-    candidate, places, known, world, sight, limbs, whose, which, neighbours, tied, at, seen, box, expected, weight,
-    price,
+    candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight, price
 ):  # fmt: skip
     """Fill in what `weighed` returns, zeros before; `expected` (A,) is how many places there are.
 
@@ -105,7 +95,7 @@ def _weigh(
     (A, 3): left, right and the nearest. Joints are `at` (A, J, 3), or where the others are in the mean.
     """
     people, joints, views = weight.shape
-    cameras, count = sight.cameras, 0
+    cameras, count, whose, which, neighbours = sight.cameras, 0, lists[0], lists[1], lists[2]
     for a in range(people):
         for j in range(joints):
             for v in range(views):
@@ -113,14 +103,10 @@ def _weigh(
                     whose[count], which[count] = a, candidate[a, j, v]
                     count += 1
     tie(whose[:count], which[:count], candidate, sight, tied, neighbours)
-    count = 0
-    for a in range(people):
-        for j in range(joints):
-            for v in range(views):
-                if candidate[a, j, v] >= 0:
-                    counts = min(max(tied[count] / _SURE_AFFINITY, 0.0), 1.0)
-                    weight[a, j, v] = counts if neighbours[count] > 0 else _ALONE
-                    count += 1
+    of_joint, of_view = sight.of_joint, sight.of_view
+    for n in range(count):
+        counts, d = min(max(tied[n] / _SURE_AFFINITY, 0.0), 1.0), which[n]
+        weight[whose[n], of_joint[d], of_view[d]] = counts if neighbours[n] > 0 else _ALONE
     for a in range(people):
         _fill(places[a], known[a], at[a])
     for v in range(views):
@@ -151,9 +137,8 @@ def _fill(places, known, at):
     for x in range(3):
         total, count = 0.0, 0
         for j in range(len(places)):
-            if known[j]:
-                total += places[j, x]
-                count += 1
+            total += places[j, x] if known[j] else 0.0
+            count += known[j]
         for j in range(len(places)):
             at[j, x] = places[j, x] if known[j] else total / max(count, 1)
 

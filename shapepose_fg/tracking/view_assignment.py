@@ -62,13 +62,6 @@ class Scored(NamedTuple):
     possible: Mask
     """(N,) near enough to a joint whose place is known, or likely by affinity."""
 
-    def cut(self, count: int) -> "Scored":
-        """The first `count` of them."""
-        return Scored(
-            self.first, self.person[:count], self.detection[:count], self.distance_m[:count], self.score[:count],
-            self.possible[:count],
-        )  # fmt: skip
-
 
 def assign(predicted: Predicted, sight: Sight) -> Index:
     """The detection (A, J, V) of each person's joint in each view, -1 where there is none: the best score first,
@@ -105,7 +98,8 @@ def probabilities(near: Scored, detections: int) -> Array:
     weight = np.where(near.possible, np.exp(_ODDS * (near.score - _EVEN)), 0.0)
     probable = np.empty_like(weight)
     people = int(near.person.max(initial=-1)) + 1
-    _marginals(near.first, near.person, near.detection, weight, people, detections, _MESSAGES, probable)
+    room = np.zeros(people), np.zeros(detections), np.ones_like(weight)
+    _marginals(near.first, near.person, near.detection, weight, _MESSAGES, *room, probable)
     return probable
 
 
@@ -119,22 +113,26 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
     while near is None or count > len(near.person):
         whole, real, flag = np.empty((3, count), np.intp), np.empty((5, count)), np.empty((2, count), dtype=bool)
         near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
+        gates, taken = np.empty((2, A, J)), np.empty(len(sight.of_view), np.intp)
         count = _assign(
-            given, predicted.sigma_m, predicted.lost, world, people, sight, near, np.empty((2, A, J)), first[1],
-            whole[2], np.empty(len(sight.of_view), np.intp), real[2], real[3], real[4], flag[1], chosen[0],
-            chosen[1],
+            given, predicted.sigma_m, predicted.lost, world, people, sight, near, gates, first[1], whole[2], taken,
+            real[2:], flag[1], chosen,
         )  # fmt: skip
-    return chosen[0], near.cut(count)
+    begins, person, detection, distance_m, score, possible = near
+    ends = distance_m[:count], score[:count], possible[:count]
+    return chosen[0], Scored(begins, person[:count], detection[:count], *ends)
 
 
 @kernel
 def _assign(
-    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, nearness, tied, key, sought,
-    chosen, before,
+    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought, both
 ):  # fmt: skip
-    """Fill in `near` and `chosen`, as far as there is room for what is near; returns how much there is."""
+    """Fill in `near`, and the first of `both` (2, A, J, V), as far as there is room for what is near; returns how
+    much there is.
+    """
+    gate_m, reach_m, chosen, before = gates[0], gates[1], both[0], both[1]
+    nearness, tied, key = reals[0], reals[1], reals[2]
     people_count, joints, views = chosen.shape
-    gate_m, reach_m = gates[0], gates[1]
     for a in range(people_count):
         for j in range(joints):
             gate_m[a, j] = _REACH_M if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
@@ -171,9 +169,10 @@ def _assign(
 
 
 @kernel
-def _marginals(first, person, detection, weight, people, detections, rounds, probable):
-    """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view."""
-    of_person, of_detection, unclaimed = np.zeros(people), np.zeros(detections), np.ones(len(weight))
+def _marginals(first, person, detection, weight, rounds, of_person, of_detection, unclaimed, probable):
+    """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view; zeros by person and detection
+    and ones (N,) to begin with.
+    """
     for slot in range(len(first) - 1):
         span = range(first[slot], first[slot + 1])
         for _ in range(rounds):

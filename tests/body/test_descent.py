@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale
+from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale, moved
 from shapepose_fg.body.fitting.network import NUM_PARAMETERS, NetworkConfig, UpdateNetwork, layer_shapes
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.body.model.rotation import exp_so3, six_d
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
 
 ALL = tuple(range(len(BODY_POINTS)))
@@ -177,10 +177,36 @@ def test_what_the_network_sees(any_body, name):
     np.testing.assert_allclose(seen[:, list(places), 6], np.trace(trust, axis1=2, axis2=3) / 3, atol=1e-6)
     assert not seen[:, rest, 3:].any() and not seen[:, places[3], 3:].any()
     np.testing.assert_allclose(inputs[:, 350:360], state.betas / 3, atol=1e-6)
-    np.testing.assert_allclose(inputs[:, 360:492], six_d(state.local[:, :22]).reshape(ROWS, -1), atol=1e-6)
+    columns = state.local[:, :22, :, :2].swapaxes(2, 3).reshape(ROWS, -1)
+    np.testing.assert_allclose(inputs[:, 360:492], columns, atol=1e-6)
     np.testing.assert_allclose(inputs[:, 492:495], state.transl, atol=1e-6)
     force = (information @ (xyz - placed)[..., None])[..., 0]
     force *= ((3600 / (3600 + ((xyz - placed) * force).sum(-1))) ** 2)[..., None]
     slope = np.einsum("bkxp,bkx->bp", jacobian, force)[:, [*range(76), *range(82, 85)]]
     np.testing.assert_allclose(inputs[:, 495:], np.clip(1e-4 * slope, -3, 3), rtol=1e-5, atol=1e-6)
     assert 0.01 < np.abs(inputs[:, 495:]).max() <= 3
+
+
+def turned(columns: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) what becomes of two columns (N, 6)."""
+    change, local = np.zeros((len(columns), NUM_PARAMETERS), np.float32), np.zeros((len(columns), 24, 3, 3))
+    change[:, 16:22] = columns
+    moved(change, 1.0, np.zeros((len(columns), 10)), local, np.zeros((len(columns), 3)))
+    return local[:, 1]
+
+
+def test_any_two_columns_become_a_rotation_with_the_first_ones_direction():
+    columns = np.random.default_rng(0).normal(0, 3, (200, 6)).astype(np.float32).astype(float)
+    R = turned(columns)
+    np.testing.assert_allclose((R.swapaxes(-1, -2) @ R), np.tile(np.eye(3), (200, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-12)
+    first, second = columns[:, :3], columns[:, 3:]
+    np.testing.assert_allclose(R[..., 0], first / np.linalg.norm(first, axis=1, keepdims=True), atol=1e-15)
+    # The second column is spanned by both and leans to its own side: nothing of it along the third.
+    np.testing.assert_allclose((R[..., 2] * second).sum(1), 0, atol=1e-12)
+    assert ((R[..., 1] * second).sum(1) > 0).all()
+
+
+def test_columns_without_a_rotation_are_nan_and_not_some_rotation():
+    columns = np.array([[0.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 0], [1.0, 0, 0, 2, 0, 0]])
+    assert np.isnan(turned(columns)).any(-1).any(-1).all()

@@ -6,11 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.rotation import (
     exp_so3,
-    from_six_d,
     hat,
     log_so3,
     right_jacobian_inverse,
-    six_d,
 )
 
 ANGLES = (0.0, 1e-12, 1e-7, 1e-4, 0.0999, 0.1001, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9)
@@ -61,28 +59,3 @@ def test_batch_dimensions(shape):
     for function in (hat, exp_so3, right_jacobian_inverse):
         assert function(vectors).shape == (*shape, 3)
     assert log_so3(exp_so3(vectors)).shape == shape
-
-
-def test_six_numbers_are_the_first_two_columns_and_give_the_rotation_back():
-    R = exp_so3(axis_angles())
-    columns = six_d(R)
-    np.testing.assert_array_equal(columns[..., :3], R[..., 0])
-    np.testing.assert_array_equal(columns[..., 3:], R[..., 1])
-    np.testing.assert_allclose(from_six_d(columns), R, atol=1e-14)
-
-
-def test_any_two_columns_become_a_rotation_with_the_first_ones_direction():
-    columns = np.random.default_rng(0).normal(0, 3, (200, 6))
-    R = from_six_d(columns)
-    np.testing.assert_allclose((R.swapaxes(-1, -2) @ R), np.tile(np.eye(3), (200, 1, 1)), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-12)
-    first, second = columns[:, :3], columns[:, 3:]
-    np.testing.assert_allclose(R[..., 0], first / np.linalg.norm(first, axis=1, keepdims=True), atol=1e-15)
-    # The second column is spanned by both and leans to its own side: nothing of it along the third.
-    np.testing.assert_allclose((R[..., 2] * second).sum(1), 0, atol=1e-12)
-    assert ((R[..., 1] * second).sum(1) > 0).all()
-
-
-def test_columns_without_a_rotation_are_nan_and_not_some_rotation():
-    columns = np.array([[0.0, 0, 0, 0, 1, 0], [1.0, 0, 0, 0, 0, 0], [1.0, 0, 0, 2, 0, 0]])
-    assert np.isnan(from_six_d(columns)).any(-1).any(-1).all()

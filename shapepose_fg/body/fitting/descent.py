@@ -109,7 +109,8 @@ class Sight:
 @kernel
 def moved(change, size, betas, local, transl):
     """Move B bodies, in place, by `size` times a `change` (B, 145): betas in tens, the first two columns of 22
-    rotations, which are made orthogonal again (`body/model/rotation.py`), and the place.
+    rotations, made orthogonal again (Gram-Schmidt; parallel ones: NaN), and the place. Rotations as six numbers:
+    Zhou et al., "On the Continuity of Rotation Representations in Neural Networks", CVPR 2019.
     """
     for b in range(len(change)):
         for n in range(10):

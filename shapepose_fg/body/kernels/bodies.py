@@ -86,7 +86,7 @@ def _share(M, sigma_m, S):
 def _laid(limbs, betas, place, w):
     """World rotations and axes from `local` and `tangent`, the terms of all points, and these; no forces."""
     d, v, xyz = w.inside, w.term, w.xyz
-    for q in range(24):
+    for q in range(len(w.local)):
         if q == 0:
             for x in range(3):
                 _copied(w.local[0, x], w.world[0, x])
@@ -100,7 +100,7 @@ def _laid(limbs, betas, place, w):
         w.force[i] = 0.0
     for i in range(len(xyz)):
         xyz[i], w.push[i] = limbs.root[i], 0.0
-    for n in range(10):
+    for n in range(len(limbs.by_shape)):
         for i in range(len(d)):
             d[i] += betas[n] * limbs.by_shape[n, i]
         for i in range(len(xyz)):
@@ -148,7 +148,7 @@ def _pulled(limbs, k, f0, f1, f2, w):
 def _gathered(limbs, w):
     """The gradient of betas and rotations, from the forces on all points."""
     u, g = w.force, w.gradient
-    for n in range(10):
+    for n in range(len(limbs.by_shape)):
         total = 0.0
         for i in range(len(u)):
             total += limbs.by_shape[n, i] * u[i]
@@ -179,7 +179,7 @@ def _slopes(limbs, w):
     blend = len(limbs.by_pose) > 0
     for k in range(len(limbs.share)):
         J, first, end, m = w.J[k], limbs.first[k], limbs.first[k + 1], 10
-        for n in range(10):
+        for n in range(len(limbs.by_shape)):
             w.column[k, n] = n
             for x in range(3):
                 J[x, n] = limbs.root_by_shape[n, 3 * k + x]
@@ -187,9 +187,9 @@ def _slopes(limbs, w):
             w.entry[0, e] = w.entry[1, e] = w.entry[2, e] = 0.0
         for p in range(end - 1, first - 1, -1):  # a bone's arm is whole when its parent takes it
             R, S = w.world[limbs.bone[p]], limbs.shape[p]
-            for x in range(3):
+            for x in range(len(R)):  # loops of known length take long to compile
                 a, b, c = R[x, 0], R[x, 1], R[x, 2]
-                for n in range(10):
+                for n in range(S.shape[1]):
                     J[x, n] += a * S[0, n] + b * S[1, n] + c * S[2, n]
                 for e in range(207 if blend else 0):
                     B = limbs.by_pose
@@ -215,11 +215,10 @@ def _slopes(limbs, w):
 
 
 @part
-def _energy(limbs, priors, free, rows, b, scale, w):
-    """The energy of row b, and half its gradient."""
-    A, g, c2, energy = len(priors.mean), w.gradient, scale * scale, 0.0
-    pose = w.entry[0]
-    for q in range(24):
+def _turned(priors, free, w):
+    """Rotations and tangents of row's joints from its unknowns; the root turns in its own tangent."""
+    A, pose = len(priors.mean), w.entry[0]
+    for q in range(len(w.local)):
         for x in range(3):
             i = x - 3 if q == 0 else priors.place[3 * q - 3 + x]
             if q == 0 or i >= 0:
@@ -231,40 +230,11 @@ def _energy(limbs, priors, free, rows, b, scale, w):
         _rotation(pose[0], pose[1], pose[2], w.local[q], w.tangent[q])
     for i in range(9):
         w.tangent[0, i // 3, i % 3] = 1.0 if i % 4 == 0 else 0.0
-    _laid(limbs, free, free[13 + A :], w)
-    for i in range(len(g)):
-        g[i] = 0.0
-    for i in range(A):
-        pose[i] = free[13 + i] - rows.angles[b, i]
-    for i in range(A):
-        pull = 0.0
-        for j in range(A):
-            pull += priors.precision[i, j] * pose[j]
-        g[13 + i] = pull
-        energy += pull * pose[i]
-    for n in range(10):
-        away = free[n] - rows.betas[b, n]
-        g[n] = rows.stiffness[b] * away
-        energy += g[n] * away
-    for k in range(len(w.squared)):
-        M, r0, r1, r2 = rows.information[b, k], w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
-        r0, r1, r2 = r0 - rows.xyz[b, k, 0], r1 - rows.xyz[b, k, 1], r2 - rows.xyz[b, k, 2]
-        f0 = M[0, 0] * r0 + M[0, 1] * r1 + M[0, 2] * r2
-        f1 = M[1, 0] * r0 + M[1, 1] * r1 + M[1, 2] * r2
-        f2 = M[2, 0] * r0 + M[2, 1] * r1 + M[2, 2] * r2
-        w.squared[k] = r0 * f0 + r1 * f1 + r2 * f2
-        robust = c2 / (c2 + w.squared[k])
-        energy += robust * w.squared[k]
-        w.weight[k] = v = robust * robust
-        if w.squared[k] != 0.0:
-            _pulled(limbs, k, v * f0, v * f1, v * f2, w)
-    _gathered(limbs, w)
-    return energy
 
 
 @part
 def _normal(priors, rows, b, asked, H, w):
-    """Half the Gauss-Newton Hessian where `_energy` and `_slopes` were last, its lower triangle; below it the
+    """Half the Gauss-Newton Hessian where `_slopes` was last, its lower triangle; below it the
     gradient, the Jacobian of the points that are `asked` for, and the unit vectors of the betas.
     """
     M, P, A, K, N = w.entry, len(w.gradient), len(priors.mean), len(w.squared), len(asked)
@@ -307,10 +277,41 @@ def linearised(limbs, priors, free, rows, scale, asked, linear, w):
     """The energy of B rows around `free` (B, P), the robust kernel of each having this `scale` (B,); systems are
     for the points `asked` (B, N).
     """
+    A, g, pose = len(priors.mean), w.gradient, w.entry[0]
     for b in range(len(free)):
-        linear.energy[b] = _energy(limbs, priors, free[b], rows, b, scale[b], w)
+        x, energy, c2 = free[b], 0.0, scale[b] * scale[b]
+        _turned(priors, x, w)
+        _laid(limbs, x, x[13 + A :], w)
+        for i in range(len(g)):
+            g[i] = 0.0
+        for i in range(A):
+            pose[i] = x[13 + i] - rows.angles[b, i]
+        for i in range(A):
+            pull = 0.0
+            for j in range(A):
+                pull += priors.precision[i, j] * pose[j]
+            g[13 + i] = pull
+            energy += pull * pose[i]
+        for n in range(len(limbs.by_shape)):
+            away = x[n] - rows.betas[b, n]
+            g[n] = rows.stiffness[b] * away
+            energy += g[n] * away
+        for k in range(len(w.squared)):
+            M, r0, r1, r2 = rows.information[b, k], w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
+            r0, r1, r2 = r0 - rows.xyz[b, k, 0], r1 - rows.xyz[b, k, 1], r2 - rows.xyz[b, k, 2]
+            f0 = M[0, 0] * r0 + M[0, 1] * r1 + M[0, 2] * r2
+            f1 = M[1, 0] * r0 + M[1, 1] * r1 + M[1, 2] * r2
+            f2 = M[2, 0] * r0 + M[2, 1] * r1 + M[2, 2] * r2
+            w.squared[k] = r0 * f0 + r1 * f1 + r2 * f2
+            robust = c2 / (c2 + w.squared[k])
+            energy += robust * w.squared[k]
+            w.weight[k] = v = robust * robust
+            if w.squared[k] != 0.0:
+                _pulled(limbs, k, v * f0, v * f1, v * f2, w)
+        _gathered(limbs, w)
+        linear.energy[b] = energy
         _copied(w.squared, linear.squared[b])
-        _copied(w.gradient, linear.gradient[b])
+        _copied(g, linear.gradient[b])
         for i in range(len(w.xyz)):
             linear.xyz[b, i // 3, i % 3] = w.xyz[i]
         if len(linear.system) > 0:
@@ -318,28 +319,22 @@ def linearised(limbs, priors, free, rows, scale, asked, linear, w):
             _normal(priors, rows, b, asked[b], linear.system[b], w)
 
 
-@part
-def _posed(limbs, local, betas, place, w):
-    """As `_laid`, from rotations (24, 3, 3), which turn in the tangents of the scratch arrays `w`."""
-    for q in range(24):
-        for x in range(3):
-            _copied(local[q, x], w.local[q, x])
-    _laid(limbs, betas, place, w)
-
-
 @kernel
 def placed(limbs, local, betas, place, xyz, jacobian, w):
     """Points `xyz` (B, K, 3) of bodies with rotations `local` (B, 24, 3, 3), and their `jacobian` (B, K, 3, P) or
-    (0, K, 3, P).
+    (0, K, 3, P). Rotations turn in the tangents of the scratch arrays `w`.
     """
     for b in range(len(xyz)):
-        _posed(limbs, local[b], betas[b], place[b], w)
+        for q in range(len(w.local)):
+            for x in range(3):
+                _copied(local[b, q, x], w.local[q, x])
+        _laid(limbs, betas[b], place[b], w)
         for i in range(len(w.xyz)):
             xyz[b, i // 3, i % 3] = w.xyz[i]
         if len(jacobian) > 0:
             _slopes(limbs, w)
             for k in range(len(limbs.share)):
-                for x in range(3):
+                for x in range(jacobian.shape[2]):
                     for i in range(jacobian.shape[3]):
                         jacobian[b, k, x, i] = 0.0
                     for i in range(w.count[k]):
@@ -356,18 +351,22 @@ def seen(limbs, own, betas, local, place, target, information, kernel_scale, ste
     S, K, g = w.entry, len(limbs.share), w.gradient
     for b in range(len(betas)):
         row = inputs[b]
-        _posed(limbs, local[b], betas[b], place[b], w)
+        for q in range(len(w.local)):
+            for x in range(3):
+                _copied(local[b, q, x], w.local[q, x])
+        _laid(limbs, betas[b], place[b], w)
         for i in range(len(g)):
             g[i] = 0.0
         for k in range(K):
-            t, at, R, o, x = own.target[k], 7 * k, w.world[own.bone[k]], own.offset[k], w.xyz[3 * k : 3 * k + 3]
+            t, at, R, o = own.target[k], 7 * k, w.world[own.bone[k]], own.offset[k]
             for y in range(3):
-                row[at + y] = x[y] - R[y, 0] * o[0] - R[y, 1] * o[1] - R[y, 2] * o[2]
+                row[at + y] = w.xyz[3 * k + y] - R[y, 0] * o[0] - R[y, 1] * o[1] - R[y, 2] * o[2]
                 row[at + 3 + y] = 0.0
             row[at + 6] = 0.0
             if t >= 0:
                 M = information[b, t]
-                a0, a1, a2 = target[b, t, 0] - x[0], target[b, t, 1] - x[1], target[b, t, 2] - x[2]
+                a0, a1, a2 = w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
+                a0, a1, a2 = target[b, t, 0] - a0, target[b, t, 1] - a1, target[b, t, 2] - a2
                 _share(M, TRUST_M, S)
                 row[at + 6] = (S[0, 0] + S[1, 1] + S[2, 2]) / 3
                 _share(M, REACH_M, S)
@@ -388,7 +387,7 @@ def seen(limbs, own, betas, local, place, target, information, kernel_scale, ste
                     _pulled(limbs, k, v * v * f0, v * v * f1, v * v * f2, w)
         _gathered(limbs, w)
         at = 7 * K
-        for n in range(10):
+        for n in range(betas.shape[1]):
             row[at + n] = betas[b, n] / 3
         for q in range(22):
             for x in range(3):

@@ -145,13 +145,13 @@ class BodyModel:
         """
         mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
         B, local, betas = len(parameters), parameters.local, parameters.betas
-        rotations = accumulate(local)
+        rotations = accumulate(local)[:, mesh.bones]
         shaped = mesh.template + (betas @ mesh.shapes).reshape(B, *mesh.template.shape)
         if mesh.pose_blend is not None:
             bent = (local[:, 1:] - np.eye(3)).reshape(B, -1)
             shaped = shaped + (bent @ mesh.pose_blend).reshape(shaped.shape)
         rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(B, *mesh.rest_joints.shape)
-        shift = self.joints(parameters) - (rotations @ rest[..., None])[..., 0]
+        shift = self.joints(parameters)[:, mesh.bones] - (rotations @ rest[..., None])[..., 0]
         posed = mesh.weights @ shift
         for axis in range(3):  # of the vertex at rest
             posed += (mesh.weights @ rotations[..., axis]) * shaped[..., axis, None]
@@ -215,6 +215,7 @@ class BodyModel:
             rest_joints=rest,
             rest_joint_shapes=rest_shapes.reshape(NUM_BETAS, -1),
             weights=arrays.weights,
+            bones=np.arange(len(SMPL_PARENTS)),
         )
 
 
@@ -229,21 +230,29 @@ class _Mesh:
     pose_blend: Array | None
     """(207, Nv * 3) metres per unit of each entry of R - I."""
     rest_joints: Array
-    """(24, 3) metres."""
+    """(N, 3) metres."""
     rest_joint_shapes: Array
-    """(10, 24 * 3) metres per unit of each beta."""
+    """(10, N * 3) metres per unit of each beta."""
     weights: Array
-    """(Nv, 24) skinning weights."""
+    """(Nv, N) skinning weights."""
+    bones: Index
+    """(N,) those of SMPL's on which any vertex hangs."""
 
     def part(self, vertices: Index) -> "_Mesh":
         """What some of the vertices need."""
-        columns = (3 * vertices[:, None] + np.arange(3)).ravel()
+        columns, bones = (
+            (3 * vertices[:, None] + np.arange(3)).ravel(),
+            np.flatnonzero(self.weights[vertices].any(0)),
+        )
         return replace(
             self,
             template=self.template[vertices],
             shapes=self.shapes[:, columns],
             pose_blend=None if self.pose_blend is None else self.pose_blend[:, columns],
-            weights=self.weights[vertices],
+            rest_joints=self.rest_joints[bones],
+            rest_joint_shapes=self.rest_joint_shapes[:, (3 * bones[:, None] + np.arange(3)).ravel()],
+            weights=self.weights[vertices][:, bones],
+            bones=bones,
         )
 
 

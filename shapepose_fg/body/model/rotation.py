@@ -1,4 +1,4 @@
-"""Rotations: axis-angle to matrix and back, their six numbers for networks, and Jacobians.
+"""Rotations: axis-angle to matrix and back, and Jacobians.
 
 Everything takes leading batch dimensions and is exact at angle 0 (no epsilon).
 The tangent convention of the whole package is the right one: `R exp(delta)`.
@@ -100,25 +100,3 @@ def right_jacobian_inverse(axis_angle: Array) -> Array:
     factor = np.where(small, series, (1 - half / np.tan(half)) / safe)  # (1 - t/2 cot(t/2)) / t^2
     cross = hat(axis_angle)
     return np.eye(3) + 0.5 * cross + factor * (cross @ cross)
-
-
-def six_d(R: Array) -> Array:
-    """The first two columns of rotation matrices, a continuous form for networks; (..., 3, 3) -> (..., 6).
-
-    Zhou et al., "On the Continuity of Rotation Representations in Neural Networks", CVPR 2019.
-    """
-    return R[..., :2].swapaxes(-1, -2).reshape(*R.shape[:-2], 6)
-
-
-def from_six_d(columns: Array) -> Array:
-    """Rotation matrices from two columns that need be neither unit nor orthogonal; (..., 6) -> (..., 3, 3).
-
-    Gram-Schmidt; parallel or zero columns have no rotation and give NaN.
-    """
-    first, second = columns[..., :3], columns[..., 3:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = first / np.linalg.norm(first, axis=-1, keepdims=True)
-        across = second - (x * second).sum(-1, keepdims=True) * x
-        y = across / np.linalg.norm(across, axis=-1, keepdims=True)
-    (a, b, c), (d, e, f) = np.moveaxis(x, -1, 0), np.moveaxis(y, -1, 0)
-    return np.stack((x, y, np.stack((b * f - c * e, c * d - a * f, a * e - b * d), -1)), -1)

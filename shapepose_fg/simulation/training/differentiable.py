@@ -146,12 +146,12 @@ def inverse_3x3(matrix: Tensor) -> Tensor:
 
 
 def _six_d(R: Tensor) -> Tensor:
-    """The first two columns of rotation matrices (`body/model/rotation.py`); (..., 3, 3) -> (..., 6)."""
+    """The first two columns of rotation matrices (`body/fitting/descent.py`); (..., 3, 3) -> (..., 6)."""
     return R[..., :2].transpose(-1, -2).flatten(-2)
 
 
 def _from_six_d(columns: Tensor) -> Tensor:
-    """Rotation matrices from two columns (`body/model/rotation.py`); (..., 6) -> (..., 3, 3)."""
+    """Rotation matrices from two columns (`body/fitting/descent.py`); (..., 6) -> (..., 3, 3)."""
     first, second = columns[..., :3], columns[..., 3:]
     x = first / torch.linalg.vector_norm(first, dim=-1, keepdim=True)
     across = second - (x * second).sum(-1, keepdim=True) * x
