@@ -198,6 +198,8 @@ class Rig:
     """Which axis of the world points up."""
     dark: tuple[int, ...] = ()
     """Views without a picture, at the moment that the rig is of: nobody is expected to be seen there."""
+    doubted: tuple[int, ...] = ()
+    """Views that contradict each other then, and nothing says which is wrong."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]

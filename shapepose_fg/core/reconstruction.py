@@ -31,6 +31,8 @@ class Status(StrEnum):
     """No joint is seen by two views, or too few are: nothing fixes the person in space."""
     BODY_UNDETERMINED = "body undetermined"
     """Joints are there, but too few of them to fit a body; what no view saw stays NaN."""
+    CONTRADICTED = "views contradict"
+    """Too few views are left without those that contradict each other, of which nothing says who is wrong."""
     NOT_SOLVED = "not solved"
     """A joint ran away from what was seen of it, or nothing determines it: `run` names person, frame and joint."""
 

@@ -7,6 +7,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.trust import Trust, trust_in
 
 _LEAST = 4
 """Detections that two pictures must have in common: the odd one may be of something that stands still."""
@@ -33,6 +34,11 @@ class WithoutRepeats:
         return self.frames.skeleton
 
     @property
+    def trust(self) -> Trust:
+        """Which cameras are left out besides, and when."""
+        return trust_in(self.frames)
+
+    @property
     def first(self) -> int:
         """The first frame that the recording says anything of."""
         return getattr(self.frames, "first", 0)
@@ -42,8 +48,9 @@ class WithoutRepeats:
 
     def __getitem__(self, frame: int, /) -> Detections:
         every = self.frames[frame]
-        repeated = self._repeated(frame, every)
-        return every.only(~repeated[every.view]) if repeated.any() else every
+        gone = self._repeated(frame, every)
+        gone[list(self.trust.dark(frame))] = True
+        return every.only(~gone[every.view]) if gone.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
         """The views that show in a frame what they showed in the frame before."""

@@ -70,6 +70,7 @@ def reconstruct(
     without it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut:
     nothing carries over to them, identities least of all. `shapes` are people known from other recordings.
     `fitter` replaces the body fitter, and `extra_factors` adds factors of your own to every person's window.
+    `Trusted(detections, check_setup(detections, rig).trust)` leaves out cameras that contradict the others.
     `execution` says what runs it: processes, a cluster, chunks, who is told how far it is.
 
     In the result `person` is an identity over time (without time, the number of a person within the frame). Its

@@ -1,20 +1,25 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.solve_window import Assigning, solve_window
@@ -67,6 +72,9 @@ class Setup:
             assigning=Assigning(given, self.skeleton, rounds, over_time=not span.alone),
             extra_factors=self.extra_factors,
         )
+        doubted = {frame.frame: frame.rig.doubted for frame in given if len(frame.rig.doubted) > 0}
+        if len(doubted) > 0:
+            solution = replace(solution, status=_doubted(solution, doubted))
         own = {frame.frame: frame.detections for frame in given[span.start : span.stop]}
         found = solution.observations
         left = Counter(rows.frame.tolist()) - Counter(found.frame.tolist())
@@ -109,6 +117,17 @@ class Setup:
         find = (sure, hips) if config.temporal else (sure,)
         told = {"drop": book.drop_in, "search": book.search}
         return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
+
+
+def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:
+    """Statuses (N,) where some frames' cameras are doubted: of rows that have no two others for `LEAST_JOINTS`."""
+    used = solution.inlier.copy()
+    for row, frame in enumerate(solution.observations.frame.tolist()):
+        used[row][:, list(doubted.get(frame, ()))] = False
+    of_two = (used.sum(axis=-1) >= 2).sum(axis=1) >= LEAST_JOINTS
+    there = np.isin(solution.observations.frame, list(doubted)) & ~of_two
+    there &= np.isin(solution.status, (Status.OK, Status.BODY_UNDETERMINED))
+    return np.where(there, Status.CONTRADICTED, solution.status)
 
 
 def find_people(detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig) -> Observations:

@@ -39,8 +39,8 @@ class SolvedWindows:
     """First frames of what follows a cut."""
     book: Notebook
     """Where this process takes its notes."""
-    _rigs: dict[tuple[int, ...], Rig] = field(default_factory=dict, init=False)
-    """The cameras, by which of them have no picture."""
+    _rigs: dict[tuple[tuple[int, ...], ...], Rig] = field(default_factory=dict, init=False)
+    """The cameras, by which of them have no picture, and which are doubted."""
 
     @cached_property
     def _time_s(self) -> Array:
@@ -50,12 +50,16 @@ class SolvedWindows:
     def read(self, frame: int) -> Input:
         """What the cameras give of a frame."""
         with self.book.stage("read"):
-            self.book.thin("detections", self.detections.is_thinned(frame), frame)
-            dark = self.pictures.repeated(frame)
-            self.book.repeat([self.setup.rig.names[view] for view in dark], frame)
-            if dark not in self._rigs:
-                self._rigs[dark] = replace(self.setup.rig, dark=dark)
-            return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[dark])
+            thinned = self.detections.is_thinned(frame)
+            self.book.thin("detections", thinned, frame)
+            repeated, trust = self.pictures.repeated(frame), self.pictures.trust
+            self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
+            # Who is who among more detections than people make is chance.
+            doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
+            said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
+            if said not in self._rigs:
+                self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
+            return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[said])
 
     def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
         """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""

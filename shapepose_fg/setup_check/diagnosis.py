@@ -14,14 +14,17 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.trust import BELIEVED, Trust
 from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
+from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import Lag, gross_mistake, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Change, Lag, gross_mistake, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
+from shapepose_fg.setup_check.over_time import parted, stories
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
 
 _SAME_PX = 0.6
@@ -153,11 +156,9 @@ _MOST_COST = 0.86
 _OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
 """Where several cameras have small errors, one that is off by so much, and so many times the next, is turned."""
 _NOTABLE_DEG = 0.25
-_LEAST_GAIN = 0.02
-"""Where no pose of one camera takes away so much of the residuals' cost, none is tried."""
-_POSE_GAIN = 0.04
-"""Another pose of one camera, six numbers, is named where it leaves so much less of the residuals' cost than small
-errors of all cameras do."""
+_LIKELY, _SURE_OF_ONE = 1.0, 0.7
+"""One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less BIC's
+price), and of all cameras' mistakes with this probability its own."""
 _SINGLE = 0.7
 """One camera is said to be turned where it alone explains so much of what small errors of all cameras explain."""
 _TURN_DEG = 0.6
@@ -184,6 +185,8 @@ class Diagnosis:
     """Each camera's offset in time that remains; none with too few people."""
     build: Build | None = None
     """The people, in the corrected set-up."""
+    trust: Trust = BELIEVED
+    """Which cameras a reconstruction is better without."""
 
 
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
@@ -196,12 +199,14 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS and (change := gross_mistake(look, rng)) is not None:
+    while len(findings) < _MOST_FINDINGS and (change := _next(look, rng)) is not None:
         findings.append(change.finding)
-        look = replace(change.look, evidence=evidence)
+        look = change.look
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
-        return Diagnosis((*findings, *(_nobody(look) if none else [])), given, look)
+        findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
+        trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
+        return Diagnosis(tuple(findings), given, look, trust=trust)
     problem = Problem.of(look)
     small = problem.small_errors()
     remaining = lags(refined := replace(look, views=small.views))
@@ -219,7 +224,22 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     findings += _unfit(look, known)
     build = build_of(refined.structure()[1].points, detections.skeleton)
     findings += _of_people(build, rig)
-    return Diagnosis(tuple(findings), given, look, tuple(remaining), build)
+    trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
+    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, trust)
+
+
+def _next(look: Look, rng: np.random.Generator) -> Change | None:
+    """The mistake that explains most: of a camera all the time, or from some time on."""
+    gross = gross_mistake(look, rng)
+    views = range(look.view_count if look.cameras_used > 2 else 0)
+    over_time = [story for view in views for story in stories(look, view, rng)]
+    if len(over_time) == 0:
+        return gross
+    best = max(over_time, key=lambda story: story.gain)
+    elsewhere = gross is not None and gross.finding.cameras != best.finding.cameras
+    if gross is not None and elsewhere and gross.look.total > best.look.total:
+        return gross
+    return Change(best.finding, best.look, 0.0)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
@@ -282,26 +302,30 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 
 def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
-    largest, log = float(np.hypot(small.shift_deg, small.roll_deg).max()), np.abs(np.log(small.focal))
-    if largest < _OFF_DEG and log.max() < _OFF_FOCAL and problem.pose_gain < _LEAST_GAIN:
+    (gain, view, kind), sure = problem.singles[0], problem.sure
+    log = np.abs(np.log(small.focal))
+    if gain > _LIKELY and sure > _SURE_OF_ONE and view not in known:
+        found, _ = problem.single(view, kind)
+        large = abs(np.log(found.amount)) > _OFF_FOCAL if kind == Kind.FOCAL else found.amount > _OFF_DEG
+        if large:
+            x, y = small.centre_px[view].tolist()
+            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else ())]
+    largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
+    if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
         return []
-    (pose, cost), shifted = problem.other_pose(), problem.small_errors(SHIFT)
-    if cost < min(small.cost, shifted.cost) - _POSE_GAIN and known.isdisjoint(pose.cameras):
-        return [pose]
+    shifted = problem.small_errors(SHIFT)
     turned, focal = _off(problem, small, shifted)
     off = np.flatnonzero(turned | focal)
     if len(off) == 0:
         return []
     # Three cameras cannot tell which of their small errors belong to which.
     tells_apart = look.cameras_used > 3
-    if len(off) == 1 and tells_apart:
+    if len(off) == 1 and tells_apart and int(off[0]) not in known:
         view = int(off[0])
-        if view in known:
-            return []
         if focal[view]:
             return [Finding(Kind.FOCAL, (view,), float(1 / small.focal[view]))]
         found = _turned(small, view)
-        if pose.cameras == (view,) and 1 - cost > _SINGLE * (1 - small.cost):
+        if 1 - problem.single(view, Kind.MOVED)[1] > _SINGLE * (1 - small.cost):
             return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []
@@ -338,6 +362,12 @@ def _turned(small: SmallErrors, view: int) -> Finding:
 def _unfit(look: Look, known: set[int]) -> list[Finding]:
     """Cameras that fit nothing, without any explanation."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
+    everybody = tuple(np.flatnonzero(seen).tolist())
+    if len(known) == 0 and (frames := parted(look)) is not None:
+        return [Finding(Kind.UNFIT, everybody, float(look.scores.min()), frames=frames)]
+    if len(everybody) == 2:
+        fits = look.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
+        return [] if fits else [Finding(Kind.UNFIT, everybody, float(look.scores[0]))]
     bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
     return [Finding(Kind.UNFIT, (view,), float(look.scores[view])) for view in bad if view not in known]
 

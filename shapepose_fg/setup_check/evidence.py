@@ -1,7 +1,7 @@
 """What the check looks at: people seen at some frames of a recording, and the cameras as they are taken to be."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -12,6 +12,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
 from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
 
@@ -43,6 +44,8 @@ class Evidence:
     """At these frames, and at their neighbours."""
     most_lag: int
     """Largest offset in time that can be told."""
+    other_side: Index
+    """(J,) the core joint on the other side of the body; the joint itself where there is none."""
     stopped: Array
     """(V,) in what part of these frames each camera shows the picture before once more."""
 
@@ -72,7 +75,18 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]
-    return Evidence(spread, sightings, most, stopped)
+    return Evidence(spread, sightings, most, _other_side(detections.skeleton), stopped)
+
+
+def _other_side(skeleton: Skeleton) -> Index:
+    core = [skeleton.joints[joint] for joint in skeleton.core]
+    other = {"L": "R", "R": "L"}
+    return np.array(
+        [
+            core.index(name) if (name := other.get(each[0], "") + each[1:]) in core else n
+            for n, each in enumerate(core)
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -239,7 +253,17 @@ class Look:
         K, cTw = self.views.K.copy(), self.views.cTw.copy()
         for view, camera in cameras.items():
             K[view], cTw[view] = camera.K, camera.cTw
-        return replace(self, views=Views(K, cTw))
+        return replace(self, views=replace(self.views, K=K, cTw=cTw))
+
+    def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "Look":
+        """The same with other detections of one camera."""
+        every = self.evidence.sightings
+        mine = np.flatnonzero(every.view == view)
+        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.only(mine))
+        xy[mine], confidence[mine] = new.xy, new.confidence
+        return replace(
+            self, evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence))
+        )
 
     def later(self, view: int, frames: int) -> "Look":
         """The same with one camera known to be late."""

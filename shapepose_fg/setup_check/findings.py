@@ -19,6 +19,9 @@ class Kind(StrEnum):
     INVERTED = "inverted extrinsics"
     TRANSPOSED = "transposed rotation"
     AXES = "other camera axes"
+    MIRRORED = "mirrored"
+    BUMPED = "bumped"
+    DRIFTING = "drifting"
     FOCAL = "focal length"
     RESIZED = "picture size"
     PRINCIPAL_POINT = "principal point"
@@ -47,6 +50,10 @@ class Finding:
     """How far the camera was moved, metres."""
     axis: str = ""
     """The axis that is up for the people."""
+    frames: tuple[int | None, int | None] = (None, None)
+    """The first frame in which it is so, and the one after the last; None where the recording begins or ends."""
+    sure: float = 1.0
+    """The probability that it is this, and not another mistake or none, as far as the detections tell."""
     same: str = ""
     """In what alone two cameras are one, if not in both: "pose" or "detections"."""
 
@@ -77,8 +84,10 @@ def sentence(finding: Finding, rig: Rig) -> str:
         calibrated=f"{width} x {height}",
         resized=f"{width * amount:.0f} x {height * amount:.0f}",
         axis=finding.axis,
+        when=_when(*finding.frames),
         up=rig.up,
     )
+    said += f" (probability {finding.sure:.2f})" if finding.sure < 0.95 else ""
     return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
 
 
@@ -155,6 +164,14 @@ def _nobody(finding: Finding, side_px: int) -> str:
     )
 
 
+def _unfit(finding: Finding, side_px: int) -> str:
+    check = "check that its calibration and its detections are its own"
+    if len(finding.cameras) == 1:
+        return f"{{who}} fits the others in nothing that was tried; {check}"
+    since = "" if finding.frames == (None, None) else " {when}, while they agree else: one of them was moved"
+    return f"{{who}} contradict each other{since}; {check.replace('its', 'their')}"
+
+
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TURNED: _turned,
     Kind.MOVED: "{who} looks moved by about {moved} and turned by {amount:.1f} degrees; calibrate its pose again",
@@ -166,6 +183,11 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TRANSPOSED: "the rotation of {who} looks transposed, with the translation as it is; transpose it",
     Kind.AXES: "the camera axes of {who} look like those of OpenGL or Blender, y up and z backwards; turn y and z"
     " round",
+    Kind.MIRRORED: "the pictures of {who} look mirrored; mirror them back",
+    Kind.BUMPED: "{who} looks turned by {degrees} degrees {when}: somebody moved it; calibrate it for"
+    " each part, or take it out of one",
+    Kind.DRIFTING: "{who} looks as if it slowly turned, by {degrees} degrees over the recording; fix it on its"
+    " stand, and take it out of this recording",
     Kind.FOCAL: _focal,
     Kind.RESIZED: "the detections of {who} look as if they were made on pictures {amount:.2g} times the calibrated"
     " size ({resized} instead of {calibrated}); give detections on pictures of the calibrated size, or the"
@@ -180,13 +202,19 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.NOBODY: _nobody,
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",
-    Kind.UNFIT: "{who} fits the others in nothing that was tried; check that its calibration and its detections"
-    " are its own",
+    Kind.UNFIT: _unfit,
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }
 """What is said of each: words that `sentence` fills in, or what chooses them by the finding and the longer side of
 its camera's picture."""
+
+
+def _when(first: int | None, last: int | None) -> str:
+    """In which frames."""
+    if first is None:
+        return "all the time" if last is None else f"before frame {last}"
+    return f"from frame {first} on" if last is None else f"in frames {first} to {last - 1}"
 
 
 def _shift(x: float, y: float) -> str:

@@ -14,7 +14,8 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.trust import BELIEVED, Spell, Trust
 from shapepose_fg.setup_check.diagnosis import Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
@@ -79,6 +80,23 @@ class SetupReport:
     """Frames that were looked at."""
     stature_m: float | None
     """How tall the people come out, median; None without people."""
+    trust: Trust = BELIEVED
+    """Which cameras a reconstruction is better without: for `reconstruct`."""
+
+    def with_consequences(self, rig: Rig) -> list[str]:
+        """The warnings, and what a reconstruction makes of them."""
+        out = {view for view, _, _ in self.trust.left_out}
+        words = [
+            f"{said}. It is left out there (--no-check keeps it)" if out & set(found.cameras) else said
+            for found, said in zip(self.findings, self.warnings, strict=True)
+        ]
+        if len(self.trust.doubted) > 0:
+            names = ", ".join(rig.names[view] for view in sorted({view for view, _, _ in self.trust.doubted}))
+            words.append(
+                f"nothing says which of {names} is wrong: rows that rest on them have the status"
+                f" {str(Status.CONTRADICTED)!r}, not 'ok'"
+            )
+        return words
 
     def as_dict(self) -> dict[str, Any]:
         """What run.json holds under `setup`."""
@@ -90,6 +108,8 @@ class SetupReport:
             ],
             "cameras": [rounded(asdict(each)) for each in self.cameras],
             "pairs": [rounded(asdict(each)) for each in self.pairs],
+            "left_out": _spells(self.trust.left_out, names),
+            "doubted": _spells(self.trust.doubted, names),
             "frames_looked_at": self.frames,
             "stature_m": None if self.stature_m is None else round(self.stature_m, 4),
         }
@@ -112,7 +132,12 @@ def check_setup(
         tuple(_pair_figures(diagnosis.look, rig, *pair) for pair in combinations(range(len(rig)), 2)),
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
+        diagnosis.trust,
     )
+
+
+def _spells(spells: Sequence[Spell], names: Sequence[str]) -> list[dict[str, Any]]:
+    return [{"camera": names[view], "frames": [first, last]} for view, first, last in spells]
 
 
 def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
@@ -177,6 +202,8 @@ _MOST_BETA = 5.0
 """A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
 """Of so many rows: fewer are single people that hardly any camera saw."""
+_FASTEST_M_S, _PAIRS = 10.0, 10
+"""Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -244,14 +271,14 @@ def result_check(
 ) -> ResultCheck:
     """The check of a set-up with what the reconstruction adds to it."""
     uses = tuple(camera_use(people, detections, rig, frames))
-    warnings = list(report.warnings)
+    warnings = report.with_consequences(rig)
     if len(people) == 0 and Kind.NOBODY not in {finding.kind for finding in report.findings}:
         warnings.append(
             "Nobody was found; see what the check of the set-up says"
             if warnings
             else "Nobody was found; look with check-calibration whether cameras and detections fit"
         )
-    warnings += _shapes(people)
+    warnings += _shapes(people) + _speeds(people) + _too_many(people)
     if len(report.findings) == 0:
         warnings += _outlier(uses)
     return ResultCheck(report, uses, tuple(warnings))
@@ -309,6 +336,38 @@ def _shapes(people: Reconstruction) -> list[str]:
     return [
         f"{far.sum()} of {len(far)} bodies have a shape that nobody has (a component of {largest.max():.0f}"
         " standard deviations); check the calibration's unit, and whether its poses are inverted"
+    ]
+
+
+def _speeds(people: Reconstruction) -> list[str]:
+    """People who move as nobody does."""
+    hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
+    order = np.lexsort((people.frame, people.person))
+    x, t = people.joints[order][:, hips].mean(axis=1), people.time_s[order]
+    follows = (np.diff(people.person[order]) == 0) & (np.diff(t) > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed = np.linalg.norm(np.diff(x, axis=0), axis=1)[follows] / np.diff(t)[follows]
+    speed = np.sort(speed[np.isfinite(speed)])
+    if len(speed) < 2 * _PAIRS:
+        return []
+    fast = float(np.median(speed[-max(len(speed) // 10, 1) :]))
+    if fast < _FASTEST_M_S:
+        return []
+    rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
+    return [
+        f"people move at {fast:.0f} m/s, and nobody does: --fps is probably wrong ({rate:.0f} a second; a camera"
+        " gives 25 to 60), or frames are missing, or the calibration's unit is wrong"
+    ]
+
+
+def _too_many(people: Reconstruction) -> list[str]:
+    """Frames with more detections than people could make."""
+    frames = sum(last - first for first, last in people.run.get("thinned_frames", {}).get("detections", []))
+    if frames == 0:
+        return []
+    return [
+        f"{frames} frames have more detections than people could make: who is who is chance there, and rows have"
+        f" the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
     ]
 
 

@@ -6,7 +6,7 @@ them (bundle adjustment).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -16,12 +16,14 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import KERNEL, Look, Structure, observed, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, Q, changed, difference
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
 from shapepose_fg.setup_check.matching import Groups
 
 _ROLL = [2]
 Parts = tuple[tuple[list[int], float], ...]
 SHIFT: Parts = ((CENTRE, 10.0),)
+ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL}
+"""What one camera alone may have wrong."""
 ALL: Parts = (*SHIFT, (_ROLL, np.deg2rad(0.4)), (FOCAL, 0.02))
 """What a camera may have wrong, each with its unit of size: 10 px, 0.4 degrees, 2 percent. Turns sideways and up
 are not among them: to people in the middle of the picture they are a shift of the principal point."""
@@ -30,7 +32,7 @@ _PRIOR = 0.05
 each other, err alike: of twenty one is independent."""
 _ROUNDS, _SPARSE_STEPS = 3, 12
 _MOST_PEOPLE = 160
-_WEAK = 1e-9
+_WEAK = 1e-6
 """The information that a point has without any view, as a part of what it has: two rays may be parallel."""
 
 
@@ -155,30 +157,40 @@ class Problem:
         shift_px = np.hypot(sigma[:, 1], sigma[:, 2])
         return np.rad2deg(shift_px / views.focal_px), np.rad2deg(sigma[:, 0]), sigma[:, 3]
 
-    @property
-    def pose_gain(self) -> float:
-        """At least so much of the cost another pose of one camera would take away."""
-        return float(self._pose_gains.max() / max(_cost(self.structure), 1e-12))
+    @cached_property
+    def singles(self) -> "list[tuple[float, int, Kind]]":
+        """Each change of one camera alone, best first: the likelihood's logarithm less BIC's price; view; kind."""
+        price = 0.5 * np.log(max(_PRIOR * 2 * float(np.isfinite(self.structure.miss_px).sum()), 2.0))
+        found = []
+        for view in range(len(self.views)):
+            for kind, parts in ONE.items():
+                columns = np.array(parts) + Q * view
+                gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
+                found.append((_PRIOR * gain - price * len(parts), view, kind))
+        return sorted(found, key=lambda each: -each[0])
 
-    def other_pose(self) -> tuple[Finding, float]:
-        """The one camera whose pose, changed, explains most of the residuals, and what remains of their cost."""
-        view = int(np.argmax(self._pose_gains))
-        columns = np.array(POSE) + Q * view
+    @property
+    def sure(self) -> float:
+        """The probability that the camera of the first of `singles` is to blame, and not another, or none."""
+        gain, view, _ = self.singles[0]
+        weights = np.exp(np.array([each[0] for each in self.singles]) - max(gain, 0.0))
+        mine = np.array([each[1] == view for each in self.singles])
+        return float(weights[mine].sum() / (weights.sum() + np.exp(-max(gain, 0.0))))
+
+    def single(self, view: int, kind: Kind) -> tuple[Finding, float]:
+        """That change of one camera alone, and what remains of the residuals' cost."""
+        columns = np.array(ONE[kind]) + Q * view
 
         def step(normal: Normal, structure: Structure, total: Array) -> Array:
             change = np.zeros_like(total)
             change[columns] = normal.solve(columns)
             return change
 
-        views, _, cost = self._solved(step)
+        views, change, cost = self._solved(step)
         turn, moved = difference(self.views.cTw[view], views.cTw[view])
-        return Finding(Kind.TURNED if turn > 1 else Kind.MOVED, (view,), turn, moved=moved), cost
-
-    @property
-    def _pose_gains(self) -> Array:
-        """(V,) by how much another pose of each camera lowers the weighted squares, at least the robust cost."""
-        blocks = [np.array(POSE) + Q * view for view in range(len(self.views))]
-        return np.array([-self.normal.g[block] @ self.normal.solve(block) for block in blocks])
+        if kind == Kind.FOCAL:
+            return Finding(kind, (view,), float(np.exp(-change[view, FOCAL[0]]))), cost
+        return Finding(Kind.TURNED if turn > 1 else kind, (view,), turn, moved=moved), cost
 
     def _solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:
         """Cameras after steps (V Q,), which are told their sum so far; the sum (V, Q); the cost that remains."""

@@ -26,6 +26,7 @@ LEVELS = (
     "body.fitting body.shapes",
     "body.offsets",
     "core.detections core.frame_times",
+    "core.trust",
     "core.observations core.notes core.repeated_pictures",
     "core.observation_table",
     "core.reconstruction",

@@ -55,6 +55,14 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
         yield Spoiled("focal length x 2", detections, zoomed(rig, view, 2.0), Kind.FOCAL, (view,))
         yield Spoiled("detections x 0.5", resized(detections, (view,), 0.5), rig, Kind.RESIZED, (view,))
         yield Spoiled("inverse pose", detections, inverted(rig, (view,)), Kind.INVERTED, (view,))
+        mirror = mirrored(detections, rig, view)
+        yield Spoiled("mirrored", mirror, rig, Kind.MIRRORED, (view,))
+        half = len(detections) // 2
+        for degrees in (3, 10):
+            later = turning(detections, rig, view, lambda t, d=degrees, h=half: d if t >= h else 0)
+            yield Spoiled("bumped half-way", later, rig, Kind.BUMPED, (view,))
+        slowly = turning(detections, rig, view, lambda t, n=len(detections): 8 * t / n)
+        yield Spoiled("drifting by 8", slowly, rig, Kind.DRIFTING, (view,))
         twice, copy = listed_twice(detections, rig, view)
         yield Spoiled("listed twice", twice, copy, Kind.DUPLICATE, (view, len(rig)))
         yield Spoiled("another's file", detections, same_pose(rig, view, other), Kind.DUPLICATE, pair)
@@ -65,6 +73,38 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
     for name in get_args(Axis):
         if name != rig.up:
             yield Spoiled("wrong up axis", detections, Rig(rig.cameras, name), Kind.UP, ())
+
+
+def mirrored(detections: DetectionSequence, rig: Rig, view: int) -> Recording:
+    """One camera's detections as in pictures the other way round."""
+    width = rig.cameras[view].image_size[0]
+
+    def change(frame: int, xy: Array) -> Array:
+        return np.column_stack([width - 1 - xy[:, 0], xy[:, 1]])
+
+    return _seen_as(detections, view, change)
+
+
+def turning(detections: DetectionSequence, rig: Rig, view: int, degrees: Callable[[int], float]) -> Recording:
+    """What a camera sees that is turned sideways by `degrees` of each frame."""
+    K = rig.K[view]
+
+    def change(frame: int, xy: Array) -> Array:
+        turn = Rotation.from_rotvec(np.deg2rad(degrees(frame)) * np.array([0.3, 0.95, 0.1])).as_matrix()
+        h = np.column_stack([xy, np.ones(len(xy))]) @ (K @ turn @ np.linalg.inv(K)).T
+        return h[:, :2] / h[:, 2:]
+
+    return _seen_as(detections, view, change)
+
+
+def _seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]) -> Recording:
+    frames = []
+    for number in range(len(detections)):
+        found = detections[number]
+        xy, mine = found.xy.copy(), found.view == view
+        xy[mine] = change(number, xy[mine])
+        frames.append(replace(found, xy=xy))
+    return Recording(detections.skeleton, frames)
 
 
 def turned(rig: Rig, view: int, degrees: float, axis: Array) -> Rig:

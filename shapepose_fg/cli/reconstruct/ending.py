@@ -16,7 +16,7 @@ from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
-from shapepose_fg.setup_check.report import ResultCheck, result_check
+from shapepose_fg.setup_check.report import ResultCheck, SetupReport
 from shapepose_fg.setup_check.report import check_setup as check_detections
 from shapepose_fg.setup_check.table import use_table
 
@@ -37,8 +37,8 @@ _KNOWN_WORDS = {
 }
 
 
-def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCheck:
-    """Whether cameras, detections and, of a project, videos fit; `people` were reconstructed."""
+def check_setup(known: Prepared, task: Task) -> SetupReport:
+    """Whether cameras, detections and, of a project, videos fit."""
     frames, sizes = task.whole()[0], ()
     used = known.detections / FOOTAGE
     if used.is_file():
@@ -49,8 +49,7 @@ def check_setup(known: Prepared, task: Task, people: Reconstruction) -> ResultCh
             sizes = other_sizes([str(videos)], task.rig) if videos.is_dir() else ()
         except InputError as error:  # the result does not need them
             note(f"{error}; their sizes are not checked")
-    report = check_detections(task.detections, task.rig, frames, sizes)
-    return result_check(report, people, task.detections, task.rig, frames)
+    return check_detections(task.detections, task.rig, frames, sizes)
 
 
 def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds: float) -> Table:

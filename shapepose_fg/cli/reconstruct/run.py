@@ -27,6 +27,7 @@ from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
+from shapepose_fg.core.trust import Trusted, trust_in
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
@@ -38,6 +39,7 @@ from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.workers import get_ready
+from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 
@@ -94,7 +96,9 @@ def carry_out(
         if fitter is not None and fitter.weights is not None and fitter.weights.file is not None:
             inputs |= checksums([fitter.weights.file])
         del reading  # of half a million files it is large
-        return _Run(task, recording, known, inputs, execution).carried_out(resume=resume, restart=restart)
+        report = check_setup(known, task) if asked.check else None
+        task = task if report is None else replace(task, detections=Trusted(recording, report.trust))
+        return _Run(task, recording, known, inputs, execution, report).carried_out(resume=resume, restart=restart)
 
 
 @contextmanager
@@ -124,6 +128,8 @@ class _Run:
     """Checksums of the files that were read."""
     execution: Execution
     """What runs it."""
+    report: SetupReport | None
+    """What looks wrong with cameras and detections; None where that is not asked."""
 
     def begun(self) -> dict[str, Any]:
         """All that the result depends on, as plain values: equal for a run that goes on."""
@@ -135,6 +141,7 @@ class _Run:
             "frames": [frames.start, frames.stop],
             "time": {**times.as_dict(), "sha256": _digest(times.time_s)},
             "cuts": cuts,
+            "trust": asdict(trust_in(task.detections)),
             "chunk_frames": self.execution.chunk_frames,
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
@@ -191,7 +198,8 @@ class _Run:
         if every > 1:
             note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
         people = result.reconstruction(every=every)
-        checked = check_setup(self.known, self.task, people) if asked.check else None
+        report = self.report
+        checked = None if report is None else result_check(report, people, task.detections, rig, frames)
         result = result if checked is None else result.with_run(**checked.as_run())
         people = people.with_run(**result.run)
         note(*set_aside(output))

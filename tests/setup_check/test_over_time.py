@@ -1,0 +1,91 @@
+"""Cameras that fit in one part of a recording only, mirrored ones, and what a reconstruction makes of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Status
+from shapepose_fg.core.trust import Trust, Trusted
+from shapepose_fg.pipeline.pipeline import reconstruct
+from shapepose_fg.setup_check.findings import Kind
+from shapepose_fg.setup_check.report import check_setup, result_check
+from tests.setup_check.spoiled_setups import mirrored, turning
+from tests.setup_check.test_diagnosis import some_cameras
+
+
+def only_finding(report):
+    assert len(report.findings) == 1, report.warnings
+    return report.findings[0]
+
+
+def test_a_camera_that_is_bumped_is_named_with_the_frame_and_left_out_from_there(recording, room):
+    report = check_setup(turning(recording, room, 2, lambda t: 6.0 if t >= 25 else 0.0), room)
+    found = only_finding(report)
+    assert (found.kind, found.cameras) == (Kind.BUMPED, (2,))
+    assert found.amount == pytest.approx(6, abs=0.6)
+    assert found.frames[0] == pytest.approx(25, abs=1) and found.frames[1] is None
+    assert report.trust == Trust(left_out=((2, found.frames[0], 60),))
+    assert f"from frame {found.frames[0]} on" in report.warnings[0]
+    assert "left out" in report.with_consequences(room)[0]
+
+
+def test_before_the_bump_it_may_be_that_it_does_not_fit(recording, room):
+    found = only_finding(check_setup(turning(recording, room, 0, lambda t: 0.0 if t >= 40 else 6.0), room))
+    assert (found.kind, found.cameras, found.frames[0]) == (Kind.BUMPED, (0,), None)
+    assert found.frames[1] == pytest.approx(40, abs=1)
+
+
+def test_a_camera_that_drifts_is_named(recording, room):
+    report = check_setup(turning(recording, room, 3, lambda t: 8 * t / 59), room)
+    found = only_finding(report)
+    assert (found.kind, found.cameras) == (Kind.DRIFTING, (3,))
+    assert found.amount == pytest.approx(8, abs=0.8)
+    assert report.trust.dark(30) == (3,)
+
+
+@pytest.mark.parametrize("views", [[0, 1, 2, 3, 4], [0, 2, 3]])
+def test_a_mirrored_camera_is_named_and_left_out(recording, room, views):
+    seen, rig = some_cameras(recording, room, views)
+    report = check_setup(mirrored(seen, rig, 1), rig)
+    found = only_finding(report)
+    assert (found.kind, found.cameras) == (Kind.MIRRORED, (1,))
+    assert report.trust == Trust(left_out=((1, 0, 60),))
+
+
+def test_of_two_cameras_nothing_says_which_is_wrong(recording, room):
+    seen, rig = some_cameras(recording, room, [0, 2])
+    assert check_setup(seen, rig).trust == Trust()
+    report = check_setup(turning(seen, rig, 1, lambda t: 8.0 if t >= 30 else 0.0), rig)
+    found = only_finding(report)
+    assert (found.kind, found.cameras) == (Kind.UNFIT, (0, 1))
+    assert found.frames[0] == pytest.approx(30, abs=2)
+    assert report.trust.in_doubt(10) == () and report.trust.in_doubt(50) == (0, 1)
+    assert "contradict each other from frame" in report.warnings[0]
+
+
+@pytest.mark.slow
+def test_rows_that_rest_on_doubted_cameras_are_not_ok(recording, room):
+    seen, rig = some_cameras(recording, room, [0, 2, 3])
+    seen = Recording(seen.skeleton, seen.frames[:20])
+    people = reconstruct(Trusted(seen, Trust(doubted=((0, 10, 20), (1, 10, 20)))), rig)
+    assert set(people.status[people.frame < 10]) == {Status.OK}
+    assert set(people.status[people.frame >= 10]) == {Status.CONTRADICTED}
+    one = reconstruct(Trusted(seen, Trust(doubted=((0, 0, 20),), left_out=())), rig)
+    assert set(one.status) == {Status.OK}
+    without = reconstruct(Trusted(seen, Trust(left_out=((0, 0, 20),))), rig)
+    assert len(without) == len(people) and without.observations is not None
+    assert (without.observations.candidate[:, :, 0] < 0).all()
+
+
+@pytest.mark.slow
+def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room):
+    people = reconstruct(recording, room, times=FrameTimes.from_fps(25, len(recording)))
+    report = check_setup(recording, room)
+    assert result_check(report, people, recording, room, range(60)).warnings == ()
+    fast = replace(people, time_s=people.time_s * 25 / 1000)
+    (said,) = result_check(report, fast, recording, room, range(60)).warnings
+    assert "m/s" in said and "--fps is probably wrong (1000 a second" in said
+    assert np.isfinite(people.time_s).all()
