@@ -269,7 +269,8 @@ def _agreement(look: Look) -> tuple[Array, Array]:
     if len(views) == 2:
         groups, error, _ = look.pair(*views)
         counts = [np.bincount(look.seen_by(view).frame, minlength=last) for view in views]
-        return np.bincount(groups.frame, 1 - error / GATE, minlength=last), np.minimum(*counts) * 1.0
+        fits = np.bincount(groups.frame, 1 - error / GATE, minlength=last)
+        return np.asarray(fits, dtype=np.float64), np.minimum(*counts) * 1.0
     fits, possible = np.zeros(last), np.zeros(last)
     for view in views:
         others, seen = look.others(view), look.seen_by(view)
