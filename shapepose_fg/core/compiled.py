@@ -80,10 +80,10 @@ class _Compiling(event.Listener):
     def on_start(self, event: Any) -> None:
         self._collects.append(gc.isenabled())
         gc.disable()
-        ours = event.data["dispatcher"].py_func.__module__.startswith("shapepose_fg.")
+        ours = str(event.data["dispatcher"].py_func.__module__).startswith("shapepose_fg.")
         if ours and not self._told:
             self._told = True
-            logging.getLogger(__name__).info("compiling for this machine, once: some twenty seconds")
+            logging.getLogger(__name__).info("compiling for this machine, once: about half a minute")
 
     def on_end(self, event: Any) -> None:
         if self._collects.pop():
