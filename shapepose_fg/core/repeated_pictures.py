@@ -25,8 +25,8 @@ class WithoutRepeats:
     """The recording as it is."""
     views: int
     """V, its cameras."""
-    _before: dict[int, Detections] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """The frame that was read last, by its number."""
+    _read: dict[int, tuple[Detections, Mask]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What was read last, by its number: all detections, and which views (V,) repeat themselves."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -47,22 +47,24 @@ class WithoutRepeats:
         return len(self.frames)
 
     def __getitem__(self, frame: int, /) -> Detections:
-        every = self.frames[frame]
-        gone = self._repeated(frame, every)
-        gone[list(self.trust.dark(frame))] = True
-        return every.only(~gone[every.view]) if gone.any() else every
+        every, repeated = self._frame(frame)
+        return every.only(~repeated[every.view]) if repeated.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
         """The views that show in a frame what they showed in the frame before."""
-        return tuple(np.flatnonzero(self._repeated(frame, self.frames[frame])).tolist())
+        return tuple(np.flatnonzero(self._frame(frame)[1]).tolist())
 
-    def _repeated(self, frame: int, now: Detections) -> Mask:
-        if frame <= self.first:
-            return np.zeros(self.views, dtype=bool)
-        before = self._before[frame - 1] if frame - 1 in self._before else self.frames[frame - 1]
-        self._before.clear()
-        self._before.update({frame - 1: before, frame: now})
-        return repeated_views(before, now, self.views)
+    def _frame(self, frame: int) -> tuple[Detections, Mask]:
+        """All detections of a frame, and which views (V,) repeat themselves."""
+        if frame not in self._read:
+            now, repeated = self.frames[frame], np.zeros(self.views, dtype=bool)
+            if frame > self.first:
+                last = self._read.get(frame - 1)
+                before = self.frames[frame - 1] if last is None else last[0]
+                repeated = repeated_views(before, now, self.views)
+            self._read.clear()
+            self._read[frame] = now, repeated
+        return self._read[frame]
 
 
 def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
