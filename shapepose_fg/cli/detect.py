@@ -22,7 +22,7 @@ from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import RenderableType
 
     from shapepose_fg.detection2d.opening import Network
     from shapepose_fg.detection2d.recording import DetectionRun
@@ -132,7 +132,7 @@ def detect(
     print(_next_command(output, cameras, project, loaded))
 
 
-def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "Table":
+def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "RenderableType":
     """What was detected in each camera's pictures, and how long it took."""
     rows = []
     for view, each in enumerate(run.cameras):

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.progress import Progress
-    from rich.table import Table
 
 
 def use_any_streams() -> None:
@@ -78,16 +77,20 @@ def show(content: "RenderableType") -> None:
     console().print(content)
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 1, caption: str = "") -> "Table":
+def table(
+    heads: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 1, caption: str = ""
+) -> "RenderableType":
     """Rows under headings, the first `left` columns to the left, and a caption under them."""
+    from rich.console import Group
     from rich.table import Table
+    from rich.text import Text
 
-    made = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", caption=caption, caption_justify="left")
+    made = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     for n, head in enumerate(heads):
         made.add_column(head, justify="left" if n < left else "right", overflow="fold")
     for row in rows:
         made.add_row(*row)
-    return made
+    return Group(made, Text(caption, style="dim")) if caption else made
 
 
 def say(what: str, message: str, style: str) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+from rich.console import RenderableType
 from rich.progress import Progress, TaskID
-from rich.table import Table
 from rich.text import Text
 
 from shapepose_fg.cli.terminal import table
@@ -88,7 +88,7 @@ class Standings:
         """The recordings that are that far."""
         return [name for name, each in self.of.items() if each.status == status]
 
-    def summary(self, seconds: float) -> Table:
+    def summary(self, seconds: float) -> RenderableType:
         """How each recording ended, frames, people and time; under it what all of them took."""
         rows = []
         for name, each in self.of.items():
