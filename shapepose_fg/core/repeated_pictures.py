@@ -48,7 +48,9 @@ class WithoutRepeats:
 
     def __getitem__(self, frame: int, /) -> Detections:
         every, repeated = self._frame(frame)
-        return every.only(~repeated[every.view]) if repeated.any() else every
+        gone = repeated.copy()
+        gone[list(self.trust.dark(frame))] = True
+        return every.only(~gone[every.view]) if gone.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
         """The views that show in a frame what they showed in the frame before."""
