@@ -161,3 +161,27 @@ class Recording:
 
     def __iter__(self) -> Iterator[Detections]:
         return iter(self.frames)
+
+
+@dataclass(frozen=True)
+class DerivedFrames:
+    """A recording that is made of another, frame by frame: the base of those that leave something out."""
+
+    frames: DetectionSequence
+    """The recording as it is."""
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The detector's joints."""
+        return self.frames.skeleton
+
+    @property
+    def first(self) -> int:
+        """The first frame that the recording says anything of."""
+        return getattr(self.frames, "first", 0)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, frame: int, /) -> Detections:
+        return self.frames[frame]

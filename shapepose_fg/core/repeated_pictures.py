@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shapepose_fg.core.arrays import Mask
-from shapepose_fg.core.detections import Detections, DetectionSequence
-from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.detections import DerivedFrames, Detections
 from shapepose_fg.core.trust import Trust, trust_in
 
 _LEAST = 4
@@ -14,37 +13,22 @@ _LEAST = 4
 
 
 @dataclass(frozen=True)
-class WithoutRepeats:
+class WithoutRepeats(DerivedFrames):
     """A recording without the detections of pictures that say nothing new: of another time, they contradict.
 
     A detector finds the same again, to the last digit, in the same picture only. Where all cameras that see
     anything repeat themselves, everything may stand still, as in a made-up scene: nothing is left out.
     """
 
-    frames: DetectionSequence
-    """The recording as it is."""
     views: int
     """V, its cameras."""
     _read: dict[int, tuple[Detections, Mask]] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What was read last, by its number: all detections, and which views (V,) repeat themselves."""
 
     @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.frames.skeleton
-
-    @property
     def trust(self) -> Trust:
         """Which cameras are left out besides, and when."""
         return trust_in(self.frames)
-
-    @property
-    def first(self) -> int:
-        """The first frame that the recording says anything of."""
-        return getattr(self.frames, "first", 0)
-
-    def __len__(self) -> int:
-        return len(self.frames)
 
     def __getitem__(self, frame: int, /) -> Detections:
         every, repeated = self._frame(frame)

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from shapepose_fg.core.detections import Detections, DetectionSequence
-from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.detections import DerivedFrames, DetectionSequence
 
 Spell = tuple[int, int, int]
 """A view, the first frame of which something is said, and the one after the last."""
@@ -36,29 +35,11 @@ BELIEVED = Trust()
 
 
 @dataclass(frozen=True)
-class Trusted:
+class Trusted(DerivedFrames):
     """A recording for `reconstruct`, with what is believed of its cameras."""
 
-    frames: DetectionSequence
-    """The recording."""
     trust: Trust
     """`setup_check.report.check_setup(detections, rig).trust`, for example."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.frames.skeleton
-
-    @property
-    def first(self) -> int:
-        """The first frame that the recording says anything of."""
-        return getattr(self.frames, "first", 0)
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, frame: int, /) -> Detections:
-        return self.frames[frame]
 
 
 def trust_in(detections: DetectionSequence) -> Trust:

@@ -55,7 +55,12 @@ def carried_to_frames(observations: Observations, points: Array, velocity: Array
     return replace(observations, xy=observations.xy - np.where(np.isfinite(away), away, 0.0))
 
 
-def spread(observations: Observations, velocity: Array, views: Views) -> Array:
-    """(N, J, 3, 3) how far joints are, in any view, from where they are at their frame's time, m²."""
-    most = np.abs(leads(observations, views)).max(axis=2)[..., None] * velocity
-    return most[..., None] * most[..., None, :]
+def widened(covariance: Array, observations: Observations, points: Array, views: Views) -> Array:
+    """`covariance` (N, J, 3, 3) and how far the joints `points` (N, J, 3) are, in any view, from where they are at
+    their frame's time, m².
+    """
+    lead_s = leads(observations, views)
+    if not lead_s.any():
+        return covariance
+    most = np.abs(lead_s).max(axis=2)[..., None] * velocities_of(observations, points)
+    return covariance + most[..., None] * most[..., None, :]

@@ -18,7 +18,7 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.joint_step import solve_joints
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.out_of_step import carried_to_frames, spread, velocities_of
+from shapepose_fg.estimation.out_of_step import carried_to_frames, velocities_of, widened
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
@@ -82,7 +82,7 @@ def solve_window(
         if assigning.over_time:
             times_s = observations.time_s.mean(axis=1)
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
-            covariance = covariance + spread(observations, velocities_of(observations, places), views)
+            covariance = widened(covariance, observations, places, views)
         least = None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
         before = observations
         observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, least)

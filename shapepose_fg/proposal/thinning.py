@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Index, Mask
-from shapepose_fg.core.detections import Detections, DetectionSequence
-from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.detections import DerivedFrames, Detections
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints
 
 _LEAST_IN_A_VIEW = 8
@@ -21,32 +20,17 @@ _LEAST_IN_A_VIEW = 8
 
 
 @dataclass(frozen=True)
-class ThinnedFrames:
+class ThinnedFrames(DerivedFrames):
     """A recording whose frames have no more detections than are allowed, in an order of their own.
 
     They are sorted by where they are, so that nothing depends on the order in which cameras, people and detections
     are given: of equal ones the first is taken in many places.
     """
 
-    frames: DetectionSequence
-    """The recording as it is."""
     views: int
     """V, its cameras."""
     config: CandidateConfig
     """How many are allowed."""
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The detector's joints."""
-        return self.frames.skeleton
-
-    @property
-    def first(self) -> int:
-        """The first frame that the recording says anything of."""
-        return getattr(self.frames, "first", 0)
-
-    def __len__(self) -> int:
-        return len(self.frames)
 
     def __getitem__(self, frame: int, /) -> Detections:
         every = self.frames[frame]
