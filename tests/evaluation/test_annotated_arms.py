@@ -11,6 +11,7 @@ from shapepose_fg.evaluation.single_person import (
     ARMS,
     SIGMA_PX,
     WRONG_M,
+    man_of,
     measure_arms,
     read_annotated_arms,
 )
@@ -124,3 +125,18 @@ def test_the_recording(shared_data):
     single = single_footage(folder)
     errors = measure_arms(single.reconstruct(frames=range(8)), arms.only(range(8)))
     assert np.median(errors.error_m) < WRONG_M / 4  # four views see both arms hang
+
+
+def test_the_man_is_in_the_middle_and_missing_frames_are_missing(scene, truth):
+    middle = scene.rig.centres.mean(axis=0) * [1, 1, 0]
+    joints = truth.joints - truth.joints.mean(axis=1, keepdims=True) * [1, 1, 0] + middle
+    his = replace(truth, joints=joints)
+    far = replace(truth, joints=joints + np.array([4.0, 0, 0]))
+    both = type(truth).concatenate([far, his.rows(truth.frame != 7)])
+    assert (both.joints[man_of(both, scene.rig)] == his.rows(truth.frame != 7).joints).all()
+    assert len(man_of(truth.rows(truth.frame < 0), scene.rig)) == 0
+
+
+def test_a_man_without_joints_is_nobody(scene, truth):
+    nothing = replace(truth, joints=np.full_like(truth.joints, np.nan))
+    assert len(man_of(nothing, scene.rig)) == 0
