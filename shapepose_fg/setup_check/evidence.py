@@ -11,6 +11,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.pieces import add_view, project, solved
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
@@ -147,7 +148,7 @@ def _triangulate(
     slope: Array,
 ) -> None:
     """`triangulate` with K [R t] as `cameras` (V, 3, 4), from pixels to rays (V, 3, 3), and `centres` (V, 3)."""
-    A, b, x, ray, gu, gv = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    A, b, x, ray, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     views = len(cameras)
     for p in range(prior.shape[0]):
         for j in range(prior.shape[1]):
@@ -171,26 +172,24 @@ def _triangulate(
             for i in range(3):
                 A[i, i] += 1e-12
             if seen >= 2:
-                _solve(A, b, x)
+                solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], x)
             else:
                 x[0] = x[1] = x[2] = math.nan
             for step in range(steps + 1):
                 for i in range(3):
                     b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
                 for v in range(views):
-                    M = cameras[v]
-                    z = M[2, 0] * x[0] + M[2, 1] * x[1] + M[2, 2] * x[2] + M[2, 3]
+                    u, w, z = project(cameras[v], x)
                     depth[p, j, v], miss_px[p, j, v], slope[p, j, v] = z, math.nan, math.nan
                     if step < steps:
                         weight[p, j, v] = 0.0
                     if not z > 0:
                         continue
-                    u = (M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2] + M[0, 3]) / z
-                    w = (M[1, 0] * x[0] + M[1, 1] * x[1] + M[1, 2] * x[2] + M[1, 3]) / z
                     slope[p, j, v] = 0.0
                     for i in range(3):
-                        gu[i], gv[i] = (M[0, i] - u * M[2, i]) / z, (M[1, i] - w * M[2, i]) / z
-                        slope[p, j, v] += gu[i] ** 2 + gv[i] ** 2
+                        along_u = cameras[v, 0, i] - u * cameras[v, 2, i]
+                        along_w = cameras[v, 1, i] - w * cameras[v, 2, i]
+                        slope[p, j, v] += (along_u**2 + along_w**2) / z**2
                     if not prior[p, j, v] > 0:
                         continue
                     du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
@@ -198,33 +197,15 @@ def _triangulate(
                     miss_px[p, j, v] = math.sqrt(square)
                     if step < steps:
                         weight[p, j, v] = prior[p, j, v] / (1 + prior[p, j, v] * square)
-                        for i in range(3):
-                            b[i] += weight[p, j, v] * (gu[i] * du + gv[i] * dw)
-                            for k in range(3):
-                                A[i, k] += weight[p, j, v] * (gu[i] * gu[k] + gv[i] * gv[k])
+                        add_view(cameras[v], u, w, z, du, dw, weight[p, j, v], A, b)
                 if step < steps:
                     least = 1e-9 * (A[0, 0] + A[1, 1] + A[2, 2]) + 1e-300
                     for i in range(3):
                         A[i, i] += least
-                    _solve(A, b, gu)
+                    solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], step_m)
                     for i in range(3):
-                        x[i] -= gu[i]
+                        x[i] -= step_m[i]
             points[p, j, 0], points[p, j, 1], points[p, j, 2] = x[0], x[1], x[2]
-
-
-@kernel
-def _solve(A: Array, b: Array, x: Array) -> None:
-    """A x = b for a symmetric A (3, 3)."""
-    c0 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
-    c1 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
-    c2 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
-    d1 = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
-    d2 = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
-    d3 = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
-    determinant = A[0, 0] * c0 + A[0, 1] * c1 + A[0, 2] * c2
-    x[0] = (c0 * b[0] + c1 * b[1] + c2 * b[2]) / determinant
-    x[1] = (c1 * b[0] + d1 * b[1] + d2 * b[2]) / determinant
-    x[2] = (c2 * b[0] + d2 * b[1] + d3 * b[2]) / determinant
 
 
 @dataclass(frozen=True, eq=False)
