@@ -6,10 +6,10 @@ import pytest
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import vertex_normals
 from shapepose_fg.viz.rendering import (
+    Surface,
     first_surface_at,
     look_at,
     rasterise,
-    render_depth,
     scaled,
     zoom,
 )
@@ -42,10 +42,13 @@ def rays(camera: Camera) -> np.ndarray:
     return np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(camera.K).T
 
 
-@pytest.mark.parametrize("cull_back", [False, True])
-def test_depth_of_a_sphere(camera: Camera, cull_back: bool):
+def drawn(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> Surface:
+    return rasterise(*camera.project(vertices), faces, camera.image_size)
+
+
+def test_depth_of_a_sphere(camera: Camera):
     vertices, faces = sphere(200)
-    surface = render_depth(vertices, faces, camera, cull_back=cull_back)
+    surface = drawn(vertices, faces, camera)
     centre = camera.cTw[:, 3]
     # |s ray - centre| = 1, the smaller root.
     ray = rays(camera)
@@ -65,7 +68,7 @@ def test_depth_of_a_tilted_plane(camera: Camera):
     corners = np.array([[-0.4, -0.5, 0.3], [0.5, -0.4, -0.2], [0.3, 0.5, 0.1], [-0.6, 0.6, 0.6]])
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     corners[3] -= normal * (normal @ (corners[3] - corners[0])) / (normal @ normal)
-    surface = render_depth(corners, np.array([[0, 1, 2], [0, 2, 3]]), camera)
+    surface = drawn(corners, np.array([[0, 1, 2], [0, 2, 3]]), camera)
     n = camera.cTw[:, :3] @ normal
     point = camera.cTw[:, :3] @ corners[0] + camera.cTw[:, 3]
     expected = (n @ point) / (rays(camera) @ n)
@@ -77,9 +80,9 @@ def test_depth_of_a_tilted_plane(camera: Camera):
 
 
 def test_the_nearer_of_two_quads_wins_and_neighbours_leave_no_gap():
-    square = np.array([[2.0, 2], [12, 2], [12, 12], [2, 12]])
+    square = np.array([[1.75, 1.75], [12.25, 1.75], [12.25, 12.25], [1.75, 12.25]])  # no edge on a pixel's centre
     xy = np.concatenate([square, square + np.array([5, 3])])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    faces = np.array([[2, 1, 0], [3, 2, 0], [6, 5, 4], [7, 6, 4]])  # counter-clockwise as seen
     surface = rasterise(xy, np.repeat([3.0, 2.0], 4), faces, (24, 20))
     row, column = np.mgrid[:20, :24]
     first = (column >= 2) & (column <= 12) & (row >= 2) & (row <= 12)
@@ -91,9 +94,9 @@ def test_the_nearer_of_two_quads_wins_and_neighbours_leave_no_gap():
 
 
 def test_nearer_in_the_middle_only_where_planes_cross():
-    xy = np.array([[0.0, 0], [20, 0], [20, 10], [0, 10]] * 2)
+    xy = np.array([[-0.5, -0.5], [20.5, -0.5], [20.5, 10.5], [-0.5, 10.5]] * 2)
     depth = np.array([1.0, 3, 3, 1, 3, 1, 1, 3])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    faces = np.array([[2, 1, 0], [3, 2, 0], [6, 5, 4], [7, 6, 4]])  # counter-clockwise as seen
     surface = rasterise(xy, depth, faces, (21, 11))
     assert (surface.face[:, :10] < 2).all()
     assert (surface.face[:, 11:] >= 2).all()
@@ -104,13 +107,13 @@ def test_nearer_in_the_middle_only_where_planes_cross():
 def test_what_is_behind_the_camera_or_nan_is_not_drawn(camera: Camera):
     vertices, faces = sphere(20)
     behind = vertices + 2 * camera.centre
-    assert (render_depth(behind, faces, camera).face == -1).all()
+    assert (drawn(behind, faces, camera).face == -1).all()
     around = vertices + camera.centre  # the camera is in the middle: no face crosses the image plane whole
-    assert np.isfinite(render_depth(around, faces, camera).depth).any()
+    assert np.isfinite(drawn(around, faces[:, ::-1], camera).depth).any()
     vertices = vertices.copy()
     vertices[:200] = np.nan
-    assert (render_depth(vertices, faces, camera).face >= 0).any()
-    assert (render_depth(np.zeros((0, 3)), np.zeros((0, 3), dtype=int), camera).face == -1).all()
+    assert (drawn(vertices, faces, camera).face >= 0).any()
+    assert (drawn(np.zeros((0, 3)), np.zeros((0, 3), dtype=int), camera).face == -1).all()
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_up(camera: Camera):
@@ -150,7 +153,7 @@ def test_the_fast_way_meets_the_same_surfaces(camera: Camera):
     for eye, target in (((4.0, 1, 0.5), (0, 0, 0)), ((1.0, 0.1, 1), (0.5, 0.7, 0.2)), ((0, 0, 0.1), (3.0, 1, 0))):
         shifted = np.array([[200.0, 3.0, 70.0], [0, 180.0, 66.0], [0, 0, 1]])
         seen_from = Camera("c", shifted, look_at(np.array(eye), np.array(target), UP), camera.image_size)
-        exact = render_depth(points, mesh, seen_from, cull_back=True)
+        exact = drawn(points, mesh, seen_from)
         depth, vertex = first_surface_at(points, mesh.astype(np.int32), seen_from, column, row)
         hit = exact.face >= 0
         hits.append(hit.mean())

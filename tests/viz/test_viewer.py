@@ -12,7 +12,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.viz.bodies import joined, surfaces
-from shapepose_fg.viz.rendering import render_depth
+from shapepose_fg.viz.rendering import rasterise
 from shapepose_fg.viz.viewer.picture import Floor, demo_picture, floor_under, framed, free_viewpoint, two_views
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -109,7 +109,7 @@ def test_surfaces_are_those_of_rows_with_a_body_and_lie_under_skeletons(scene: S
     vertices, faces = joined(bodies, scene.body.faces)
     # In a view, every joint's pixel is covered by a body or next to one: joints lie inside the silhouette.
     camera = framed(scene.rig.cameras[0], vertices, (800, 450))
-    surface = render_depth(vertices, faces, camera)
+    surface = rasterise(*camera.project(vertices), faces, camera.image_size)
     xy, _ = camera.project(people.joints[rows].reshape(-1, 3))
     column, row = np.clip(np.rint(xy), 0, (799, 449)).astype(int).T
     assert (surface.face[row, column] >= 0).mean() > 0.95

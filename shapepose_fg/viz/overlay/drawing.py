@@ -98,7 +98,7 @@ def draw_bodies(
         return picture
     points, corners = joined(vertices, faces)
     xy, depth = view.project(points)
-    surface = rasterise(xy, depth, corners, view.size, cull_back=True)
+    surface = rasterise(xy, depth, corners, view.size)
     row, column = np.nonzero(surface.face >= 0)
     met = surface.face[row, column]
     first, second, third = points[corners[met].T]

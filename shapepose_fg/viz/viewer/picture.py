@@ -17,7 +17,7 @@ from shapepose_fg.io.footage.placement import Placement, PlacementKind
 from shapepose_fg.viz.bodies import joined, surfaces
 from shapepose_fg.viz.overlay import drawing
 from shapepose_fg.viz.overlay.drawing import Colour
-from shapepose_fg.viz.rendering import look_at, render_depth, zoom
+from shapepose_fg.viz.rendering import look_at, rasterise, zoom
 
 _WIDE, _GAP, _HEADER = 1800, 14, 60
 """Width of the picture, space between its panels and above them, pixels."""
@@ -199,7 +199,7 @@ def two_views(rig: Rig, vertices: Array, faces: Index) -> tuple[int, int]:
     area_m2 = np.zeros(len(rig))
     for view, camera in enumerate(rig.cameras):
         small = zoom(camera, (0, 0, *camera.image_size), 240)
-        depth = render_depth(vertices, faces, small, cull_back=True).depth
+        depth = rasterise(*small.project(vertices), faces, small.image_size).depth
         area_m2[view] = (depth[np.isfinite(depth)] ** 2).sum() / small.K[0, 0] ** 2
     first = int(area_m2.argmax())
     axes = rig.cTw[:, 2, :3]
