@@ -13,13 +13,12 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("viewer", "detect", "export", "view", "archive", "cluster")
+EXTRAS = ("detect", "export", "view", "archive", "cluster")
 HEAD = """# Licences of what is installed with it
 
-`pip install shapepose-fg` brings the first table, its extras the second; what is only needed to test it is not
-listed. The names are those that each package's own metadata give. None asks that programs which use it be under
-its own licence. opencv-python-headless carries FFmpeg's libraries (LGPL-2.1) beside its own; they are separate
-files that may be exchanged.
+`pip install shapepose-fg` brings the first table, its extras the second, named as each package's own metadata do.
+None asks that programs which use it be under its own licence. opencv-python-headless carries FFmpeg's libraries
+(LGPL-2.1) beside its own; they are separate files that may be exchanged.
 
 Our code is MIT; what the body and priors are made from is in the [README](../README.md#licence-and-credits).
 """
