@@ -15,6 +15,7 @@ from shapepose_fg.cli.options import (
     frame_range,
     frames_option,
     grouped,
+    next_reconstruct,
     option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
@@ -44,8 +45,7 @@ class NetworkOptions:
 
     def load(self) -> "Network":
         """The network, fetched if that is asked for; InputError where options contradict each other."""
-        from shapepose_fg.detection2d.download import named_file
-        from shapepose_fg.detection2d.opening import open_network
+        from shapepose_fg.detection2d.opening import named_file, open_network
 
         if self.network is None and self.download is None:
             raise InputError("say what detects: --download rtmpose-m the first time, or --network FILE")
@@ -149,8 +149,6 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
 
 def _next_command(output: Path, cameras: CameraOptions, project: Path | None, network: "Network") -> str:
     """How to go on, as a line to copy, wherever it is pasted."""
-    import shlex
-
     results = output.resolve().parent / "results"
     files = {"--calibration": cameras.calibration, "--detections": output, "--output": results}
     if project is not None and output.resolve().parent == project.resolve():
@@ -158,6 +156,5 @@ def _next_command(output: Path, cameras: CameraOptions, project: Path | None, ne
     skeleton = Path(network.settings["network"].get("skeleton") or "")
     files |= {"--skeleton": skeleton} if skeleton.is_file() else {}
     options = {name: file.resolve() for name, file in files.items() if file is not None}
-    options |= {"--up": cameras.up, "--unit": cameras.unit, "--image-size": cameras.image_size}
-    words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
-    return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+    said = {"--up": cameras.up, "--unit": cameras.unit, "--image-size": cameras.image_size}
+    return next_reconstruct(options | said)

@@ -2,7 +2,8 @@
 
 import inspect
 import re
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from functools import wraps
@@ -187,6 +188,12 @@ class TakeOptions(ResultOptions):
         """How it is read, as keywords."""
         persons, frames = tuple(self.person) if self.person else None, result_frames(self.frames)
         return super().how() | {"seen_only": self.seen_only, "frames": frames, "persons": persons}
+
+
+def next_reconstruct(options: Mapping[str, object]) -> str:
+    """How to go on, as a line to copy: `reconstruct` with those options that are given."""
+    words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
+    return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 
 
 def check_fps(fps: float | None) -> None:

@@ -1,7 +1,6 @@
 """The command `refine-calibration`: better cameras from the people of a recording."""
 
 import json
-import shlex
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from shapepose_fg.cli.options import (
     frames_option,
     grouped,
     json_option,
+    next_reconstruct,
     option,
 )
 from shapepose_fg.cli.terminal import note, progress, show, table
@@ -120,21 +120,12 @@ def refine_calibration(
     else:
         _show(found, may)
         print(f"{output}: {form}")
-        print(next_command(seen, rate, output, seen.detections, form == "our own rig file"))
-
-
-def next_command(seen: DetectionOptions, rate: RateOptions, cameras: Path, detections: Path, whole: bool) -> str:
-    """How to go on, as a line to copy; `whole`: the file of the cameras says unit, axis and size itself."""
-    said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
-    options: dict[str, object] = {
-        "--calibration": cameras,
-        "--detections": detections,
-        "--skeleton": seen.skeleton,
-    }
-    options |= {} if whole else said
-    options |= {"--fps": rate.fps, "--timestamps": rate.timestamps, "--frames": rate.frames, "--output": "results"}
-    words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
-    return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+        # Our own file says axis, unit and size itself.
+        said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
+        options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
+        options |= {} if form == "our own rig file" else said
+        options |= {"--fps": rate.fps, "--timestamps": rate.timestamps, "--frames": rate.frames}
+        print(next_reconstruct(options | {"--output": "results"}))
 
 
 def _show(found: "Refinement", may: FreedomOptions) -> None:

@@ -18,6 +18,7 @@ from shapepose_fg.cli.options import (
     frames_option,
     grouped,
     json_option,
+    next_reconstruct,
     option,
 )
 from shapepose_fg.cli.terminal import note, progress, show, table
@@ -86,8 +87,7 @@ def synchronise(
     if output is not None and not as_json:
         options = {"--calibration": seen.calibration, "--detections": output / "detection", "--up": seen.up}
         options |= {"--unit": seen.unit, "--image-size": seen.image_size, "--output": output / "results"}
-        line = [word for name, value in options.items() if value is not None for word in (name, str(value))]
-        print(f"next: {shlex.join(['shapepose-fg', 'reconstruct', *line])}")
+        print(next_reconstruct(options))
 
 
 def _show(found: "Synchronised", rig: "Rig") -> None:

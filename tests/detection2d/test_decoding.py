@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.detection2d.decoding import decode, line_integrals, peaks
-from shapepose_fg.detection2d.heat_maps import NetworkLayout, layouts
+from shapepose_fg.detection2d.heat_maps import NetworkLayout, decode, layouts, line_integrals, peaks
 
 LAYOUT = layouts()["tf-pose"]
 

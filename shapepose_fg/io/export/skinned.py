@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.body.model.body_model import accumulate
 from shapepose_fg.body.model.rotation import exp_so3, hat, quaternion
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.arrays import Array, Index, Mask
@@ -182,8 +183,4 @@ def _offsets(rest: Array) -> Array:
 def _accumulated(rotations: Array) -> Array:
     """(F, 24, 3, 3) world from bone, of quaternions (F, 24, 4) against the parent."""
     cross = hat(rotations[..., :3])
-    local = np.eye(3) + 2 * (rotations[..., 3:, None] * cross + cross @ cross)
-    world = [local[:, 0]]
-    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
-        world.append(world[parent] @ local[:, joint])
-    return np.stack(world, axis=1)
+    return accumulate(np.eye(3) + 2 * (rotations[..., 3:, None] * cross + cross @ cross))
