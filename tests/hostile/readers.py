@@ -1,4 +1,4 @@
-"""Every reader of files from others, with valid files to be changed: for property tests and `scripts/fuzz.py`."""
+"""Every reader of files from others, with valid files to be changed: for property tests and fuzz.py."""
 
 import json
 import pickle

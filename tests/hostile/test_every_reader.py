@@ -16,7 +16,7 @@ from tests.hostile.trying import Trial
 from tests.marks import slow
 
 FOUND = Path(__file__).parent / "data" / "fuzz"
-"""What `scripts/fuzz.py` found once: folders called after the reader, with the files as they were."""
+"""What `tests/hostile/fuzz.py` found once: folders called after the reader, with the files as they were."""
 MOST_S = 5.0
 """No small file may take longer to read; most take a millisecond."""
 

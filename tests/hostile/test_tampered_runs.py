@@ -142,7 +142,7 @@ def test_what_has_the_right_digests_and_makes_no_sense_is_refused(parts, task, k
 
 
 def test_a_body_whose_shape_is_none_is_refused(task, whole, tmp_path):
-    """Found by scripts/fuzz.py: its digests were right."""
+    """Found by tests/hostile/fuzz.py: its digests were right."""
     kept = InFolder(shutil.copytree(whole / "parts", tmp_path / "parts"))
     arrays = {name: kept.array("bodies-0", name) for name in kept.keys("bodies-0")}
     for name, value, sentence in (

@@ -1,9 +1,9 @@
-"""Change valid files until a reader breaks: python scripts/fuzz.py [--cases 10000 | --seconds 600] [reader ...].
+"""Change valid files until a reader breaks: python -m tests.hostile.fuzz [--cases N | --seconds 600] [reader ...].
 
-Every reader of files from others, also of runs, finished and not, and of what exports read
-(tests/hostile/readers.py), is run on changed files. A case may end in a result or an InputError. Anything else,
-over 20 s, over 1 GiB beyond what was in use before, or a file written elsewhere is a fault: its file is kept in
-tests/hostile/data/fuzz, where tests/hostile/test_every_reader.py tries it again.
+Every reader of files from others, also of runs, finished and not, and of what exports read (readers.py), is run
+on changed files. A case may end in a result or an InputError. Anything else, over 20 s, over 1 GiB beyond what
+was in use before, or a file written elsewhere is a fault: its file is kept in data/fuzz, where
+test_every_reader.py tries it again.
 
 With `--cases` each reader gets so many, the same ones each time. With `--seconds` they are guided by which lines
 of this project they reach (atheris, libFuzzer: pip install ".[fuzz]"). `--held-out` starts from other files and
@@ -11,7 +11,6 @@ random numbers, which nothing was mended by, and keeps nothing. `--kills 50` kil
 """
 
 import argparse
-import importlib
 import os
 import re
 import subprocess
@@ -20,8 +19,10 @@ import tempfile
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-FOUND = ROOT / "tests" / "hostile" / "data" / "fuzz"
+from tests.hostile import trying
+
+ROOT = Path(__file__).parents[2]
+FOUND = Path(__file__).parent / "data" / "fuzz"
 HELD_OUT = 1_000_000
 """What other random numbers begin with."""
 
@@ -37,15 +38,15 @@ def main() -> None:
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("--begin", type=int, default=0, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    # The project first: of an editable install `factors` would be the folder of tests.
-    sys.path.insert(0, str(ROOT))
     if given.worker is not None:
         work(given)
         return
     if given.kills:
         kill(given.kills, HELD_OUT if given.held_out else 0)
         return
-    names = given.reader or list(importlib.import_module("tests.hostile.readers").READERS)
+    from tests.hostile.readers import READERS
+
+    names = given.reader or list(READERS)
     cases = faults = 0
     for name in names:
         ran, failed = fuzz(name, given, max(1.0, given.seconds / len(names)))
@@ -56,8 +57,10 @@ def main() -> None:
 
 def kill(times: int, first: int) -> None:
     """Kill `reconstruct` or a worker so many times: it ends with the same bytes, or says one sentence."""
+    from tests.hostile.kills import Killing
+
     with tempfile.TemporaryDirectory() as folder:
-        killing = importlib.import_module("tests.hostile.kills").Killing.of(Path(folder))
+        killing = Killing.of(Path(folder))
         for number in range(first, first + times):
             print(f"{number}: {killing.once(number, Path(folder) / str(number))}", flush=True)
 
@@ -65,13 +68,20 @@ def kill(times: int, first: int) -> None:
 def fuzz(name: str, given: argparse.Namespace, left: float) -> tuple[int, int]:
     """Cases and faults of one reader; a worker that died is followed by another, which starts elsewhere."""
     cases = faults = begin = 0
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     while faults < 20 and (begin < given.cases if given.cases else left >= 1):
-        command = [sys.executable, __file__, "--worker", name, "--begin", str(begin), "--cases", str(given.cases)]
-        command += ["--seconds", str(int(left)), *(["--held-out"] if given.held_out else [])]
+        command = [sys.executable, "-m", __spec__.name, "--worker", name, "--begin", str(begin)]
+        command += [
+            "--cases",
+            str(given.cases),
+            "--seconds",
+            str(int(left)),
+            *(["--held-out"] if given.held_out else []),
+        ]
         with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None) as folder:
             start = time.monotonic()
             ended = subprocess.run(
-                command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
+                command, cwd=folder, env=environment, capture_output=True, text=True, errors="replace", check=False
             )
             left -= time.monotonic() - start
             counts = re.findall(r"^#(\d+)|stat::number_of_executed_units:\s*(\d+)", ended.stderr, re.MULTILINE)
@@ -103,7 +113,6 @@ def _keep(name: str, broken: list[Path]) -> None:
 
 def work(given: argparse.Namespace) -> None:
     """Cases of one reader in this process."""
-    trying = importlib.import_module("tests.hostile.trying")
     Path("files").mkdir()
     tempfile.tempdir = str(Path.cwd())
     first = HELD_OUT if given.held_out else 0
