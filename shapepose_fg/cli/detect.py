@@ -45,7 +45,8 @@ class NetworkOptions:
 
     def load(self) -> "Network":
         """The network, fetched if that is asked for; InputError where options contradict each other."""
-        from shapepose_fg.detection2d.opening import named_file, open_network
+        from shapepose_fg.detection2d.download import named_file
+        from shapepose_fg.detection2d.opening import open_network
 
         if self.network is None and self.download is None:
             raise InputError("say what detects: --download rtmpose-m the first time, or --network FILE")

@@ -54,7 +54,7 @@ class PictureOptions:
     ) -> "list[tuple[CameraFootage, Footage]]":
         """Those of the result in `results`, whose run.json says `run`, for the cameras `drawn` (`pictures_of`)."""
         from shapepose_fg.io.footage.placement import FOOTAGE
-        from shapepose_fg.viz.overlay.frames import pictures_of
+        from shapepose_fg.viz.overlay.result_pictures import pictures_of
 
         if detections is None and (results_folder(results) / FOOTAGE).is_file():
             detections = results_folder(results)

@@ -31,8 +31,9 @@ def train_fitter(
 
     from shapepose_fg.body.fitting.weights import FitterWeights, adapted_file, fingerprint
     from shapepose_fg.body.model.body_model import BodyModel
+    from shapepose_fg.simulation.training.adaptation import PLAIN, TRAINED, adapted
     from shapepose_fg.simulation.training.motions import drawn_motions, load_motions
-    from shapepose_fg.simulation.training.train import PLAIN, TRAINED, TrainingConfig, adapted
+    from shapepose_fg.simulation.training.train import TrainingConfig
 
     model = BodyModel.load(body)
     if output is None and fingerprint(model) == FitterWeights.default().body:

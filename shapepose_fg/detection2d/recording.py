@@ -14,7 +14,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
-from shapepose_fg.detection2d.heat_maps import Candidates
+from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.opening import Network
 from shapepose_fg.detection2d.top_down import People
 from shapepose_fg.detection2d.upright import UprightView, roll_of

@@ -18,7 +18,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.files import write_atomically, write_content
 from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
-from shapepose_fg.io.detections.people import MARGIN
+from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
 SMALLEST_PERSON = 3

@@ -25,7 +25,7 @@ SIZES = ((640, 480), (1920, 1080), (1080, 1920), (640, 640))
 @pytest.mark.parametrize("suppressed", [False, True])
 @pytest.mark.parametrize("shown, boxed", [((192, 256), (416, 416)), ((288, 384), (640, 640))])
 def test_boxes_and_joints_are_rtmlib_s(tmp_path: Path, monkeypatch, shown, boxed, suppressed):
-    monkeypatch.setattr("shapepose_fg.detection2d.top_down._MOST_PEOPLE", 1000)  # rtmlib has no such bound
+    monkeypatch.setattr("shapepose_fg.detection2d.boxes._MOST_PEOPLE", 1000)  # rtmlib has no such bound
     rng, people, off = np.random.default_rng(0), 0, []
     for seed, (width, height) in itertools.product(range(2), SIZES):
         pose = rtmpose_file(tmp_path / f"pose{seed}.onnx", 26, shown, seed)

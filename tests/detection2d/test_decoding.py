@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.detection2d.heat_maps import NetworkLayout, decode, layouts, line_integrals, peaks
+from shapepose_fg.detection2d.decoding import decode, line_integrals, peaks
+from shapepose_fg.detection2d.heat_maps import NetworkLayout, layouts
 
 LAYOUT = layouts()["tf-pose"]
 

@@ -10,8 +10,8 @@ import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import user_cache
-from shapepose_fg.detection2d import opening
-from shapepose_fg.detection2d.opening import BASES, named_file, named_networks
+from shapepose_fg.detection2d import download
+from shapepose_fg.detection2d.download import BASES, named_file, named_networks
 
 NETWORK = bytes(range(256)) * 400
 NAME, FILE = "rtmpose-m", named_networks()["rtmpose-m"].file
@@ -58,7 +58,7 @@ def server(monkeypatch, tmp_path):
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
     address = f"http://127.0.0.1:{served.server_port}"
-    monkeypatch.setattr(opening, "BASES", (f"{address}/first", f"{address}/mirror"))
+    monkeypatch.setattr(download, "BASES", (f"{address}/first", f"{address}/mirror"))
     yield pages, asked
     served.shutdown()
     thread.join()
@@ -108,7 +108,7 @@ def test_the_mirror_is_asked_where_the_first_address_fails(server):
     ("file:///etc/passwd", "302"),
 ])  # fmt: skip
 def test_what_is_not_a_network_is_not_kept(server, monkeypatch, page, problem):
-    monkeypatch.setattr(opening, "MOST_BYTES", 1_000_000)
+    monkeypatch.setattr(download, "MOST_BYTES", 1_000_000)
     server[0][f"/first/{FILE}"] = server[0][f"/mirror/{FILE}"] = page
     with pytest.raises(InputError, match=f"cannot be fetched from .*{problem}.*; fetch it by hand"):
         named_file(NAME, fetch=True)

@@ -14,9 +14,10 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26
+from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.detection2d.opening import open_network, read_form
-from shapepose_fg.detection2d.top_down import BoxForm, BoxNetwork, KeypointForm
+from shapepose_fg.detection2d.top_down import KeypointForm
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.simulation import built_in_scene

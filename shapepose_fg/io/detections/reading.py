@@ -15,14 +15,8 @@ from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.json_people import read_json_people
-from shapepose_fg.io.detections.people import (
-    CameraPeople,
-    KeptPeople,
-    ViewStream,
-    assemble,
-    candidates_of,
-    score_rule,
-)
+from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, candidates_of, score_rule
+from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000

@@ -1,125 +1,25 @@
-"""A result drawn over all cameras' pictures, wherever these are: videos or still images, whole or not at all."""
+"""A result drawn over the pictures of all cameras, frame by frame: videos or still images, whole or not at all."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
-from shapepose_fg.io.footage.footage import Footage, Picture, open_footage
-from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, placements_of, read_used_footage
-from shapepose_fg.io.footage.places import find_footage
+from shapepose_fg.io.footage.footage import Footage, Picture
+from shapepose_fg.io.footage.placement import CameraFootage
 from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay import drawing
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
-
-_MOST_FRAMES = 10_000_000
-"""No recording is as long: numbers in the names of pictures that are not those of frames."""
-
-
-def pictures_of(
-    run: Mapping[str, Any],
-    rig: Rig,
-    drawn: Sequence[str],
-    videos: Sequence[str] | None = None,
-    detections: Path | None = None,
-    image_placement: Sequence[str] = (),
-    open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
-    tell: Callable[[str], None] = print,
-) -> list[tuple[CameraFootage, Footage]]:
-    """The pictures of the cameras `drawn`, and which belongs to which frame; InputError where they are missing.
-
-    `run` is what the result's run.json says. They are in `videos`, as `find_footage` takes it, or where `detect`
-    says in the folder `detections`, or beside what the result was made from. `image_placement` is how those of
-    another size than the calibration's came about, as `placements_of` takes it. `open_one` opens the pictures of a
-    camera, by its name; `tell` is given what was taken to be what.
-    """
-    used = {each.name: each for each in _used_footage(run, detections)}
-    unknown = [name for name in drawn if name not in used]
-    notes: list[str] = []
-    if videos is not None:
-        places, notes = find_footage(videos, drawn)
-        paths = dict(zip(drawn, places, strict=True))
-    elif len(unknown) > 0:
-        raise InputError(
-            f"nothing says where the pictures of camera {unknown[0]} are; give --videos, or with --detections the"
-            " folder that `shapepose-fg detect` wrote"
-        )
-    else:
-        paths = {name: used[name].path for name in drawn}
-    for name, path in paths.items():
-        if not path.exists():
-            raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
-    opened = {name: open_one(name, path) for name, path in paths.items()}
-    # What detect was told of the pictures holds as long as they have the same size.
-    alike = {
-        name: used[name].placement
-        for name, each in opened.items()
-        if name in used and used[name].placement.picture_size == each.size and not image_placement
-    }
-    for name, placement in alike.items():
-        size = rig.cameras[rig.names.index(name)].image_size
-        if placement.calibrated_size != size:
-            theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
-            raise InputError(
-                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, and the cameras.json of the"
-                f" result is for {ours}; give --detections with the folder of this result, or --image-placement"
-            )
-    sizes = {name: each.size for name, each in opened.items() if name not in alike}
-    placements, concluded = placements_of(image_placement, sizes, rig)
-    notes += concluded
-    if len(unknown) > 0:
-        first = run.get("numbered_from")
-        picture = "the first picture" if first is None else f"picture {first}"
-        notes.append(
-            f"frame {first or 0} of the result is taken to be {picture} of {' '.join(unknown)}, and so on"
-        )
-    for text in notes:
-        tell(text)
-    pairs = []
-    for name, footage in opened.items():
-        index = used[name].places if name in used else _counted(footage, "numbered_from" in run)
-        index = np.where(index < len(footage.number), index, -1)
-        pairs.append((CameraFootage(name, footage.path, (placements | alike)[name], index), footage))
-    return pairs
-
-
-def _counted(footage: Footage, numbered: bool) -> Index:
-    """(T,) the picture of each frame, -1 where one is missing: that of its number, or counted from the first."""
-    first = 0 if numbered else int(footage.number[0])
-    count = int(footage.number[-1]) - first + 1
-    if count > _MOST_FRAMES:
-        raise InputError(
-            f"{footage.path}: pictures are numbered from {footage.number[0]} to {footage.number[-1]}; number them"
-            " by the frames of the recording"
-        )
-    index = np.full(count, -1, dtype=np.intp)
-    index[footage.number - first] = np.arange(len(footage.number))
-    return index
-
-
-def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:
-    """What `detect` wrote of the pictures, beside the detections that the result was made from."""
-    if detections is not None:
-        file = detections / FOOTAGE if detections.is_dir() else detections
-        if not file.is_file():
-            raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
-        return read_used_footage(file)
-    inputs = run.get("inputs")
-    texts = [Path(str(each)) for each in (inputs if isinstance(inputs, dict) else ())]
-    files = [each.parent / FOOTAGE for each in texts if each.suffix in (".txt", ".json")]
-    return next((read_used_footage(file) for file in files if file.is_file()), [])
-
 
 _INK: drawing.Colour = (45, 45, 45)
 _GRID = "grid"

@@ -15,7 +15,7 @@ from shapepose_fg.io.export.registry import read_take
 from shapepose_fg.io.export.rerun_app import new_stream
 from shapepose_fg.io.export.rerun_log import log_pictures, undistorting
 from shapepose_fg.io.footage.placement import Placement, PlacementKind
-from shapepose_fg.viz.overlay.frames import pictures_of
+from shapepose_fg.viz.overlay.result_pictures import pictures_of
 
 from .conftest import FIRST
 

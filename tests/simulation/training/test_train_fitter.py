@@ -22,7 +22,7 @@ from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
 from shapepose_fg.simulation.foreign import Proportions, reshaped
-from shapepose_fg.simulation.training import train as training
+from shapepose_fg.simulation.training import adaptation
 from shapepose_fg.simulation.training.motions import drawn_motions
 from shapepose_fg.simulation.training.train import PeopleSource, TrainingConfig, compared
 
@@ -93,7 +93,7 @@ def short(tmp_path, monkeypatch) -> Path:
     """A folder with the second body, an empty cache of the user's, and few people to calibrate and compare on."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(training, "_CALIBRATION_PEOPLE", 64)
+    monkeypatch.setattr(adaptation, "_CALIBRATION_PEOPLE", 64)
     write_body(second_body(), tmp_path / "second.npz")
     return tmp_path
 
@@ -164,7 +164,7 @@ def test_a_network_in_another_body_s_words_says_the_same_of_the_same_body():
     body, shipped = BodyModel.default(), FitterWeights.default()
     mixed = np.linalg.qr(np.random.default_rng(0).normal(size=(10, 10)))[0]
     same = BodyModel(replace(body.arrays, shapes=body.arrays.shapes @ mixed))
-    network = training.translated(shipped, body, same)
+    network = adaptation.translated(shipped, body, same)
     other = FitterWeights(network.finished(), shipped.frame, fingerprint(same), shipped.spread)
     people = source_of(body, shipped.frame).draw(50, torch.Generator().manual_seed(0))
     targets = JointTargets(people.points[:, :25].double().numpy(), np.tile(np.eye(3) / 0.01**2, (50, 25, 1, 1)))
@@ -174,7 +174,7 @@ def test_a_network_in_another_body_s_words_says_the_same_of_the_same_body():
     assert ours.ok.all() and theirs.ok.all()
     assert np.linalg.norm(theirs.joints - ours.joints, axis=-1).mean() < 2e-3  # gradients are cut off per beta
     assert np.array_equal(
-        training.translated(shipped, body, body).finished().weights["leave.weight"],
+        adaptation.translated(shipped, body, body).finished().weights["leave.weight"],
         shipped.network.weights["leave.weight"],
     )
 

@@ -1,0 +1,100 @@
+"""YOLOX: boxes around the people in a picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from shapepose_fg.core.arrays import Real
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.detection2d.onnx_network import Blob, OnnxNetwork, words
+
+Side = Annotated[int, Field(ge=16, le=4096)]
+"""Pixels of a network's input along one axis."""
+_Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
+
+_GREY = 114
+"""The colour beside pictures of another shape than the network's."""
+_STRIDES = (8, 16, 32)
+"""Pixels per cell of the grids on which boxes are proposed."""
+_PERSON = 0
+"""The number of people among COCO's classes."""
+_MOST_PEOPLE = 200
+"""Of one picture; the surest."""
+_FARTHEST = 1e6
+"""Pixels of the input: no box lies beyond."""
+_LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
+"""Scores over which a box counts, as in rtmlib; the second where suppression is in the network."""
+
+
+class BoxForm(BaseModel):
+    """How a box network is to be read: the table `boxes` of a network's TOML file."""
+
+    model_config = ConfigDict(extra="forbid")
+    network: str = ""
+    """Its ONNX file."""
+    size: tuple[Side, Side] = (640, 640)
+    """(width, height) of its input, where the ONNX file does not fix it."""
+    min_score: _Share | None = None
+    """Less sure boxes are nobody's; None for rtmlib's own."""
+    max_overlap: _Share = 0.45
+    """Of two boxes that share more of their union than this one goes."""
+
+
+@dataclass(frozen=True)
+class BoxNetwork:
+    """YOLOX, with non-maximum suppression inside of the network or without."""
+
+    network: OnnxNetwork
+    """What proposes boxes."""
+    form: BoxForm
+    """How it is to be read."""
+
+    def find(self, picture: NDArray[np.uint8]) -> Real:
+        """(P, 4) left, top, right, bottom in pixels of a `picture` (H, W, 3), the surest first."""
+        size = np.array(self.form.size)
+        scale = float((size / picture.shape[1::-1]).min())
+        width, height = (max(int(side * scale), 1) for side in picture.shape[1::-1])
+        shown = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
+        shown[:height, :width] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR)
+        outputs = self.network.run(np.ascontiguousarray(shown.transpose(2, 0, 1)[None], dtype=np.float32))
+        boxes, score, least = self._proposed(outputs)
+        # What is no number is not less than this either.
+        sound = (np.abs(boxes) < _FARTHEST).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
+        there = there[np.argsort(score[there])[::-1]]
+        boxes, score = boxes[there] / scale, score[there]
+        if least == _LEAST:
+            # Sides that count their last pixel too.
+            rectangles = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2] + 1])
+            kept = cv2.dnn.NMSBoxes(rectangles.tolist(), score.tolist(), 0.0, self.form.max_overlap)
+            boxes = boxes[np.asarray(kept, dtype=np.intp)].astype(np.float64)
+        return boxes[:_MOST_PEOPLE]
+
+    def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
+        """(N, 4) boxes in pixels of the input, (N,) how sure each is of a person, and the least that counts."""
+        # Column and row of all cells of the grids, one grid after the other.
+        grids = [np.indices((self.form.size[1] // step, self.form.size[0] // step))[::-1] for step in _STRIDES]
+        cells = np.concatenate([grid.reshape(2, -1).T for grid in grids])
+        stride = np.repeat(_STRIDES, [grid[0].size for grid in grids])[:, None]
+        shape = outputs[0].shape
+        if shape[:1] != (1,) or len(shape) != 3 or shape[2] < 5 or (shape[2] > 5 and shape[1] != len(cells)):
+            raise InputError(
+                f"{self.network.file}: of a picture of {words(self.form.size)} YOLOX gives 1 x {len(cells)} x 6"
+                f" numbers or more, with suppression inside 1 x N x 5, this network {words(shape)}; give another"
+                " --boxes"
+            )
+        found = outputs[0][0]
+        if shape[2] == 5:
+            labels = outputs[1].reshape(-1) if len(outputs) > 1 and outputs[1].size == len(found) else None
+            score = found[:, 4] if labels is None else np.where(labels == _PERSON, found[:, 4], 0.0)
+            return found[:, :4], score, _LEAST_SUPPRESSED
+        # In single precision, as the network computes: crops of the same boxes have the same pixels.
+        centre = ((found[:, :2] + cells) * stride).astype(np.float32)
+        sides = (np.exp(np.minimum(found[:, 2:4], 50)) * stride).astype(np.float32)
+        boxes = np.hstack([centre - sides / 2, centre + sides / 2])
+        return boxes, found[:, 4] * found[:, 5 + _PERSON], _LEAST

@@ -1,0 +1,127 @@
+"""Named networks, fetched when asked for, and the same ever after: their checksums are pinned at first use."""
+
+import hashlib
+import http.client
+import json
+import tempfile
+import urllib.error
+import urllib.request
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import SMALL, read_bytes, read_text, user_cache, write_content
+from shapepose_fg.detection2d.onnx_network import MOST_BYTES
+
+BASES = (
+    "https://download.openmmlab.com/mmpose/v1/projects/rtmposev1/onnx_sdk",
+    "https://huggingface.co/Tau-J/RTMPose/resolve/main/rtmposev1/onnx_sdk",
+)
+"""Addresses of the folders that hold the named networks, as rtmlib publishes them: OpenMMLab's, its mirror."""
+
+_TIMEOUT_S = 30.0
+_INSIDE = "end2end.onnx"
+"""What the network is called in its archive."""
+_BROKEN = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+
+
+@dataclass(frozen=True)
+class NamedNetwork:
+    """A network that can be asked for by name."""
+
+    file: str
+    """The archive that holds it, at each of `BASES`."""
+    size: tuple[int, int]
+    """(width, height) of its input."""
+    boxes: str | None = None
+    """The name of the network that finds people for it; None of one that finds people."""
+
+
+@lru_cache(maxsize=1)
+def named_networks() -> dict[str, NamedNetwork]:
+    """All of them by name: RTMPose of HALPE-26, and the YOLOX that rtmlib gives each."""
+    table = json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
+    return {name: NamedNetwork(**(entry | {"size": tuple(entry["size"])})) for name, entry in table.items()}
+
+
+def named_file(
+    name: str,
+    *,
+    fetch: bool = False,
+    say: Callable[[str], object] = print,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Path:
+    """The file of the named network `name`, fetched first where it is not there and `fetch` says so.
+
+    The sha256 of the ONNX file is told to `say` and pinned at first use. InputError where it is another later.
+    """
+    kept, pin = (user_cache("networks") / f"{name}.{ending}" for ending in ("onnx", "sha256"))
+    there = kept.is_file()
+    if not there and not fetch:
+        raise InputError(f"{name}: it has not been fetched yet; --download {name} does so, or give a file's path")
+    content = read_bytes(kept, MOST_BYTES) if there else _fetched(named_networks()[name].file, progress)
+    digest = hashlib.sha256(content).hexdigest()
+    if not pin.is_file():
+        write_content(pin, digest)
+        say(f"{name}: sha256 {digest} is pinned in {pin}")
+    pinned = read_text(pin, most=SMALL).strip()
+    if digest != pinned:
+        raise InputError(
+            f"{kept}: the sha256 of {'the file' if there else 'what came'} is {digest}, and {pinned[:64]} was"
+            f" pinned at first use; if that is meant, delete the file and {pin.name} beside it"
+        )
+    if not there:
+        write_content(kept, content)
+    return kept
+
+
+class _OnlyHttps(urllib.request.HTTPRedirectHandler):
+    """Follows no redirection to where others may listen and change what comes."""
+
+    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
+        if not newurl.startswith("https://"):
+            raise urllib.error.URLError(f"it leads on to {newurl[:200]}, which is not https")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
+    """The network in an archive, from the first address that has it."""
+    problems, opener = list[str](), urllib.request.build_opener(_OnlyHttps)
+    for base in BASES:
+        try:
+            with opener.open(f"{base}/{file}", timeout=_TIMEOUT_S) as answer, tempfile.TemporaryFile() as archive:
+                total, done = int(answer.headers.get("Content-Length") or 0), 0
+                # No more is read than a network has: an address that never ends fills no disk.
+                while done <= MOST_BYTES and (part := answer.read(1 << 16)):
+                    archive.write(part)
+                    done += len(part)
+                    progress(done, max(total, done))
+                if done < total or done > MOST_BYTES:
+                    raise ValueError(f"{done} bytes came of {total}" if done < total else "it has no end")
+                return _inside(archive)
+        except (OSError, ValueError, EOFError, RuntimeError, http.client.HTTPException, *_BROKEN) as error:
+            told = error if isinstance(error, urllib.error.HTTPError) else getattr(error, "reason", error)
+            problems.append(f"{base}/{file} ({told})")
+    raise InputError(
+        f"the network cannot be fetched from {' or '.join(problems)}; fetch it by hand and give the path of the"
+        f" {_INSIDE} in it"
+    )
+
+
+def _inside(archive: IO[bytes]) -> bytes:
+    """The one network in an archive. Nothing is unpacked to where the archive says."""
+    with zipfile.ZipFile(archive) as opened:
+        found = [each for each in opened.infolist() if PurePosixPath(each.filename).name == _INSIDE]
+        if len(found) != 1:
+            raise ValueError(f"it holds {len(found)} files {_INSIDE}")
+        with opened.open(found[0]) as stream:
+            content = stream.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"its {_INSIDE} has over {MOST_BYTES} bytes")
+    return content

@@ -1,0 +1,161 @@
+"""What one camera saw, block by block, and the blocks of all cameras put together as a table of the recording."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.kept_arrays import KeptArrays
+from shapepose_fg.io.detection_table import BLOCK_FRAMES, DetectionTable, keep_block
+
+MARGIN = 0.25
+"""How far outside the picture a detector may place a joint, as a part of the picture's size."""
+_STRAY = 0.01
+"""Up to this share of a camera's joints may have no place in its picture: they are left out, and it is said. More
+are detections of other pictures, or another camera's calibration."""
+_LEAST_SCORE = 1e-6
+"""Below this a detector says that it saw nothing; products of such scores are 0."""
+
+
+@dataclass(frozen=True)
+class ViewCandidates:
+    """All candidates that one camera saw in some frames, sorted by frame and then by joint."""
+
+    frame: Index
+    """(D,) frame of each candidate, from 0."""
+    seen: Detections
+    """The candidates, of view 0, pixels as measured; pairs join two of one frame."""
+
+    @classmethod
+    def of(
+        cls, frame: Index, joint: Index, xy: Array, confidence: Array, pairs: Index, affinity: Array
+    ) -> "ViewCandidates":
+        """Of columns as in `Detections`."""
+        return cls(frame, Detections(np.zeros_like(joint), joint, xy, confidence, pairs, affinity))
+
+    def only(self, keep: Mask) -> "ViewCandidates":
+        """The candidates of the mask `keep` (D,), and the pairs between them."""
+        return self if keep.all() else ViewCandidates(self.frame[keep], self.seen.only(keep))
+
+
+@dataclass(frozen=True)
+class ViewStream:
+    """All candidates that one camera saw in a recording, in blocks of `BLOCK_FRAMES` frames."""
+
+    source: Path
+    """The file or folder that they come from, for messages."""
+    frame_count: int
+    """T, frames that the source holds, seen or empty."""
+    blocks: Iterator[ViewCandidates]
+    """The blocks in order, each read when it is asked for; the last may have fewer frames."""
+    first_number: int = 0
+    """What the source itself calls its first frame."""
+    skeleton: Skeleton | None = None
+    """Whose joints the candidates are, where the source says it."""
+
+
+def assemble(views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: KeptArrays) -> DetectionTable:
+    """Put the views of a recording together, one `ViewStream` per camera of `rig`, undistorted; held by `kept`.
+
+    Raises InputError where the views hold different numbers of frames or do not fit their pictures.
+    """
+    first = views[0]
+    for view in views[1:]:
+        if (view.frame_count, view.first_number) == (first.frame_count, first.first_number):
+            continue
+        for each in views:  # what is wrong with their files goes first
+            for _ in each.blocks:
+                pass
+        what = f"holds {view.frame_count} frames", f"holds {first.frame_count}"
+        if view.frame_count == first.frame_count:
+            what = f"starts at frame {view.first_number}", f"starts at frame {first.first_number}"
+        raise InputError(f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of each")
+    ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
+    for n, blocks in enumerate(zip(*(view.blocks for view in views), strict=True)):
+        seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
+        stop = min((n + 1) * BLOCK_FRAMES, first.frame_count)
+        keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
+    notes = tuple(note for each in ideal for reason in each.reasons for note in reason.note())
+    return DetectionTable(skeleton, kept, first.frame_count, tuple(view.source for view in views), notes)
+
+
+def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detections, Index, Index]:
+    """The candidates of all views in some frames, and (T + 1,) where candidates and pairs of each frame begin."""
+    counts = [len(view.frame) for view in views]
+    offsets = np.cumsum([0, *counts[:-1]])
+    every = Detections(
+        np.repeat(np.arange(len(views)), counts),
+        np.concatenate([view.seen.joint for view in views]),
+        np.concatenate([view.seen.xy for view in views]),
+        np.concatenate([view.seen.confidence for view in views]),
+        np.concatenate([view.seen.pairs + offset for view, offset in zip(views, offsets, strict=True)]),
+        np.concatenate([view.seen.affinity for view in views]),
+    )
+    frame = np.concatenate([view.frame for view in views])
+    # Views come in order and each is sorted by frame: a stable sort leaves (frame, view, joint).
+    order = np.argsort(frame, kind="stable")
+    frame, every = frame[order], every.rows(order)
+    pair_frame = frame[every.pairs[:, 0]]
+    pair_order = np.argsort(pair_frame, kind="stable")
+    edges = np.arange(frames.start, frames.stop + 1)
+    start, pair_frame = np.searchsorted(frame, edges), pair_frame[pair_order]
+    pairs = every.pairs[pair_order] - start[pair_frame - frames.start][:, None]
+    every = replace(every, pairs=pairs, affinity=every.affinity[pair_order])
+    return every, start, np.searchsorted(pair_frame, edges)
+
+
+class _LeftOut:
+    """Candidates of a camera that were left out for one reason."""
+
+    def __init__(self, what: str, cure: str) -> None:
+        self._what, self._cure, self._count, self._of, self._first = what, cure, 0, 0, ""
+
+    def add(self, out: Mask, words: Callable[[int], str]) -> None:
+        """Take in which candidates (D,) of a block are left out; `words` say where one of them is."""
+        if self._count == 0 and out.any():
+            self._first = words(int(np.argmax(out)))
+        self._count += int(out.sum())
+        self._of += len(out)
+
+    def note(self) -> list[str]:
+        """A sentence, if there were some; InputError where there are so many that it cannot be by chance."""
+        if self._count > _STRAY * self._of:
+            raise InputError(f"{self._first}; {self._cure}")
+        return [f"{self._first}; {self._count} {self._what} of {self._of} were left out"] if self._count else []
+
+
+class _Undistorted:
+    """One camera's candidates with the pixels of a camera without distortion, and those that were left out."""
+
+    def __init__(self, source: Path, camera: Camera) -> None:
+        self.source, self.camera = source, camera
+        self.reasons = (
+            _LeftOut("such joints", "give detections made on pictures of the calibrated size"),
+            _LeftOut("joints", "check the distortion coefficients in the calibration"),
+        )
+
+    def undistorted(self, view: ViewCandidates) -> ViewCandidates:
+        """A block."""
+        camera, (width, height), xy = self.camera, self.camera.image_size, view.seen.xy
+        size = np.array([width, height], dtype=np.float64)
+        outside = np.any((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size), axis=1)
+
+        def where(row: int) -> str:
+            return (
+                f"{self.source}: frame {view.frame[row]} has a joint at pixel ({xy[row, 0]:.0f},"
+                f" {xy[row, 1]:.0f}), far outside the {width} x {height} picture of the calibration"
+            )
+
+        self.reasons[0].add(outside, where)
+        certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
+        straight = camera.undistort(certain.seen.xy)
+        undone = np.asarray(~np.isfinite(straight).all(axis=1))
+        what = f"{self.source}: the distortion of camera {camera.name} cannot be undone at frame"
+        self.reasons[1].add(undone, lambda row: f"{what} {certain.frame[row]}")
+        return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)

@@ -1,0 +1,117 @@
+"""What run.json says of a result, in words; entries that are not what they should be say nothing."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.pipeline.config import PipelineConfig
+
+Run = Mapping[str, Any]
+
+
+def told_by(run: Run) -> dict[str, Any]:
+    """The entries of a run that the page shows, by the names that its template uses."""
+    people, time = objects(run.get("people")), objects(run.get("time"))
+    problems, spans = people.get("problems"), covered_frames(run) or []
+    return {
+        "warnings": [*map(str, lists(objects(run.get("setup")).get("warnings")))],
+        "notes": [*map(str, lists(run.get("notes")))],
+        "problems": [", ".join(f"{key} {it}" for key, it in objects(each).items()) for each in lists(problems)],
+        "dropped": _dropped(objects(people.get("dropped")), objects(run.get("dropped_frames"))),
+        "probabilities": _probabilities(run.get("probability")),
+        "fps": number(time.get("fps")),
+        "source": str(time.get("source", "")),
+        "frames": ", ".join(f"{span.start}–{span.stop - 1}" for span in spans if len(span) > 0),
+        "cuts": ", ".join(map(str, run.get("cuts", []))),
+        "body": run.get("body"),
+        "time": _time(objects(run.get("seconds"))),
+        "configured": isinstance(run.get("configuration"), dict),
+        "over_time": bool(objects(run.get("configuration")).get("temporal", True)),
+        "changed": _changed_settings(run),
+        **{
+            key: [(str(name), _text(value)) for name, value in objects(run.get(key)).items()]
+            for key in ("versions", "inputs")
+        },
+    }
+
+
+def number(value: object) -> float | None:
+    """A finite number of run.json; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+        return None
+    return float(value)
+
+
+def objects(value: object) -> Mapping[str, Any]:
+    """An object of run.json; an empty one for anything else."""
+    return value if isinstance(value, dict) else {}
+
+
+def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
+    """Settings that are not the default: dotted name, value, default; a dash where there is none any more.
+
+    Tables of an older program, of which everything was written down, are left out.
+    """
+    usual = dict(_flat(asdict(PipelineConfig())))
+    given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
+    return [
+        (name, value, default)
+        for name, (value, default) in given.items()
+        if value != default and name.split(".")[0] not in PipelineConfig.replaced
+    ]
+
+
+def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
+    """Why somebody was left out: reason, how many, and in which frames, as far as there is room."""
+    counts = {reason: number(count) for reason, count in reasons.items()}
+    told = [(reason, int(count)) for reason, count in counts.items() if count is not None]
+    return [(reason, count, _frames_words(frames.get(reason))) for reason, count in told]
+
+
+def _probabilities(listed: object) -> dict[int, float]:
+    """How probable it is that each person was there, by number; empty frame by frame."""
+    entries = [objects(each) for each in lists(listed)]
+    found = {number(each.get("person")): number(each.get("probability")) for each in entries}
+    return {int(who): value for who, value in found.items() if who is not None and value is not None}
+
+
+def _time(seconds: Run) -> str:
+    """How long the stages took, the longest first; empty where that is not said."""
+    spent = {name: value for name, each in seconds.items() if (value := number(each)) is not None}
+    longest = sorted((each for each in spent.items() if each[1] >= 0.05), key=lambda each: -each[1])
+    listed = ", ".join(f"{name} {value:.1f}" for name, value in longest)
+    return f"{sum(spent.values()):.1f} s of processors: {listed}" if len(spent) > 0 else ""
+
+
+def lists(value: object) -> list[Any]:
+    """A list of run.json; an empty one for anything else."""
+    return value if isinstance(value, list) else []
+
+
+def _flat(table: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of nested tables."""
+    for key, value in objects(table).items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _text(value: object) -> str:
+    """A setting as it is compared and shown: lists and tuples alike, 1 and 1.0 alike."""
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_text, value))
+    told = number(value)
+    return f"{told:g}" if told is not None else str(value)
+
+
+def _frames_words(spans: object) -> str:
+    """`0-3, 17, 20-25 and more` of [start, stop) spans."""
+    told = []
+    for span in lists(spans):
+        ends = [number(end) for end in lists(span)]
+        if len(ends) == 2 and None not in ends:
+            start, stop = int(ends[0] or 0), int(ends[1] or 0)
+            told.append(f"{start}" if stop == start + 1 else f"{start}–{stop - 1}")
+    return ", ".join(told[:12]) + (f" and {len(told) - 12} segments more" if len(told) > 12 else "")
