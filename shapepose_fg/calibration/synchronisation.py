@@ -8,7 +8,6 @@ people (`in_space`).
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,8 @@ from shapepose_fg.calibration.scanning import Scan, chosen
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.detections import Detections, DetectionSequence, Recording
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.setup_check.matching import Sightings
 
 _STEP_S = 0.1
@@ -152,33 +150,3 @@ def _offsets(
     offset = -(shift + start)
     offset = offset - offset[0]
     return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, sure
-
-
-def same_moments(recording: DetectionSequence, found: Synchronised, fps: float) -> tuple[Recording, Array]:
-    """All cameras' frames that are nearest to moments of the first one, and when they were exposed (T, V)."""
-    count = len(recording)
-    own = found.at(np.arange(count) / fps)  # (T, V) when each camera exposed each of its frames
-    place = np.stack([np.interp(own[:, 0], each, np.arange(count), np.nan, np.nan) for each in own.T], axis=1)
-    place = np.rint(place[np.isfinite(place).all(axis=1)]).astype(np.intp)
-    if len(place) == 0:
-        raise InputError("the cameras have no moment in common; give --frames of a part in which all of them run")
-    frames = []
-    for row in place.tolist():
-        parts = [recording[frame] for frame in row]
-        parts = [part.only(part.view == view) for view, part in enumerate(parts)]
-        begin = np.cumsum([0, *(len(part) for part in parts)])
-        view, joint, xy, score = (np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS)
-        pairs = np.concatenate([part.pairs + at for part, at in zip(parts, begin[:-1], strict=True)])
-        affinity = np.concatenate([part.affinity for part in parts])
-        frames.append(Detections(view, joint, xy, score, pairs, affinity))
-    return Recording(recording.skeleton, frames), np.take_along_axis(own, place, axis=0)
-
-
-def write_camera_times(path: Path, rig: Rig, times: Array) -> None:
-    """Write when frames were exposed (T, V), a column for each camera, as `--timestamps` takes it."""
-    rows = [", ".join(["frame", *rig.names])]
-    rows += [", ".join([str(n), *(f"{each:.6f}" for each in row)]) for n, row in enumerate(times - times.min())]
-    write_content(path, "\n".join(rows) + "\n")
-
-
-_COLUMNS = ("view", "joint", "xy", "confidence")

@@ -99,8 +99,9 @@ def detect(
     if pictures.videos is None or output is None:
         missing = "--videos, the cameras' videos or pictures" if pictures.videos is None else "--output, a folder"
         raise InputError(f"what to read or where to write is missing; give {missing}")
+    from shapepose_fg.core.moments import align
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
-    from shapepose_fg.io.footage.lockstep import align, clocks_of
+    from shapepose_fg.io.footage.clocks import clocks_of
     from shapepose_fg.io.footage.placement import placements_of
 
     rig = cameras.rig()

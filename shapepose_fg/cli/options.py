@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 
 import typer
 
+from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Axis, Rig
+    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
+    from shapepose_fg.io.detection_table import DetectionTable
     from shapepose_fg.pipeline.config import PipelineConfig
 
 INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
@@ -159,6 +162,25 @@ class DetectionOptions(CameraOptions):
         if len(found) < 2:
             raise InputError(f"{self.calibration}: at least 2 cameras are needed to see depth, got {len(found)}")
         return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeOptions:
+    """When frames were taken."""
+
+    fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
+    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
+
+    def read(self, seen: DetectionOptions, rig: "Rig", kept: Path) -> "tuple[DetectionTable, FrameTimes | None]":
+        """The recording, and the times of its frames where something says them (`read_recording`); what is odd is
+        said.
+        """
+        from shapepose_fg.io.recording import read_recording
+
+        check_fps(self.fps)
+        recording, times = read_recording(seen.detections, rig, seen.skeleton, kept, self.fps, self.timestamps)
+        note(*recording.notes)
+        return recording, times
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from shapepose_fg.cli.options import INPUT, option
 from shapepose_fg.cli.terminal import note, progress
-from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.result_files import MOMENTS, results_folder
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
@@ -54,11 +54,16 @@ class PictureOptions:
     ) -> "list[tuple[CameraFootage, Footage]]":
         """Those of the result in `results`, whose run.json says `run`, for the cameras `drawn` (`pictures_of`)."""
         from shapepose_fg.io.footage.placement import FOOTAGE
+        from shapepose_fg.io.recording import read_moments
         from shapepose_fg.viz.overlay.result_pictures import pictures_of
 
-        if detections is None and (results_folder(results) / FOOTAGE).is_file():
-            detections = results_folder(results)
-        return pictures_of(run, rig, drawn, self.videos, detections, self.image_placement or (), opened, note)
+        folder = results_folder(results)
+        if detections is None and (folder / FOOTAGE).is_file():
+            detections = folder
+        moments = read_moments(folder / MOMENTS) if (folder / MOMENTS).is_file() else {}
+        return pictures_of(
+            run, rig, drawn, self.videos, detections, self.image_placement or (), moments, opened, note
+        )
 
 
 def opened(name: str, path: Path) -> "Footage":

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, cast
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
-    TIME,
     DetectionOptions,
-    check_fps,
+    TimeOptions,
     frame_range,
     frames_option,
     grouped,
@@ -24,34 +23,16 @@ from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
-    from shapepose_fg.core.camera import Rig
-    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RateOptions:
+class RateOptions(TimeOptions):
     """When frames were taken, and which are used."""
 
-    fps: float | None = option(TIME, "Frames a second; 30 where nothing says it.")
-    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
     frames: str | None = frames_option()
-
-    def times(self, detections: Path, rig: "Rig", count: int) -> "FrameTimes":
-        """Of a recording of `count` frames."""
-        from shapepose_fg.core.frame_times import FrameTimes
-        from shapepose_fg.io.timestamps import read_timestamps
-
-        if self.fps is not None and self.timestamps is not None:
-            raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
-        check_fps(self.fps)
-        beside = detections / "times.csv"
-        file = self.timestamps or (beside if self.fps is None and beside.is_file() else None)
-        if file is not None:
-            return read_timestamps(file, rig, count)
-        return FrameTimes.assumed(count) if self.fps is None else FrameTimes.from_fps(self.fps, count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +62,8 @@ def refine_calibration(
     """
     from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.refinement import refine
-    from shapepose_fg.core.storage.kept_arrays import InFolder
+    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import write_like
-    from shapepose_fg.io.detections import read_detections
 
     if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
         raise InputError("--off-degrees must be above 0, up to 20, and --off-cm above 0, up to 200")
@@ -105,10 +85,9 @@ def refine_calibration(
         0.02 if may.lens else 0.0,
     )
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
-        note(*recording.notes)
+        recording, times = rate.read(seen, rig, Path(folder))
+        times = FrameTimes.assumed(len(recording)) if times is None else times
         span = frame_range(rate.frames, len(recording), recording.first)
-        times = rate.times(seen.detections, rig, len(recording))
         reference = None if may.reference is None else rig.names.index(may.reference)
         with progress("refining", "rounds") as done:
             found = refine(recording, rig, times, span, freedom, reference, done)

@@ -6,15 +6,23 @@ from pathlib import Path
 
 import typer
 
-from shapepose_fg.cli.options import DetectionOptions, frame_range, frames_option, grouped, json_option
+from shapepose_fg.cli.options import (
+    DetectionOptions,
+    TimeOptions,
+    frame_range,
+    frames_option,
+    grouped,
+    json_option,
+)
 from shapepose_fg.cli.pictures import PictureOptions
-from shapepose_fg.cli.terminal import note, show
+from shapepose_fg.cli.terminal import show
 
 
 @grouped
 def check_calibration(
     seen: DetectionOptions,
     pictures: PictureOptions,
+    rate: TimeOptions,
     frames: str | None = frames_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -22,8 +30,6 @@ def check_calibration(
 
     Exit code 1 where something looks wrong, 0 where nothing does. Of pictures the sizes are compared.
     """
-    from shapepose_fg.core.storage.kept_arrays import InFolder
-    from shapepose_fg.io.detections import read_detections
     from shapepose_fg.io.footage.placement import FOOTAGE
     from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
     from shapepose_fg.setup_check.report import check_setup
@@ -31,8 +37,7 @@ def check_calibration(
 
     rig = seen.rig()
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
-        note(*recording.notes)
+        recording, _ = rate.read(seen, rig, Path(folder))
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
         if pictures.videos is None and (used := seen.detections / FOOTAGE).is_file():
             sizes = detected_sizes(used, rig)

@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
 
 from shapepose_fg.cli.options import (
@@ -35,18 +36,17 @@ def synchronise(
     fps: float | None = option(TIME, "Frames a second of all cameras; needed."),
     most: float = option(TIME, "Largest offset that is looked for, seconds.", 60.0),
     frames: str | None = frames_option(),
-    output: Path | None = option(RESULT, "Folder for detections of the same moments, and their times (BODY_25)."),
+    output: Path | None = option(RESULT, "File for the times of all frames, as --timestamps takes it."),
     as_json: bool = json_option(),
 ) -> None:
     """Find when cameras of known poses were started, from the people whom they see; any offset, to milliseconds.
 
     Exit code 1 where motion does not determine a camera's offset; nothing is written then.
     """
-    from shapepose_fg.calibration.synchronisation import same_moments, synchronise, write_camera_times
-    from shapepose_fg.core.skeleton import BODY_25
+    from shapepose_fg.calibration.synchronisation import synchronise
     from shapepose_fg.core.storage.kept_arrays import InFolder
     from shapepose_fg.io.detections import read_detections
-    from shapepose_fg.io.write_detections import write_association
+    from shapepose_fg.io.timestamps import write_timestamps
 
     if fps is None:
         raise InputError("--fps: missing; say how many frames a second the cameras took")
@@ -55,21 +55,14 @@ def synchronise(
         raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
     rig = seen.rig()
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
+        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)), True)
         note(*recording.notes)
-        if output is not None and recording.skeleton.joints != BODY_25.joints:
-            raise InputError(
-                f"--output: only BODY_25 can be written, and these are {recording.skeleton.name}; leave it out"
-                " and give the offsets that are printed to shapepose-fg detect --start"
-            )
         span = frame_range(frames, len(recording), recording.first)
         with progress("comparing", "pairs") as done:
             found = synchronise(recording, rig, fps, span, most, progress=done)
         problems = found.undetermined(rig)
-        if output is not None and not problems:
-            moments, times = same_moments(recording, found, fps)
-            write_association(moments, rig, output)
-            write_camera_times(output / "detection" / "times.csv", rig, times)
+    if output is not None and not problems:
+        write_timestamps(output, rig.names, found.at(np.arange(len(recording)) / fps))
     if as_json:
         print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
     else:
@@ -84,10 +77,15 @@ def synchronise(
         print(
             f"of videos: shapepose-fg detect {shlex.join(words)}, and --fps, --calibration and the rest as before"
         )
-    if output is not None and not as_json:
-        options = {"--calibration": seen.calibration, "--detections": output / "detection", "--up": seen.up}
-        options |= {"--unit": seen.unit, "--image-size": seen.image_size, "--output": output / "results"}
-        print(next_reconstruct(options))
+        if output is not None:
+            options = {
+                "--calibration": seen.calibration,
+                "--detections": seen.detections,
+                "--skeleton": seen.skeleton,
+            }
+            options |= {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
+            print(f"{output}: times of {len(recording)} frames")
+            print(next_reconstruct(options | {"--timestamps": output, "--output": "results"}))
 
 
 def _show(found: "Synchronised", rig: "Rig") -> None:

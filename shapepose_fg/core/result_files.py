@@ -21,6 +21,8 @@ from shapepose_fg.core.storage.npz import NpzFile, Pieces, write_npz
 from shapepose_fg.core.storage.schema import Table, columns_of
 
 PEOPLE, RUN, OBSERVATIONS = "people.npz", "run.json", "observations.npz"
+MOMENTS = "moments.csv"
+"""Which picture of each camera a frame is, where cameras differ."""
 RUN_ID = "run_id"
 """What ties them: a digest of all columns of people.npz."""
 T = TypeVar("T", bound=Table)

@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.moments import Moments
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.opening import Network
 from shapepose_fg.detection2d.top_down import People
 from shapepose_fg.detection2d.upright import UprightView, roll_of
 from shapepose_fg.io.footage.footage import Footage, Progress
-from shapepose_fg.io.footage.lockstep import Lockstep
 from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, write_used_footage
+from shapepose_fg.io.timestamps import nameable, write_timestamps
 
 BLOCK = 16
 """Moments that are kept together: what a run that is killed loses at most."""
@@ -63,7 +64,7 @@ class DetectionRun:
 
     cameras: Sequence[CameraDetector]
     """(V,) how each camera's pictures are read, by one network."""
-    moments: Lockstep
+    moments: Moments
     """Which pictures belong together."""
     output: Path
     """The folder for the detections."""
@@ -161,13 +162,9 @@ def _write_times(run: DetectionRun) -> None:
     if time_s is None:
         file.unlink(missing_ok=True)
         return
-    time_s = time_s - time_s.min()
     names = [each.camera.name for each in run.cameras]
-    apart = not run.moments.synchronised and not any(set(name) & set(", \t#") for name in names)
-    columns = time_s if apart else time_s.mean(axis=1, keepdims=True)
-    lines = [", ".join(["frame", *(names if apart else ["time_s"])])]
-    lines += [f"{frame}, " + ", ".join(f"{value:.6f}" for value in row) for frame, row in enumerate(columns)]
-    write_content(file, "\n".join(lines) + "\n")
+    apart = not run.moments.synchronised and nameable(names)
+    write_timestamps(file, names, time_s if apart else time_s.mean(axis=1))
 
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:

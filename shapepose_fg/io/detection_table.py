@@ -46,6 +46,8 @@ class DetectionTable:
     """What the reader made of the files and left out, a sentence each."""
     first: int = 0
     """The first frame that a file says anything of."""
+    picture: Index | None = None
+    """(T, V) which frame of its file each view shows in each frame, -1 for none; None where it is the same one."""
     _at_hand: dict[int, Arrays] = field(default_factory=dict, init=False, repr=False, compare=False)
     """The blocks that were asked for last."""
 

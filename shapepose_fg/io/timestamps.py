@@ -2,7 +2,9 @@
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -10,7 +12,8 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.core.moments import CameraClock, Moments, align
+from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
@@ -19,16 +22,18 @@ _MOST_BYTES = 2**28
 """A line a frame: a day of 30 cameras."""
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 1e-6, 10.0
 """Frames nearer or farther apart than this are no recording of motion: the file is in another unit."""
-_SAME_CLOCK_S = 1.0
-"""Cameras that took one frame farther apart than this do not share a clock."""
+_NO_PICTURE = "-"
+"""In place of a time: the camera has no such frame."""
 
 
-def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
+def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
     """The times of a recording of `frames` frames, from a text file (docs/conventions.md).
 
     Numbers are apart by commas or spaces. Without a header each line is a time in seconds, frame 0 first. The
     header names the columns: `time_s`, or the rig's cameras; and `frame`, if lines say which frame they are of.
-    InputError, one sentence that names file, line and cure.
+    Where cameras took frames of one number farther apart than from one frame to the next, or lack some, pictures
+    of other numbers belong together: the moments say which, and the times are theirs. InputError, one sentence
+    that names file, line and cure.
     """
     path = Path(path)
     names, numbers, lines = _table(path, rig)
@@ -47,18 +52,53 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> FrameTimes:
         problem = f"must hold a time for each of the {frames} frames, got {len(numbers)}"
         raise InputError(f"{path}: {problem}; add a column frame where it is of more frames than the recording")
     time_s = numbers[picked][:, [names.index(name) for name in wanted]]
-    steps, apart = np.diff(time_s, axis=0), np.ptp(time_s, axis=1)
+    clocks = [_clock(path, name, each, lines[picked]) for name, each in zip(wanted, time_s.T, strict=True)]
+    if len(wanted) == 1:
+        return FrameTimes(time_s[:, 0], source=str(path)), None
+    slowest = max(clock.period for clock in clocks)
+    if np.isfinite(time_s).all() and (np.ptp(time_s, axis=1) <= slowest).all():
+        return FrameTimes(time_s, source=str(path)), None
+    try:
+        found = align(clocks, True, "give times of one clock")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    # Pictures that a camera lacks are counted by its own frames, as the detections are.
+    number = [np.append(np.flatnonzero(np.isfinite(each)), -1) for each in time_s.T]
+    picture = np.column_stack([own[place] for own, place in zip(number, found.picture.T, strict=True)])
+    notes = tuple(f"{path}: {each}" for each in found.notes)
+    return FrameTimes(cast(Array, found.time_s), source=str(path)), Moments(picture, found.time_s, notes)
+
+
+def nameable(names: Sequence[str]) -> bool:
+    """Whether columns can be called after these cameras."""
+    return not any(set(name) & set(", \t#") for name in names)
+
+
+def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
+    """Write when frames were taken, from 0 on, as `read_timestamps` reads it: (T,), or (T, V) for each camera."""
+    if times.ndim == 2 and not nameable(names):
+        raise InputError(f"{path}: a camera's name has a blank, a comma or #; rename it in the calibration")
+    columns = [_TIME] if times.ndim == 1 else names
+    rows = [", ".join([_FRAME, *columns])]
+    for frame, row in enumerate((times - times.min()).reshape(len(times), -1).tolist()):
+        rows.append(", ".join([str(frame), *(f"{each:.6f}" for each in row)]))
+    write_content(path, "\n".join(rows) + "\n")
+
+
+def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
+    """The clock of a camera, or of all, whose frames were taken at `time_s` (T,), NaN for those it lacks."""
+    there = np.isfinite(time_s)
+    time_s, lines = time_s[there], lines[there]
+    steps = np.diff(time_s)
     if (steps <= 0).any():
-        line = lines[picked][int(np.argmax((steps <= 0).any(axis=1))) + 1]
-        what = f"line {line} must be later than the frame before"
+        what = f"line {lines[int(np.argmax(steps <= 0)) + 1]} must be later than the frame before"
         raise InputError(f"{path}: {what}; put frames in order of their times")
-    if len(time_s) > 1 and not _SHORTEST_STEP_S <= (step := np.median(steps)) <= _LONGEST_STEP_S:
+    step = float(np.median(steps)) if len(steps) > 0 else np.inf
+    if len(steps) > 0 and not _SHORTEST_STEP_S <= step <= _LONGEST_STEP_S:
         raise InputError(f"{path}: frames would be {step:.3g} s apart; write seconds")
-    if (apart > _SAME_CLOCK_S).any():
-        frame = int(np.argmax(apart > _SAME_CLOCK_S))
-        what = f"the cameras' times of frame {frame} are {apart[frame]:.3g} s apart"
-        raise InputError(f"{path}: {what}; give times of one clock")
-    return FrameTimes(time_s[:, 0] if len(wanted) == 1 else time_s, source=str(path))
+    if len(there) > 0 and len(time_s) == 0:
+        raise InputError(f"{path}: camera {name} has no times; take it out of the calibration")
+    return CameraClock(name, time_s, step)
 
 
 def _table(path: Path, rig: Rig) -> tuple[list[str], Array, Index]:
@@ -77,10 +117,13 @@ def _table(path: Path, rig: Rig) -> tuple[list[str], Array, Index]:
         if len(words) != len(names):
             cure = "name the columns in a first line" if names == [_TIME] else "correct the line"
             raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
-        wrong = [word[:20] for word in words if not is_number(word)]
+        lacks = [
+            word == _NO_PICTURE and name not in (_FRAME, _TIME) for word, name in zip(words, names, strict=True)
+        ]
+        wrong = [word[:20] for word, none in zip(words, lacks, strict=True) if not (none or is_number(word))]
         if len(wrong) > 0:
             raise InputError(f"{path}: line {line} must hold numbers, got {wrong[0]!r}; write seconds like 0.033")
-        rows.append([float(word) for word in words])
+        rows.append([np.nan if none else float(word) for word, none in zip(words, lacks, strict=True)])
         lines.append(line)
     return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
 

@@ -11,10 +11,10 @@ import pytest
 import shapepose_fg.detection2d.recording as recording
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.moments import CameraClock, align
 from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.footage import open_footage
-from shapepose_fg.io.footage.lockstep import CameraClock, align
 from shapepose_fg.io.footage.placement import FOOTAGE, Placement, PlacementKind, read_used_footage
 from shapepose_fg.io.timestamps import read_timestamps
 from tests.detection2d.conftest import paint

@@ -30,6 +30,7 @@ from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
 from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+from shapepose_fg.io.recording import read_moments, write_moments
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.pipeline.pipeline import PipelineConfig
@@ -123,6 +124,11 @@ def _times(folder: Path, seed: int) -> Read:
     )
     rig = _rig(seed, 2)
     return lambda: read_timestamps(folder / "times.csv", rig, 9)
+
+
+def _moments(folder: Path, seed: int) -> Read:
+    write_moments(folder / "moments.csv", _rig(seed, 2), np.array([[4, 0], [5, -1], [6, 2]]))
+    return lambda: read_moments(folder / "moments.csv")
 
 
 def _project(folder: Path, seed: int) -> Read:
@@ -320,6 +326,7 @@ READERS: dict[str, Prepare] = {
     "skeleton": _skeleton,
     "settings": _settings,
     "times": _times,
+    "moments": _moments,
     "project of Pose2Sim": _project,
     "recordings": _recordings,
     "batch": _batch,

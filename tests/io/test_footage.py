@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.io.footage.clocks import typed_rate, typed_start
 from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage
-from shapepose_fg.io.footage.lockstep import typed_rate, typed_start
 from shapepose_fg.io.footage.placement import (
     CameraFootage,
     Placement,

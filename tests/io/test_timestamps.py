@@ -8,7 +8,7 @@ import pytest
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.timestamps import read_timestamps
+from shapepose_fg.io.timestamps import read_timestamps, write_timestamps
 from shapepose_fg.simulation.scene import ring_of_cameras
 
 
@@ -20,7 +20,9 @@ def rig() -> Rig:
 
 def read(tmp_path: Path, text: str, rig: Rig, frames: int = 3):
     (tmp_path / "times.csv").write_text(text)
-    return read_timestamps(tmp_path / "times.csv", rig, frames)
+    times, moments = read_timestamps(tmp_path / "times.csv", rig, frames)
+    assert moments is None
+    return times
 
 
 @pytest.mark.parametrize(
@@ -52,6 +54,25 @@ def test_cameras_that_are_called_by_numbers(tmp_path):
     np.testing.assert_allclose(read(tmp_path, "1\n2\n3\n", rig).time_s, [1, 2, 3])
 
 
+def test_cameras_that_began_apart_are_put_together_by_their_times(tmp_path, rig):
+    """cam1 began 2.1 frames later, and lacks its frame 3."""
+    text = "cam0 cam1\n0 .084\n.04 .124\n.08 .164\n.12 -\n.16 .244\n.2 .284\n.24 -\n"
+    (tmp_path / "times.csv").write_text(text)
+    times, moments = read_timestamps(tmp_path / "times.csv", rig, 7)
+    assert moments is not None and moments.picture.tolist() == [[2, 0], [3, 1], [4, 2], [5, -1], [6, 4]]
+    expected = [[0.08, 0.084], [0.12, 0.124], [0.16, 0.164], [0.2, 0.2], [0.24, 0.244]]
+    np.testing.assert_allclose(times.time_s, expected)
+    assert "no picture within half a frame of 1 of 5 moments" in " ".join(moments.notes)
+
+
+def test_what_is_written_is_read(tmp_path, rig):
+    given = np.array([[0.5, 0.51], [0.54, 0.55]])
+    write_timestamps(tmp_path / "times.csv", rig.names, given)
+    np.testing.assert_allclose(read_timestamps(tmp_path / "times.csv", rig, 2)[0].time_s, given - 0.5, atol=1e-6)
+    with pytest.raises(InputError, match="has a blank, a comma or #; rename it in the calibration"):
+        write_timestamps(tmp_path / "times.csv", ["left one", "b"], given)
+
+
 def test_a_recording_without_frames(tmp_path, rig):
     assert len(read(tmp_path, "time_s\n", rig, frames=0)) == 0
 
@@ -78,8 +99,10 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("0\n33\n67\n", "frames would be 33.5 s apart; write seconds"),
         (
             "cam0 cam1\n0 1000\n1 1001\n2 1002\n",
-            "the cameras' times of frame 0 are 1e+03 s apart; give times of one",
+            "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no moment in common; give times",
         ),
+        ("cam0 cam1\n0 -\n1 -\n2 -\n", "camera cam1 has no times; take it out of the calibration"),
+        ("frame cam0 cam1\n0 0 0\n- 1 1\n2 2 2\n", "line 3 must hold numbers, got '-'"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(tmp_path, rig, text, sentence):
@@ -95,6 +118,7 @@ def test_damaged_files_are_one_sentence_or_none(tmp_path, rig):
         damaged[int(rng.integers(len(whole)))] = int(rng.integers(256))
         (tmp_path / "times.csv").write_bytes(bytes(damaged))
         try:
-            assert np.isfinite(read_timestamps(tmp_path / "times.csv", rig, 3).time_s).all()
+            times, moments = read_timestamps(tmp_path / "times.csv", rig, 3)
+            assert np.isfinite(times.time_s).all() and (moments is None or len(moments) == len(times))
         except InputError as error:
             assert "\n" not in str(error)

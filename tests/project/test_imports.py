@@ -25,7 +25,7 @@ LEVELS = (
     "body.model",
     "body.fitting body.shapes",
     "body.offsets",
-    "core.detections core.frame_times",
+    "core.detections core.frame_times core.moments",
     "core.trust",
     "core.observations core.notes core.repeated_pictures",
     "core.observation_table",

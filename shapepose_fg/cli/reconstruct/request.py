@@ -12,6 +12,7 @@ from shapepose_fg.cli.options import (
     TIME,
     DetectionOptions,
     Preset,
+    TimeOptions,
     check_fps,
     ends,
     frame_range,
@@ -21,21 +22,20 @@ from shapepose_fg.cli.options import (
 )
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE
+from shapepose_fg.core.result_files import MOMENTS, OBSERVATIONS, PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
-    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
-OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", "report.html")
+OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, "report.html")
 """The files that are left in the folder of results."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request(DetectionOptions):
+class Request(DetectionOptions, TimeOptions):
     """One recording, and what is wanted of it: the options of `shapepose-fg reconstruct`, by their names."""
 
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
@@ -44,8 +44,6 @@ class Request(DetectionOptions):
     config: Path | None = option(RESULT, "Settings as TOML, all that `shapepose-fg config` prints or some.")
     frames: str | None = frames_option()
     body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
-    fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
-    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
     readout: float | None = option(TIME, "Seconds that rolling shutters take from first to last row.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
@@ -113,15 +111,6 @@ class Prepared:
             return self.project.span(count)
         return frame_range(self.request.frames, count, first)
 
-    def times(self, rig: "Rig", count: int) -> "FrameTimes | None":
-        """When the frames were taken; None where nothing says it."""
-        from shapepose_fg.core.frame_times import FrameTimes
-        from shapepose_fg.io.timestamps import read_timestamps
-
-        if self.request.timestamps is not None:
-            return read_timestamps(self.request.timestamps, rig, count)
-        return None if self.request.fps is None else FrameTimes.from_fps(self.request.fps, count)
-
     def cuts(self, count: int) -> tuple[int, ...]:
         """The cuts, if a recording of `count` frames can have them."""
         from shapepose_fg.core.frame_times import check_cuts
@@ -140,6 +129,8 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
 
     `tell` is given what a project's files were taken to be. InputError where something is missing or wrong.
     """
+    from shapepose_fg.io.recording import times_beside
+
     project = None
     if request.project is not None:
         from shapepose_fg.io.pose2sim_project import read_pose2sim_project
@@ -158,12 +149,8 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
         missing = [name for name, value in options.items() if value is None]
         listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
         raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
-    if request.fps is not None and request.timestamps is not None:
-        raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
     check_fps(request.fps)
-    times = detections / "times.csv"
-    if request.fps is None and request.timestamps is None and times.is_file():
-        request = replace(request, timestamps=times)
+    request = replace(request, timestamps=times_beside(detections, request.fps, request.timestamps))
     if request.frames is not None:
         ends(request.frames)
     return Prepared(request, project, calibration, detections, output)

@@ -22,7 +22,7 @@ from shapepose_fg.cli.terminal import note, progress, show
 from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.result_files import PEOPLE, set_aside
+from shapepose_fg.core.result_files import MOMENTS, PEOPLE, set_aside
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
@@ -31,8 +31,8 @@ from shapepose_fg.core.trust import Trusted, trust_in
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.placement import FOOTAGE
+from shapepose_fg.io.recording import read_recording, write_moments
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
@@ -75,10 +75,10 @@ def carry_out(
         raise InputError(f"{output}: a finished result is here; give another --output, or --overwrite")
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
-        recording = read_detections(known.detections, rig, asked.skeleton, kept)
+        recording, times = read_recording(known.detections, rig, asked.skeleton, kept, asked.fps, asked.timestamps)
         note(*recording.notes)
         count = len(recording)
-        span, times, cuts = known.span(count, recording.first), known.times(rig, count), known.cuts(count)
+        span, cuts = known.span(count, recording.first), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
         if execution.workers != 1 and execution.cluster is None:
             get_ready("shapepose_fg.pipeline.pipeline")
@@ -102,14 +102,14 @@ def carry_out(
 
 
 @contextmanager
-def _recording_folder(folder: Path) -> Iterator[InFolder]:
+def _recording_folder(folder: Path) -> Iterator[Path]:
     """Where what the cameras saw is kept while the block runs: in files, because it may be larger than memory.
 
     What a killed run left there is removed.
     """
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        yield InFolder(folder)
+        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -212,6 +212,10 @@ class _Run:
             write_content(output / FOOTAGE, read_text(used))
         else:
             (output / FOOTAGE).unlink(missing_ok=True)
+        if self.recording.picture is not None:
+            write_moments(output / MOMENTS, rig, self.recording.picture)
+        else:
+            (output / MOMENTS).unlink(missing_ok=True)
         summary = summary_table(result, people, self.task, seconds)
         for n, written in enumerate(self._written(result, people, every)):
             summary.add_row("" if n > 0 else "written", written)

@@ -47,15 +47,19 @@ FORMATS = [Format("4D Association's text", ("{}.txt",), read_association_text), 
 
 
 def read_detections(
-    path: str | Path, rig: Rig, skeleton: Skeleton | str | Path | None = None, kept: KeptArrays | None = None
+    path: str | Path,
+    rig: Rig,
+    skeleton: Skeleton | str | Path | None = None,
+    kept: KeptArrays | None = None,
+    own_frames: bool = False,
 ) -> DetectionTable:
     """Read what every camera of `rig` saw from the folder `path`, undistorted.
 
     The formats are `FORMATS`, told by the files (docs/conventions.md). Cameras that the rig does not have are
     passed over. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a TOML file that describes it;
     without it the number of keypoints tells. `notes` of the table say what was made of the files. `kept` holds the
-    recording, in memory by default: with an empty `InFolder` it may be larger than that. Raises InputError, one
-    sentence that names file, place and cure.
+    recording, in memory by default: with an empty `InFolder` it may be larger than that. With `own_frames` cameras
+    may have different numbers of frames. Raises InputError, one sentence that names file, place and cure.
     """
     kept = InMemory() if kept is None else kept
     form, places, notes = find_places(Path(path), rig)
@@ -75,7 +79,7 @@ def read_detections(
         skeleton, how = _skeleton_of_streams(streams, wanted), "made between the two that one neighbour links"
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
     notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
-    table = assemble(streams, rig, skeleton, kept)
+    table = assemble(streams, rig, skeleton, kept, own_frames)
     return replace(table, notes=(*notes, *table.notes), first=first)
 
 

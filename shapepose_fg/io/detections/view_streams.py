@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,10 @@ class ViewCandidates:
         return self if keep.all() else ViewCandidates(self.frame[keep], self.seen.only(keep))
 
 
+_NONE = np.zeros(0, dtype=np.intp)
+_NOTHING = ViewCandidates.of(_NONE, _NONE, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), np.intp), np.zeros(0))
+
+
 @dataclass(frozen=True)
 class ViewStream:
     """All candidates that one camera saw in a recording, in blocks of `BLOCK_FRAMES` frames."""
@@ -60,14 +65,18 @@ class ViewStream:
     """Whose joints the candidates are, where the source says it."""
 
 
-def assemble(views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: KeptArrays) -> DetectionTable:
+def assemble(
+    views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: KeptArrays, own_frames: bool = False
+) -> DetectionTable:
     """Put the views of a recording together, one `ViewStream` per camera of `rig`, undistorted; held by `kept`.
 
-    Raises InputError where the views hold different numbers of frames or do not fit their pictures.
+    With `own_frames` cameras may have different numbers of frames: nobody is seen in those that one lacks. Raises
+    InputError where the views hold different frames otherwise, or do not fit their pictures.
     """
-    first = views[0]
-    for view in views[1:]:
-        if (view.frame_count, view.first_number) == (first.frame_count, first.first_number):
+    first = max(views, key=lambda view: view.frame_count)
+    for view in views:
+        same_count = view.frame_count == first.frame_count or own_frames
+        if same_count and view.first_number == first.first_number:
             continue
         for each in views:  # what is wrong with their files goes first
             for _ in each.blocks:
@@ -77,7 +86,7 @@ def assemble(views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: Ke
             what = f"starts at frame {view.first_number}", f"starts at frame {first.first_number}"
         raise InputError(f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of each")
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
-    for n, blocks in enumerate(zip(*(view.blocks for view in views), strict=True)):
+    for n, blocks in enumerate(zip_longest(*(view.blocks for view in views), fillvalue=_NOTHING)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
         stop = min((n + 1) * BLOCK_FRAMES, first.frame_count)
         keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
@@ -108,6 +117,34 @@ def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detection
     pairs = every.pairs[pair_order] - start[pair_frame - frames.start][:, None]
     every = replace(every, pairs=pairs, affinity=every.affinity[pair_order])
     return every, start, np.searchsorted(pair_frame, edges)
+
+
+def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> DetectionTable:
+    """The recording whose frame t is, of each view v, frame `picture` (T, V)[t, v] of the given one; -1 is none.
+
+    Held by `kept`.
+    """
+    count, views = picture.shape
+    for n, begin in enumerate(range(0, count, BLOCK_FRAMES)):
+        frames = range(begin, min(begin + BLOCK_FRAMES, count))
+        # One view after the other, each with its few blocks of the recording at hand.
+        seen = [_frames_of(recording, view, picture[frames, view], begin) for view in range(views)]
+        keep_block(kept, n, *_together(seen, frames))
+    return replace(recording, kept=kept, frame_count=count, first=0, picture=picture)
+
+
+def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int) -> ViewCandidates:
+    """What a view saw in some of its frames, as frames `begin` and on; -1 is none."""
+    there = np.flatnonzero(picture >= 0)
+    every = [recording[frame] for frame in picture[there].tolist()]
+    parts = [each.only(each.view == view) for each in every]
+    if len(parts) == 0:
+        return _NOTHING
+    start = np.cumsum([0, *(len(part) for part in parts)])
+    columns = ("joint", "xy", "confidence", "affinity")
+    joint, xy, confidence, affinity = (np.concatenate([getattr(part, name) for part in parts]) for name in columns)
+    pairs = np.concatenate([part.pairs + at for part, at in zip(parts, start[:-1], strict=True)])
+    return ViewCandidates.of(begin + np.repeat(there, np.diff(start)), joint, xy, confidence, pairs, affinity)
 
 
 class _LeftOut:

@@ -24,6 +24,7 @@ def pictures_of(
     videos: Sequence[str] | None = None,
     detections: Path | None = None,
     image_placement: Sequence[str] = (),
+    moments: Mapping[str, Index] | None = None,
     open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
     tell: Callable[[str], None] = print,
 ) -> list[tuple[CameraFootage, Footage]]:
@@ -31,8 +32,9 @@ def pictures_of(
 
     `run` is what the result's run.json says. They are in `videos`, as `find_footage` takes it, or where `detect`
     says in the folder `detections`, or beside what the result was made from. `image_placement` is how those of
-    another size than the calibration's came about, as `placements_of` takes it. `open_one` opens the pictures of a
-    camera, by its name; `tell` is given what was taken to be what.
+    another size than the calibration's came about, as `placements_of` takes it. `moments` are (T,) the frames of
+    each camera's own that the result's frames show, where these differ (`read_moments`). `open_one` opens the
+    pictures of a camera, by its name; `tell` is given what was taken to be what.
     """
     used = {each.name: each for each in _used_footage(run, detections)}
     unknown = [name for name in drawn if name not in used]
@@ -68,7 +70,7 @@ def pictures_of(
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
     placements, concluded = placements_of(image_placement, sizes, rig)
     notes += concluded
-    if len(unknown) > 0:
+    if len(unknown) > 0 and not moments:
         first = run.get("numbered_from")
         picture = "the first picture" if first is None else f"picture {first}"
         notes.append(
@@ -79,6 +81,8 @@ def pictures_of(
     pairs = []
     for name, footage in opened.items():
         index = used[name].places if name in used else _counted(footage, "numbered_from" in run)
+        if moments and name in moments:
+            index = np.append(index, -1)[np.minimum(moments[name], len(index))]
         index = np.where(index < len(footage.number), index, -1)
         pairs.append((CameraFootage(name, footage.path, (placements | alike)[name], index), footage))
     return pairs

@@ -103,6 +103,17 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     assert np.median(away) < 0.5
 
 
+def test_frames_that_are_other_frames_of_the_camera(filmed):
+    """The result's frame 1 is frame 3 of the camera; its frame 2 none, its frame 3 one that was not filmed."""
+    take = read_take(filmed)
+    assert take.rig is not None
+    moments = {"cam0": np.array([0, 3, -1, 5000, FIRST + 1])}
+    videos = [f"cam0={filmed / 'cam0'}"]
+    ((used, footage),) = pictures_of(take.people.run, take.rig, ["cam0"], videos, moments=moments, open_one=opened)
+    assert footage.number[used.places[[0, 1, 4]]].tolist() == [0, 3, FIRST + 1]
+    assert used.places[[2, 3]].tolist() == [-1, -1]
+
+
 def test_pictures_whose_numbers_are_no_frames_are_refused(filmed):
     take = read_take(filmed)
     assert take.rig is not None

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.footage.lockstep import CameraClock, align
+from shapepose_fg.core.moments import CameraClock, align
 
 
 def clock(name: str, fps: float, frames: int, start_s: float = 0.0) -> CameraClock:
@@ -63,6 +63,15 @@ def test_frame_rates_that_vary_are_followed_by_time():
     both = (moments.picture >= 0).all(axis=1)
     assert np.abs(np.diff(moments.time_s[both], axis=1)).max() <= 1 / 60 + 1e-3
     assert both.mean() > 0.9
+
+
+def test_a_picture_stands_for_one_moment():
+    """29.97 among 30 a second for 100 s: after 16.7 s a picture is as near to one moment as to the next."""
+    moments = align([clock("a", 30, 3000), clock("b", 30000 / 1001, 2997)], True)
+    used = moments.picture[moments.picture[:, 1] >= 0, 1]
+    assert len(moments) == 3000 and (np.diff(used) == 1).all() and len(used) == 2997
+    assert moments.time_s is not None and (np.diff(moments.time_s, axis=0) > 0).all()
+    assert np.ptp(moments.time_s, axis=1).max() < 1 / 59
 
 
 def test_cameras_without_a_moment_in_common_are_named():

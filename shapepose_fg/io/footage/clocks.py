@@ -1,0 +1,63 @@
+"""When each camera took its pictures: by the footage itself, or by what the user says."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.moments import CameraClock
+from shapepose_fg.io.footage.footage import Footage
+from shapepose_fg.io.footage.places import per_camera
+from shapepose_fg.io.validation import is_number
+
+
+def clocks_of(
+    footage: Sequence[Footage], fps: Sequence[str], start: Sequence[str], cameras: Sequence[str]
+) -> tuple[list[CameraClock], bool]:
+    """When each camera took its frames, and whether in seconds: without any rate frames are counted.
+
+    `fps` and `start` are options, as `per_camera` reads them.
+    """
+    rates = [typed_rate(text) for text in per_camera("--fps", fps, cameras, one_for_all=True)]
+    starts = per_camera("--start", start, cameras)
+    timed = [rate is not None or each.time_s is not None for rate, each in zip(rates, footage, strict=True)]
+    has_clock = any(timed)
+    if has_clock and not all(timed):
+        name = cameras[timed.index(False)]
+        raise InputError(f"camera {name}: pictures do not say when they were taken; give --fps {name}=RATE")
+    # Pictures of one number belong together: all are counted from the first number that any camera has.
+    first = min((each.number[0] for each in footage if each.time_s is None), default=0)
+    clocks = []
+    for name, each, rate, text in zip(cameras, footage, rates, starts, strict=True):
+        number = each.number - (first if each.time_s is None else 0)
+        if rate is not None:
+            taken, period = number / rate, 1 / rate
+        elif each.time_s is not None:
+            taken = each.time_s
+            period = float(np.median(np.diff(taken))) if len(taken) > 1 else 1 / 30
+        else:
+            taken, period = number.astype(np.float64), 1.0
+        clocks.append(CameraClock(name, taken + typed_start(text, period, has_clock), period))
+    return clocks, has_clock
+
+
+def typed_rate(text: str | None) -> float | None:
+    """Frames a second."""
+    if text is None:
+        return None
+    if not is_number(text) or not 0.01 <= float(text) <= 1e5:
+        raise InputError(f"--fps {text}: must be a number of frames a second, such as 25")
+    return float(text)
+
+
+def typed_start(text: str | None, period: float, has_clock: bool) -> float:
+    """When a camera's first frame was taken, in seconds, or in frames where there is no clock."""
+    if text is None:
+        return 0.0
+    match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())
+    if match is None:
+        raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
+    if match[2] == "s" and not has_clock:
+        raise InputError(f"--start {text}: nothing says how many frames a second there are; give --fps, or 12f")
+    return float(match[1]) * (1.0 if match[2] == "s" else period)

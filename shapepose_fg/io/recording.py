@@ -1,0 +1,78 @@
+"""A recording as it is reconstructed: what all cameras saw at the same moments, and when these were."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.core.storage.kept_arrays import InFolder
+from shapepose_fg.io.detection_table import DetectionTable
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.detections.view_streams import in_moments
+from shapepose_fg.io.timestamps import read_timestamps
+
+_MOST_BYTES = 2**28
+TIMES = "times.csv"
+"""The times of detections, beside them."""
+
+
+def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -> Path | None:
+    """The file with the times of the frames: the one that is given, or without a rate the one beside; or none."""
+    if fps is not None and timestamps is not None:
+        raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
+    beside = detections / TIMES
+    return timestamps or (beside if fps is None and beside.is_file() else None)
+
+
+def read_recording(
+    detections: Path,
+    rig: Rig,
+    skeleton: Skeleton | str | Path | None,
+    kept: Path,
+    fps: float | None = None,
+    timestamps: Path | None = None,
+) -> tuple[DetectionTable, FrameTimes | None]:
+    """What the cameras saw, in the empty folder `kept`, and the times of its frames; None where nothing says them.
+
+    `timestamps` is a file that `read_timestamps` reads, times.csv beside the detections by default. Cameras that
+    began at other times, or run at other rates, are put together by it: frames are moments then.
+    InputError, one sentence that names file, place and cure.
+    """
+    file = times_beside(detections, fps, timestamps)
+    recording = read_detections(detections, rig, skeleton, InFolder(kept), own_frames=file is not None)
+    count = len(recording)
+    if file is None:
+        return recording, None if fps is None else FrameTimes.from_fps(fps, count)
+    times, moments = read_timestamps(file, rig, count)
+    if moments is None:
+        return recording, times
+    together = in_moments(recording, moments.picture, InFolder(kept / "moments"))
+    what = f"{file}: pictures of the same times are put together: {len(moments)} frames"
+    return replace(together, notes=(*recording.notes, what, *moments.notes)), times
+
+
+def write_moments(file: Path, rig: Rig, picture: Index) -> None:
+    """Write which picture `picture` (T, V) of its own each camera shows in each frame, -1 for none."""
+    rows = [", ".join(["frame", *rig.names])]
+    rows += [", ".join(map(str, [frame, *row])) for frame, row in enumerate(picture.tolist())]
+    write_content(file, "\n".join(rows) + "\n")
+
+
+def read_moments(file: Path) -> dict[str, Index]:
+    """What `write_moments` wrote: (T,) pictures by the camera's name; InputError on anything else."""
+    lines = [re.split(r",\s*", line) for line in read_text(file, most=_MOST_BYTES).splitlines()]
+    names, *rows = lines if len(lines) > 0 else [[""]]
+    try:
+        numbers = np.array(rows, dtype=np.intp).reshape(len(rows), len(names))
+    except ValueError:
+        raise InputError(f"{file}: not whole numbers, as many in each line; reconstruct again") from None
+    if names[0] != "frame" or (numbers[:, 0] != np.arange(len(rows))).any() or (numbers[:, 1:] < -1).any():
+        raise InputError(f"{file}: not a line for each frame from 0 on; reconstruct again")
+    return dict(zip(names[1:], numbers.T[1:], strict=True))
