@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from shapepose_fg.core.camera import Lens
+from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import LARGE, read_text
 from shapepose_fg.io.calibration.content import Content

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from shapepose_fg.core.camera import Axis, Lens, Rig
+from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, Node, Unit, WrittenCamera, WrittenRig, intrinsics

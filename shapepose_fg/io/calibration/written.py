@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
+from shapepose_fg.core.camera import Axis, Camera
+from shapepose_fg.core.lens import Lens, padded_distortion
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.validation import describe
