@@ -29,7 +29,7 @@ def check_calibration(
     from shapepose_fg.setup_check.report import check_setup
     from shapepose_fg.setup_check.table import setup_report
 
-    rig = seen.rig()
+    rig = seen.still_rig("check-calibration")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
         note(*recording.notes)

@@ -291,7 +291,7 @@ class Views:
 
     @classmethod
     def of(cls, rig: Rig, time_s: Array | None = None) -> "Views":
-        """The cameras of a rig; of one that moves at `time_s` (N, V), seconds, when each view of each row was taken.
+        """The cameras of a rig; of one that moves at `time_s` (N, V), seconds, the times of each row's views.
 
         ValueError where cameras move and no times are given.
         """

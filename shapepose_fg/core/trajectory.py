@@ -45,7 +45,9 @@ class Trajectory:
 
         time_s, wTb = np.asarray(self.time_s, dtype=np.float64), np.asarray(self.wTb, dtype=np.float64)
         if len(time_s) < 2 or time_s.ndim != 1 or wTb.shape != (len(time_s), 4, 4):
-            raise refuse(f"time_s must be (F,) and wTb (F, 4, 4), F at least 2, got {time_s.shape} and {wTb.shape}")
+            raise refuse(
+                f"time_s must be (F,) and wTb (F, 4, 4), F at least 2, got {time_s.shape} and {wTb.shape}"
+            )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
         if (np.diff(time_s) <= 0).any():
@@ -75,12 +77,14 @@ class Trajectory:
         return np.asarray((time_s >= self.time_s[0]) & (time_s <= self.time_s[-1]) & near)
 
     def at(self, time_s: Array) -> Array:
-        """(..., 4, 4) poses at times (...,): places on straight lines, turns about one axis; the first before it."""
-        from scipy.spatial.transform import Rotation, Slerp
+        """(..., 4, 4) poses at times (...,): places on straight lines, turns about one axis; ends stay."""
+        from scipy.spatial.transform import Rotation
 
-        flat = np.clip(np.ravel(time_s), self.time_s[0], self.time_s[-1])
-        pose = np.tile(np.eye(4), (len(flat), 1, 1))
-        pose[:, :3, :3] = Slerp(self.time_s, Rotation.from_matrix(self.wTb[:, :3, :3]))(flat).as_matrix()
+        flat, pose = np.ravel(time_s), np.tile(np.eye(4), (np.size(time_s), 1, 1))
+        before, part = self._place(flat)
+        R, last = self.wTb[before, :3, :3], self.wTb[before + 1, :3, :3]
+        turn = part[:, None] * Rotation.from_matrix(R.mT @ last).as_rotvec()
+        pose[:, :3, :3] = R @ Rotation.from_rotvec(turn).as_matrix()
         pose[:, :3, 3] = self._between(self.wTb[:, :3, 3], flat)
         return pose.reshape(*np.shape(time_s), 4, 4)
 
@@ -105,11 +109,16 @@ class Trajectory:
         return way[:, None, None] * np.diag(sigmas**2)
 
     def _between(self, values: Array, time_s: Array) -> Array:
-        """(M, ...) of `values` (F, ...) at times (M,), on straight lines; the first before it, the last after it."""
-        after = np.clip(np.searchsorted(self.time_s, time_s), 1, len(self) - 1)
-        first, last = self.time_s[after - 1], self.time_s[after]
-        part = np.clip((time_s - first) / (last - first), 0.0, 1.0).reshape(-1, *[1] * (values.ndim - 1))
-        return (1 - part) * values[after - 1] + part * values[after]
+        """(M, ...) of `values` (F, ...) at times (M,), on straight lines; ends stay."""
+        before, part = self._place(time_s)
+        part = part.reshape(-1, *[1] * (values.ndim - 1))
+        return (1 - part) * values[before] + part * values[before + 1]
+
+    def _place(self, time_s: Array) -> tuple[Index, Array]:
+        """(M,) the pose before each of the times (M,), and how far each is on the way to the next, 0 to 1."""
+        before = np.clip(np.searchsorted(self.time_s, time_s) - 1, 0, len(self) - 2)
+        first, last = self.time_s[before], self.time_s[before + 1]
+        return before, np.clip((time_s - first) / (last - first), 0.0, 1.0)
 
 
 @dataclass(frozen=True)

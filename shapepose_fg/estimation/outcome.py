@@ -55,7 +55,9 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     final = linearise(carried, state.sigmas, X, state.views, state.config.observations)
     covariance = _calibrated(state, X, covariance, final)
     if state.views.carried is not None:
-        covariance += carried_covariance(final, state.of_body, state.sigmas, state.views, state.config.observations)
+        covariance += carried_covariance(
+            final, state.of_body, state.sigmas, state.views, state.config.observations
+        )
     reported = strong(state)
     hiding = limbs_that_hide(state.config.joints)
     elsewhere = elsewhere_variance(X, rows.frame, reported, state.views, hiding)

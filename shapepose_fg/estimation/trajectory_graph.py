@@ -39,8 +39,8 @@ _WEAKEST_M = 0.15
 """A joint that its views place worse than this, in its worst direction, says nothing of cameras."""
 _SAME_PERSON = 2.5
 """Joints of one person in one view err together: what so many say is one."""
-_ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
-"""Shares of a detector's errors, and how long each lasts, seconds; both as in `calibration/refinement.py`."""
+_ERRORS = ((0.45, 3.5), (0.25, 0.25))
+"""Shares of a detector's errors that last, and how long, seconds; all as in `calibration/refinement.py`."""
 _AVERAGED_S = 1.0
 """So long an odometry of 1 % is better than what people say of a pose: over this, errors would average out."""
 _NEW_S = 3.0
@@ -54,7 +54,8 @@ _LEAST = np.diag([1e-6**2] * 3 + [1e-5**2] * 3)
 def dilution(step_s: float) -> float:
     """How many of the errors of one detection, of joints and of frames `step_s` apart, are one error."""
     lags = np.arange(1, max(int(_AVERAGED_S / step_s), 1) + 1) * step_s
-    return _SAME_PERSON * (1 + 2 * sum(share * np.exp(-lags / lasts).sum() for share, lasts in _ERRORS if lasts > 0))
+    lasting = sum(share * np.exp(-lags / lasts).sum() for share, lasts in _ERRORS)
+    return float(_SAME_PERSON * (1 + 2 * lasting))
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Mounted:
     odometry: Array = field(init=False)
     """(T, B, 4, 4) world from carrier at the frames' times, as given."""
     sensors: Array = field(init=False)
-    """(T, V, 4, 4) from the carrier, at its frame's time, to the camera at its own; unit of one that stands still."""
+    """(T, V, 4, 4) from carrier, at its frame's time, to camera, at its own; unit where a camera stands still."""
 
     def __post_init__(self) -> None:
         rig, middle = self.rig, self.time_s.mean(axis=1)
@@ -99,8 +100,12 @@ class Mounted:
         return odometry_factors(self.keys()[:, carrier], poses, covariances)
 
     def known(self, carrier: int) -> list[gtsam.NonlinearFactor]:
-        """What is known of one carrier's poses beforehand: where it starts; where SLAM has it, every few seconds."""
-        trajectory, keys, middle = self.rig.trajectories[carrier], self.keys()[:, carrier], self.time_s.mean(axis=1)
+        """What is known of one carrier's poses: where it starts; where SLAM has it, every few seconds."""
+        trajectory, keys, middle = (
+            self.rig.trajectories[carrier],
+            self.keys()[:, carrier],
+            self.time_s.mean(axis=1),
+        )
         covariance, at = trajectory.start_covariance(), [0]
         if carrier == 0 and (self.rig.carrier >= 0).all() and trajectory.covariance is None:
             covariance = _GAUGE
@@ -110,7 +115,9 @@ class Mounted:
             covariances = trajectory.covariance_at(middle)
         poses = self.odometry[:, carrier]
         return [
-            gtsam.PriorFactorPose3(int(keys[n]), gtsam.Pose3(poses[n]), gaussian(symmetric(covariances[n]) + _LEAST))
+            gtsam.PriorFactorPose3(
+                int(keys[n]), gtsam.Pose3(poses[n]), gaussian(symmetric(covariances[n]) + _LEAST)
+            )
             for n in at
         ]
 
@@ -177,7 +184,9 @@ class TrajectoryGraph:
         for key, pose in zip(self.keys.ravel().tolist(), self.poses.reshape(-1, 4, 4), strict=True):
             here.insert(key, gtsam.Pose3(pose))
         factors = (rest.at(n) for n in range(rest.size()))
-        return [gtsam.LinearContainerFactor(each, here) for each in factors if each is not None and each.size() > 0]
+        return [
+            gtsam.LinearContainerFactor(each, here) for each in factors if each is not None and each.size() > 0
+        ]
 
     def _build(self, reach_m: float) -> list[int]:
         """Make graph and values around the present poses; returns the keys of the joints that are in it."""

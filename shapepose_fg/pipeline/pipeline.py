@@ -32,7 +32,7 @@ from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.setup import find_people as find_people
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
-from shapepose_fg.pipeline.trajectories import keep, kept_rig, refine, unrefined
+from shapepose_fg.pipeline.trajectories import about, keep, kept_rig, refine, unrefined
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.presence import probability
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
@@ -101,7 +101,7 @@ def refine_trajectories(
 ) -> Rig:
     """The rig with its trajectories as the people have them that its cameras see, covariances in them.
 
-    What `reconstruct` does first where cameras move; with the rig that this returns it takes the poses as they are.
+    What `reconstruct` does first where cameras move; with the rig that this returns it takes poses as they are.
     People tell of a pose where two cameras see them that do not move together; elsewhere the odometry goes on.
     Where no camera stands still the world is that in which the first carrier starts. `camera_factors` are your own
     on poses. Poses of frames that stand alone (`config.temporal` false) are taken as they are.
@@ -204,6 +204,8 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         notes.add(each)
     more = {"time": times.as_dict(), "cuts": cuts}
     more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}
+    if rig.moves:
+        more |= {"trajectories": about(rig, setup.rig)}
     more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return result.with_run(**_summary(notes, config, frames, result), **more)
 

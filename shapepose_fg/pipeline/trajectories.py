@@ -7,6 +7,7 @@ window's people stand as what they say of the poses.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -33,7 +34,9 @@ def unrefined(rig: Rig) -> bool:
 
 
 def kept_rig(kept: KeptArrays, rig: Rig) -> Rig | None:
-    """The rig with the trajectories that a run has kept; None where it has none yet."""
+    """The rig with the trajectories that a run has kept; None where it has none yet, or needs none."""
+    if not rig.moves:
+        return None
     found = []
     for number, trajectory in enumerate(rig.trajectories):
         name = f"{_KEPT}-{number}"
@@ -73,6 +76,30 @@ def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) 
         for n, trajectory in enumerate(rig.trajectories)
     ]
     return replace(rig, trajectories=tuple(refined))
+
+
+def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
+    """What run.json says of trajectories: cameras, way, how far people corrected them, how sure they are."""
+    told = []
+    for number, (old, new) in enumerate(zip(given.trajectories, refined.trajectories, strict=True)):
+        cameras = [name for name, on in zip(given.names, given.carrier, strict=True) if on == number]
+        was, covariance = old.at(new.time_s), new.covariance_at(new.time_s)
+        moved = np.linalg.norm(new.wTb[:, :3, 3] - was[:, :3, 3], axis=1)
+        cosine = (np.trace(new.wTb[:, :3, :3] @ was[:, :3, :3].mT, axis1=1, axis2=2) - 1) / 2
+        variance = np.einsum("tii->ti", covariance)
+        told.append(
+            {
+                "carrier": new.name,
+                "cameras": cameras,
+                "refined": new.refined,
+                "way_m": round(float(np.linalg.norm(np.diff(new.wTb[:, :3, 3], axis=0), axis=1).sum()), 3),
+                "moved_mm": round(1e3 * float(moved.max()), 1),
+                "turned_deg": round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).max())), 3),
+                "sigma_mm": round(1e3 * float(np.sqrt(np.median(variance[:, 3:].mean(axis=1)))), 1),
+                "sigma_deg": round(float(np.degrees(np.sqrt(np.median(variance[:, :3].mean(axis=1))))), 3),
+            }
+        )
+    return told
 
 
 @dataclass
