@@ -73,7 +73,7 @@ class Trajectory:
     def covers(self, time_s: Array) -> Mask:
         """(...,) which times lie between two poses that are near enough to each other."""
         after = np.clip(np.searchsorted(self.time_s, time_s), 1, len(self) - 1)
-        near = np.diff(self.time_s)[after - 1] <= LONGEST_GAP_S
+        near = (np.diff(self.time_s)[after - 1] <= LONGEST_GAP_S) | (self.time_s[after] == time_s)
         return np.asarray((time_s >= self.time_s[0]) & (time_s <= self.time_s[-1]) & near)
 
     def at(self, time_s: Array) -> Array:
