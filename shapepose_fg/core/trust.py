@@ -62,8 +62,15 @@ def without_poses(rig: Rig, times: FrameTimes) -> tuple[Spell, ...]:
 
 
 def with_poses(detections: DetectionSequence, rig: Rig, times: FrameTimes) -> DetectionSequence:
-    """The recording without the pictures of cameras that have no pose then."""
+    """The recording without the pictures of cameras that have no pose then; ValueError where one never has."""
     spells, trust = without_poses(rig, times), trust_in(detections)
+    for view, first, last in spells:
+        if last - first == len(times):
+            path = rig.trajectories[int(rig.carrier[view])]
+            runs = f"{path.name} runs from {path.time_s[0]:.10g} to {path.time_s[-1]:.10g} s"
+            raise ValueError(
+                f"camera {rig.names[view]} has no pose at any picture: {runs}; give times of its clock"
+            )
     if len(spells) == 0:
         return detections
     frames = detections.frames if isinstance(detections, Trusted) else detections

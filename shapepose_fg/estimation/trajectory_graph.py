@@ -18,6 +18,7 @@ from factors import (
     DEFAULT_WIDTH_SIGMA,
     camera_keys,
     gaussian,
+    isotropic,
     joint_keys,
     make_calibration,
     make_camera,
@@ -45,6 +46,8 @@ _AVERAGED_S = 1.0
 """So long an odometry of 1 % is better than what people say of a pose: over this, errors would average out."""
 _NEW_S = 3.0
 """Errors of poses that SLAM gives are taken to be new after this time: one of them counts in so long."""
+_ANYWHERE_M = 10.0
+"""Joints are about there: without it one that ends behind its cameras would make the system singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
 """Where no camera stands still, the world is that in which the first carrier starts."""
 _LEAST = np.diag([1e-6**2] * 3 + [1e-5**2] * 3)
@@ -214,6 +217,8 @@ class TrajectoryGraph:
         there = chosen.any(axis=2)
         joints = self._joint_keys[there].tolist()
         deque(map(self.values.insert, joints, points[there]), maxlen=0)
+        near = isotropic(3, _ANYWHERE_M)
+        deque(map(self.graph.addPriorPoint3, joints, points[there], [near] * len(joints)), maxlen=0)
         for factor in self._own(self, self.keys) if self._own is not None else ():
             self.graph.add(factor)
         return joints

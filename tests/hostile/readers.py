@@ -32,6 +32,7 @@ from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps
+from shapepose_fg.io.trajectories import POSE, read_trajectory
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
@@ -123,6 +124,18 @@ def _times(folder: Path, seed: int) -> Read:
     )
     rig = _rig(seed, 2)
     return lambda: read_timestamps(folder / "times.csv", rig, 9)
+
+
+def _trajectory(folder: Path, seed: int) -> Read:
+    rng, count = np.random.default_rng(seed), 9
+    turn = rng.normal(size=(count, 4))
+    pose = np.column_stack(
+        [np.arange(count) / 25, rng.normal(size=(count, 3)), turn / np.linalg.norm(turn, axis=1)[:, None]]
+    )
+    names = [*POSE, *(f"{each}_{each}" for each in ("rx", "ry", "rz", "x", "y", "z"))]
+    lines = [" ".join(names), *(" ".join(map(repr, [*row, *[0.01] * 6])) for row in pose.tolist())]
+    (folder / "robot.csv").write_text("\n".join(lines) + "\n")
+    return lambda: read_trajectory(folder / "robot.csv")
 
 
 def _project(folder: Path, seed: int) -> Read:
@@ -320,6 +333,7 @@ READERS: dict[str, Prepare] = {
     "skeleton": _skeleton,
     "settings": _settings,
     "times": _times,
+    "trajectory": _trajectory,
     "project of Pose2Sim": _project,
     "recordings": _recordings,
     "batch": _batch,

@@ -12,9 +12,11 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import reconstruct, refine_trajectories
+from shapepose_fg.pipeline.trajectories import keep, kept_rig, unrefined
 from shapepose_fg.simulation.scene import UP, look_at
 from tests.conftest import STANDING, detect_exactly
 
@@ -209,6 +211,23 @@ def test_factors_of_your_own_on_poses_count(drifted):
 
     rig = refine_trajectories(drifted.recording, drifted.rig, times=TIMES, camera_factors=surveyed)
     assert np.linalg.norm(camera_error(drifted, rig)[30, 3:]) < 0.004
+
+
+def test_a_run_keeps_its_trajectories(refined):
+    kept = InMemory()
+    assert kept_rig(kept, refined) is None
+    keep(kept, refined)
+    again = kept_rig(kept, refined)
+    assert again is not None and not unrefined(again)
+    np.testing.assert_array_equal(again.trajectories[0].wTb, refined.trajectories[0].wTb)
+    np.testing.assert_array_equal(again.trajectories[0].covariance, refined.trajectories[0].covariance)
+
+
+def test_a_trajectory_of_another_clock_is_refused(drifted):
+    path = drifted.rig.trajectories[0]
+    rig = replace(drifted.rig, trajectories=(replace(path, time_s=path.time_s + 1.7e9),))
+    with pytest.raises(ValueError, match="camera cam2 has no pose at any picture: robot runs from 17000000"):
+        refine_trajectories(drifted.recording, rig, times=TIMES)
 
 
 def test_pictures_outside_the_trajectory_are_not_used(drifted):
