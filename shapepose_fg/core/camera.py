@@ -300,7 +300,7 @@ class Views:
             return cls(rig.K, rig.cTw, rig.image_sizes, readout_s)
         if time_s is None:
             raise ValueError("cameras that move have poses at times only: give time_s, or `Rig.at` a moment")
-        cTw = np.ascontiguousarray(np.linalg.inv(rig.poses(time_s))[..., :3, :])
+        cTw = np.ascontiguousarray(np.linalg.inv(rig.poses(time_s))[..., :3, :], dtype=np.float64)
         carried = Carried.of(rig.trajectories, rig.carrier, time_s.mean(axis=1))
         return cls(rig.K, cTw, rig.image_sizes, readout_s, carried)
 

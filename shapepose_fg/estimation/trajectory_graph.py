@@ -94,7 +94,8 @@ class Mounted:
         on, wTc = self.rig.carrier, np.stack([camera.wTc for camera in self.rig.cameras])
         wTc = np.tile(wTc, (len(at), 1, 1, 1))
         wTc[:, on >= 0] = poses[at][:, on[on >= 0]] @ self.sensors[at][:, on >= 0]
-        return Views(self.rig.K, np.ascontiguousarray(np.linalg.inv(wTc)[..., :3, :]), self.rig.image_sizes)
+        cTw = np.ascontiguousarray(np.linalg.inv(wTc)[..., :3, :], dtype=np.float64)
+        return Views(self.rig.K, cTw, self.rig.image_sizes)
 
     def steps(self, carrier: int) -> list[gtsam.NonlinearFactor]:
         """The odometry of one carrier, frame by frame."""
@@ -239,7 +240,7 @@ class TrajectoryGraph:
         with np.errstate(invalid="ignore"):
             chosen = rows.seen & (away_m < reach_m) & (evidence.sigma_m < _WEAKEST_M)[..., None]
         on = self.mounted.rig.carrier
-        groups = sum((chosen[..., on == each].any(axis=-1)).astype(int) for each in np.unique(on).tolist())
+        groups = np.sum([chosen[..., on == each].any(axis=-1) for each in np.unique(on).tolist()], axis=0)
         return chosen & (groups >= 2)[..., None], evidence.target, sigmas
 
 

@@ -51,7 +51,10 @@ def kept_rig(kept: KeptArrays, rig: Rig) -> Rig | None:
 def keep(kept: KeptArrays, rig: Rig) -> None:
     """What `kept_rig` gives."""
     for number, each in enumerate(rig.trajectories):
-        kept.keep(f"{_KEPT}-{number}", {"time_s": each.time_s, "wTb": each.wTb, "covariance": each.covariance})
+        kept.keep(
+            f"{_KEPT}-{number}",
+            {"time_s": each.time_s, "wTb": each.wTb, "covariance": each.covariance_at(each.time_s)},
+        )
 
 
 def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) -> Rig:
