@@ -24,6 +24,8 @@ from shapepose_fg.estimation.trajectory_graph import CameraFactors, Mounted, Tra
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import Span
 
+_SAME_S = 1e-4
+"""Poses nearer to a frame than this are not kept beside the frame's own."""
 _KEPT = "trajectories"
 """The name under which a run keeps them, and the number of each behind it."""
 
@@ -214,7 +216,10 @@ def _refined(given: Trajectory, time_s: Array, poses: Array, odometry: Array, co
     middle = time_s.mean(axis=1)
     first, last = np.searchsorted(given.time_s, [time_s.min(), time_s.max()])
     own = given.time_s[max(first - 1, 0) : last + 1]
-    times = np.unique(np.concatenate([own, middle]))
+    # What is as good as at a frame is the frame's.
+    place = np.clip(np.searchsorted(middle, own), 1, len(middle) - 1)
+    near = np.minimum(np.abs(middle[place] - own), np.abs(middle[place - 1] - own)) < _SAME_S
+    times = np.sort(np.concatenate([own[~near], middle]))
     correction = Trajectory(given.name, middle, poses @ np.linalg.inv(odometry))
     surely = Trajectory(given.name, middle, poses, covariance).covariance_at(times)
     return replace(

@@ -83,14 +83,14 @@ def rig() -> Rig:
 def test_a_rig_file_and_its_trajectories_come_back(tmp_path, rig):
     write_rig(rig, tmp_path / "rig.json")
     back = read_rig(tmp_path / "rig.json")
-    assert [each.carrier for each in back.cameras] == ["", "", *["trajectories/0-robot.csv"] * 2]
+    assert [each.carrier for each in back.cameras] == ["", "", *["trajectories/robot.csv"] * 2]
     (was,), (now,) = rig.trajectories, back.trajectories
     assert now.refined and now.drift == was.drift
     np.testing.assert_allclose(now.wTb, was.wTb, atol=1e-12)
     np.testing.assert_allclose(now.covariance, was.covariance, rtol=1e-12)
     time_s = np.full(4, 0.15)
     np.testing.assert_allclose(back.at(time_s).cTw, rig.at(time_s).cTw, atol=1e-12)
-    as_tum = read_trajectory(tmp_path / "trajectories" / "0-robot.tum")
+    as_tum = read_trajectory(tmp_path / "trajectories" / "robot.tum")
     np.testing.assert_allclose(as_tum.wTb, was.wTb, atol=1e-12)
 
 
@@ -98,7 +98,7 @@ def test_an_odometry_that_starts_at_zero_is_put_into_the_world(tmp_path, rig):
     write_rig(rig, tmp_path / "rig.json")
     content = json.loads((tmp_path / "rig.json").read_text())
     wTo = [[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 0], [0, 0, 0, 1]]
-    content["trajectories"]["trajectories/0-robot.csv"]["wTo"] = wTo
+    content["trajectories"]["trajectories/robot.csv"]["wTo"] = wTo
     (tmp_path / "rig.json").write_text(json.dumps(content))
     moved = read_rig(tmp_path / "rig.json").trajectories[0]
     np.testing.assert_allclose(moved.wTb, np.array(wTo) @ rig.trajectories[0].wTb, atol=1e-12)

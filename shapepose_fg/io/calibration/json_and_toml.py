@@ -48,7 +48,11 @@ def write_rig(rig: Rig, path: str | Path) -> None:
 
     Trajectories go into the folder `trajectories` beside it, as CSV with covariances and as TUM's text.
     """
-    files = {each.name: f"trajectories/{n}-{Path(each.name).stem}.csv" for n, each in enumerate(rig.trajectories)}
+    stems = [Path(each.name).stem for each in rig.trajectories]
+    files = {
+        each.name: f"trajectories/{stem if stems.count(stem) == 1 else f'{n}-{stem}'}.csv"
+        for n, (each, stem) in enumerate(zip(rig.trajectories, stems, strict=True))
+    }
     cameras = [
         {
             "name": camera.name,
