@@ -11,6 +11,7 @@ from factors.keys import (
     CameraKey,
     JointKey,
     camera_key,
+    camera_keys,
     format_key,
     joint_key,
     joint_keys,
@@ -47,6 +48,7 @@ from factors.noise import (
     robust_kernel,
     sigma_px,
 )
+from factors.odometry import odometry_factors
 from factors.pinhole import project_with_jacobian, to_pixels
 from factors.projection import (
     in_front,
@@ -55,6 +57,7 @@ from factors.projection import (
     make_camera,
     moving_projection_factors,
     posed_projection_factor,
+    posed_projection_factors,
     projection_factor,
     projection_factors,
 )
@@ -77,6 +80,7 @@ __all__ = [
     "body_prior_factor",
     "body_prior_factors",
     "camera_key",
+    "camera_keys",
     "determined",
     "diagonal",
     "format_key",
@@ -98,10 +102,12 @@ __all__ = [
     "motion_covariance",
     "motion_factors",
     "moving_projection_factors",
+    "odometry_factors",
     "offset_factors",
     "offset_key",
     "offset_keys",
     "posed_projection_factor",
+    "posed_projection_factors",
     "project_with_jacobian",
     "projection_factor",
     "projection_factors",

@@ -70,8 +70,15 @@ def offset_key(person: int, joint: int, frame: int = 0, source: int = 0) -> int:
 
 
 def camera_key(view: int, frame: int = 0) -> int:
-    """Key of the pose (`Pose3`, world from camera) of a camera; frame 0 for one that stands still."""
+    """Key of the pose (`Pose3`, world from camera) of a camera, or of what carries several; frame 0 for one that
+    stands still.
+    """
     return int(_pack(_CAMERA, view, 0, frame))
+
+
+def camera_keys(view: int, frames: ArrayLike) -> NDArray[np.int64]:
+    """`camera_key` for an array of `frames`."""
+    return _pack(_CAMERA, view, 0, frames)
 
 
 def joint_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:

@@ -143,6 +143,33 @@ def posed_projection_factor(
     return gtsam.GenericProjectionFactorCal3_S2(_pixel(uv), model, pose_key, key, calibration, body_T_sensor)
 
 
+def posed_projection_factors(
+    calibrations: Sequence[gtsam.Cal3_S2],
+    view: ArrayLike,
+    pose_keys: ArrayLike,
+    sensors: Sequence[gtsam.Pose3],
+    keys: ArrayLike,
+    xy: ArrayLike,
+    sigmas_px: ArrayLike,
+    kernel: Kernel | None = None,
+) -> list[gtsam.NoiseModelFactor]:
+    """`posed_projection_factor` for arrays of D observations.
+
+    Observation d: the camera `sensors[d]`, carrier from camera, on the carrier `pose_keys[d]`, with the lens
+    `calibrations[view[d]]`, sees the joint `keys[d]` at `xy[d]` (D, 2) to within `sigmas_px[d]`.
+    """
+    points, chosen = np.asarray(xy, dtype=np.float64), np.asarray(view)
+    poses, joints, count = np.asarray(pose_keys), np.asarray(keys), len(points)
+    shapes = [each.shape for each in (chosen, poses, joints)]
+    if points.shape != (count, 2) or shapes != [(count,)] * 3 or not len(sensors) == np.size(sigmas_px) == count:
+        raise ValueError(f"view, pose_keys and keys must be (D,), xy (D, 2), got {shapes} and {points.shape}")
+    if not np.isfinite(points).all():
+        raise ValueError("xy holds a value that is not finite: drop unseen joints first")
+    models, lenses = isotropic_models(2, sigmas_px, kernel), [calibrations[each] for each in chosen.tolist()]
+    given = points, models, poses.tolist(), joints.tolist(), lenses, sensors
+    return list(map(gtsam.GenericProjectionFactorCal3_S2, *given))
+
+
 def in_front(depth_m: ArrayLike, min_depth_m: float = 0.1) -> NDArray[np.bool_]:
     """Which depths (...,) along the optical axis are at least `min_depth_m`; NaN is not."""
     return np.asarray(depth_m, dtype=np.float64) >= min_depth_m

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from shapepose_fg.pipeline.execution import Execution as Execution
     from shapepose_fg.pipeline.pipeline import PipelineConfig as PipelineConfig
     from shapepose_fg.pipeline.pipeline import reconstruct as reconstruct
+    from shapepose_fg.pipeline.pipeline import refine_trajectories as refine_trajectories
 
 _HOMES = {
     "Execution": "shapepose_fg.pipeline.execution",
@@ -32,6 +33,7 @@ _HOMES = {
     "read_detections": "shapepose_fg.io.detections",
     "read_rig": "shapepose_fg.io.calibration",
     "reconstruct": "shapepose_fg.pipeline.pipeline",
+    "refine_trajectories": "shapepose_fg.pipeline.pipeline",
     "write_rig": "shapepose_fg.io.calibration",
 }
 """Where each public name lives. It is imported when it is asked for, so that this import loads no torch."""

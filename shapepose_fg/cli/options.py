@@ -163,6 +163,15 @@ class DetectionOptions(CameraOptions):
             raise InputError(f"{self.calibration}: at least 2 cameras are needed to see depth, got {len(found)}")
         return found
 
+    def still_rig(self, what: str) -> "Rig":
+        """The cameras, for `what` is for cameras that stand still only; InputError where one moves."""
+        found = self.rig()
+        moving = next((camera.name for camera in found.cameras if camera.carrier), None)
+        if moving is not None:
+            cure = "leave it out of the calibration; reconstruct refines trajectories by itself"
+            raise InputError(f"{self.calibration}: camera {moving} moves, and {what} is for fixed cameras; {cure}")
+        return found
+
 
 @dataclass(frozen=True, kw_only=True)
 class TimeOptions:

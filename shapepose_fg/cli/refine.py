@@ -69,7 +69,7 @@ def refine_calibration(
         raise InputError("--off-degrees must be above 0, up to 20, and --off-cm above 0, up to 200")
     if may.stature is not None and not 0.5 <= may.stature <= 2.5:
         raise InputError(f"--stature {may.stature:g}: must be 0.5 to 2.5 metres")
-    rig = seen.rig()
+    rig = seen.still_rig("refine-calibration")
     if may.reference is not None and may.reference not in rig.names:
         raise InputError(f"--reference {may.reference}: no such camera; give one of {' '.join(rig.names)}")
     bent = [camera.name for camera in rig.cameras if camera.lens == "fisheye" or camera.distortion[4:].any()]

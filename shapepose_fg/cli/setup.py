@@ -35,7 +35,7 @@ def check_calibration(
     from shapepose_fg.setup_check.report import check_setup
     from shapepose_fg.setup_check.table import setup_report
 
-    rig = seen.rig()
+    rig = seen.still_rig("check-calibration")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording, _ = rate.read(seen, rig, Path(folder))
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)

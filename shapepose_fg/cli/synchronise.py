@@ -53,7 +53,7 @@ def synchronise(
     check_fps(fps)
     if not 0 < most <= 600:
         raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
-    rig = seen.rig()
+    rig = seen.still_rig("synchronise")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)), True)
         note(*recording.notes)

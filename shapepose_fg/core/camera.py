@@ -1,35 +1,28 @@
 """Where cameras stand and what they see: pinhole cameras in the world, a rig of them, their views over time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import PurePath
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
 from shapepose_fg.core.arrays import Array, Index, Real
+from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
+from shapepose_fg.core.trajectory import Carried, Trajectory
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
-
-Lens = Literal["perspective", "fisheye"]
-"""OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant fisheye."""
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST_PIXELS, _MOST_METRES, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 1e6, 200
 """No picture, room, lens or name is as large; what is computed of larger numbers overflows."""
 _ROTATION_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
-_COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
-"""How many coefficients OpenCV's functions take for each kind of lens."""
 LONGEST_READOUT_S = 0.1
 """Rolling shutters take 5 to 30 ms."""
-_UNDONE_PX = 0.5
-"""A point that comes back farther than this from where it was has no place without distortion: the polynomial of
-the lens does not reach it. Where there is one, OpenCV's iteration ends within 1e-6 px of it."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +45,19 @@ class Camera:
     readout_s: float = 0.0
     """How long a rolling shutter takes from the first row of a picture to the last, seconds; times of pictures are
     of their middle row."""
+    carrier: str = ""
+    """The name of the trajectory that it goes along; empty of a camera that stands still."""
+    bTc: Array = field(default_factory=lambda: np.eye(4))
+    """(4, 4) carrier-from-camera pose, metres; `wTc` is where that puts the camera at first."""
 
     def __post_init__(self) -> None:
         def refuse(problem: str) -> ValueError:
             return ValueError(f"camera {self.name}: {problem}")
 
-        if self.lens not in _COEFFICIENTS:
+        if self.lens not in COEFFICIENTS:
             raise refuse(f"lens must be perspective or fisheye, got {self.lens!r}")
-        lengths = [(count,) for count in _COEFFICIENTS[self.lens]]
-        arrays = {"K": ([(3, 3)], _MOST_PIXELS), "wTc": ([(4, 4)], _MOST_METRES)}
+        lengths = [(count,) for count in COEFFICIENTS[self.lens]]
+        arrays = {"K": ([(3, 3)], _MOST_PIXELS)} | dict.fromkeys(("wTc", "bTc"), ([(4, 4)], _MOST_METRES))
         for name, (shapes, most) in (arrays | {"distortion": (lengths, _MOST_DISTORTION)}).items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in shapes:
@@ -72,9 +69,9 @@ class Camera:
             object.__setattr__(self, name, value)
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or np.any(np.abs(self.K[2] - (0, 0, 1)) > 1e-9):
             raise refuse("K must have positive focal lengths and a last row 0 0 1")
-        R = self.wTc[:3, :3]
-        if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-            raise refuse("the rotation of wTc must be orthonormal with determinant 1")
+        for name, R in (("wTc", self.wTc[:3, :3]), ("bTc", self.bTc[:3, :3])):
+            if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+                raise refuse(f"the rotation of {name} must be orthonormal with determinant 1")
         width, height = self.image_size
         if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
             raise refuse(f"image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}")
@@ -138,54 +135,11 @@ class Camera:
         NaN where there is no such pixel: beyond what the lens's polynomial reaches, or at 90 degrees and more
         from the axis of a fisheye.
         """
-        xy = np.asarray(xy, dtype=np.float64)
-        if len(xy) == 0 or not self._bends:
-            return xy
-        rays = self._normalised(xy).reshape(-1, 1, 2)
-        undo = cv2.fisheye.undistortPoints if self.lens == "fisheye" else cv2.undistortPoints
-        ideal = np.asarray(undo(rays, np.eye(3), self.distortion, criteria=_CRITERIA), dtype=np.float64)
-        pixels = ideal.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
-        with np.errstate(invalid="ignore", over="ignore"):
-            undone = np.abs(self.distort(pixels) - xy).max(axis=1) < _UNDONE_PX
-        pixels[~undone] = np.nan
-        return pixels
+        return undistorted(np.asarray(xy, dtype=np.float64), self.K, self.distortion, self.lens)
 
     def distort(self, xy: Array) -> Array:
         """Map undistorted pixels (N, 2) to the pixels that the real lens gives (inverse of `undistort`)."""
-        xy = np.asarray(xy, dtype=np.float64)
-        if len(xy) == 0 or not self._bends:
-            return xy
-        rays = self._normalised(xy)
-        if self.lens == "fisheye":
-            bent = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), np.eye(3), self.distortion)
-        else:
-            rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-            bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), self.distortion)
-        bent = np.asarray(bent, dtype=np.float64).reshape(-1, 2)
-        return bent @ self.K[:2, :2].T + self.K[:2, 2]
-
-    @property
-    def _bends(self) -> bool:
-        """Whether the lens moves any pixel: a fisheye does without a coefficient too."""
-        return self.lens == "fisheye" or bool(self.distortion.any())
-
-    def _normalised(self, xy: Array) -> Array:
-        """Normalised image coordinates (N, 2) of pixels (N, 2); OpenCV's own functions pass over a skew in K."""
-        inverse = np.linalg.inv(self.K)
-        return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])
-
-
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-"""Steps and accuracy, in normalised coordinates, of undoing a distortion."""
-
-
-def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> Array:
-    """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
-    given = np.asarray(coefficients, dtype=np.float64)
-    for count in _COEFFICIENTS[lens]:
-        if len(given) <= count:
-            return np.concatenate([given, np.zeros(count - len(given))])
-    raise ValueError(f"a {lens} lens has at most {count} distortion coefficients, got {len(given)}")
+        return distorted(np.asarray(xy, dtype=np.float64), self.K, self.distortion, self.lens)
 
 
 @dataclass(frozen=True)
@@ -200,6 +154,8 @@ class Rig:
     """Views without a picture, at the moment that the rig is of: nobody is expected to be seen there."""
     doubted: tuple[int, ...] = ()
     """Views that contradict each other then, and nothing says which is wrong."""
+    trajectories: tuple[Trajectory, ...] = ()
+    """Where the carriers of cameras that move go; two cameras on one robot share its trajectory."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
@@ -209,9 +165,44 @@ class Rig:
             raise ValueError(f"camera names must differ, got {names}")
         if self.up not in ("x", "-x", "y", "-y", "z", "-z"):
             raise ValueError(f"up must be one of x -x y -y z -z, got {self.up!r}")
+        known = [each.name for each in self.trajectories]
+        for camera in self.cameras:
+            if camera.carrier and camera.carrier not in known:
+                raise ValueError(f"camera {camera.name}: there is no trajectory {camera.carrier!r}, got {known}")
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    @property
+    def moves(self) -> bool:
+        """Whether any camera moves: then `at` says where they are."""
+        return any(camera.carrier for camera in self.cameras)
+
+    @cached_property
+    def carrier(self) -> Index:
+        """(V,) which trajectory each view goes along; -1 of a camera that stands still."""
+        known = [each.name for each in self.trajectories]
+        return np.array([known.index(each.carrier) if each.carrier else -1 for each in self.cameras], np.intp)
+
+    def poses(self, time_s: Array) -> Array:
+        """(..., V, 4, 4) world from camera at times (..., V), seconds; the nearest where a trajectory has none."""
+        wTc = np.empty((*time_s.shape, 4, 4))
+        for view, (camera, number) in enumerate(zip(self.cameras, self.carrier.tolist(), strict=True)):
+            still = number < 0
+            wTc[..., view, :, :] = (
+                camera.wTc if still else self.trajectories[number].at(time_s[..., view]) @ camera.bTc
+            )
+        return wTc
+
+    def at(self, time_s: Array) -> "Rig":
+        """The cameras as they stand at one moment, `time_s` (V,); a rig whose cameras stand still is the same."""
+        if not self.moves:
+            return self
+        cameras = [
+            replace(camera, wTc=wTc, carrier="", bTc=np.eye(4)) if camera.carrier else camera
+            for camera, wTc in zip(self.cameras, self.poses(time_s), strict=True)
+        ]
+        return replace(self, cameras=tuple(cameras), trajectories=())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -286,6 +277,8 @@ class Views:
     """(V, 2) width and height, pixels; infinite where they are not known."""
     readout_s: Array | float = 0.0
     """(V,) from the first row of a picture to the last, seconds."""
+    carried: Carried | None = None
+    """What carries cameras, row by row; None where all stand still."""
 
     def __post_init__(self) -> None:
         K, cTw = self.K, self.cTw
@@ -297,9 +290,19 @@ class Views:
             raise ValueError("K or cTw holds a value that is not finite")
 
     @classmethod
-    def of(cls, rig: Rig) -> "Views":
-        """The cameras of a rig that stands still."""
-        return cls(rig.K, rig.cTw, rig.image_sizes, np.array([camera.readout_s for camera in rig.cameras]))
+    def of(cls, rig: Rig, time_s: Array | None = None) -> "Views":
+        """The cameras of a rig; of one that moves at `time_s` (N, V), seconds, the times of each row's views.
+
+        ValueError where cameras move and no times are given.
+        """
+        readout_s = np.array([camera.readout_s for camera in rig.cameras])
+        if not rig.moves:
+            return cls(rig.K, rig.cTw, rig.image_sizes, readout_s)
+        if time_s is None:
+            raise ValueError("cameras that move have poses at times only: give time_s, or `Rig.at` a moment")
+        cTw = np.ascontiguousarray(np.linalg.inv(rig.poses(time_s))[..., :3, :], dtype=np.float64)
+        carried = Carried.of(rig.trajectories, rig.carrier, time_s.mean(axis=1))
+        return cls(rig.K, cTw, rig.image_sizes, readout_s, carried)
 
     def __len__(self) -> int:
         """V, the number of views."""
@@ -324,13 +327,14 @@ class Views:
 
     @cached_property
     def focal(self) -> Array:
-        """(1, V) or (N, V) the same as `focal_px`."""
-        return np.ascontiguousarray(self.focal_px.reshape(-1, len(self)))
+        """(1, V) or (N, V), as many rows as `projection` has, the same as `focal_px`."""
+        return np.ascontiguousarray(np.broadcast_to(self.focal_px, self.projection.shape[:2]))
 
     def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""
         K, cTw = (array[index] if array.ndim == 4 else array for array in (self.K, self.cTw))
-        return Views(K, cTw, self.image_sizes, self.readout_s)
+        carried = None if self.carried is None else self.carried.rows(index)
+        return Views(K, cTw, self.image_sizes, self.readout_s, carried)
 
     def pixels(self, points: Array) -> tuple[Array, Array]:
         """The first two of `project`."""

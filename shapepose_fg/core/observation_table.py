@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.result_files import SavedTable, check_id
@@ -121,7 +121,10 @@ class ObservationTable(Table):
         """
         here = observations if carried is None else carried
         seen = observations.seen
-        projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
+        if rig.moves:
+            projected, depth = Views.of(rig, observations.time_s).pixels(joints)
+        else:
+            projected, depth = (np.moveaxis(values, 0, 2) for values in rig.project(joints))
         gate = np.where(seen, gate, Gate.NOT_SEEN)
         free = seen & (gate != Gate.USED)
         gate = np.where(free & ~(depth > 0), Gate.BEHIND_CAMERA, gate)

@@ -61,3 +61,11 @@ class Observations(Table):
     def concatenate(cls, parts: Sequence["Observations"]) -> "Observations":
         """The rows of several parts, one after the other."""
         return Observations.joined(parts)
+
+
+def rows_in(before: Observations, now: Observations) -> Index:
+    """(N,) where the rows of `now` stand among those `before`: the same people, fewer or in another order."""
+    most = 1 + max(before.track.max(initial=0), now.track.max(initial=0))
+    was, key = (each.frame * most + each.track for each in (before, now))
+    order = np.argsort(was)
+    return order[np.searchsorted(was[order], key)]

@@ -1,8 +1,12 @@
 """Which cameras a recording is reconstructed without, and which contradict each other."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DerivedFrames, DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes, spans_of
 
 Spell = tuple[int, int, int]
 """A view, the first frame of which something is said, and the one after the last."""
@@ -45,3 +49,29 @@ class Trusted(DerivedFrames):
 def trust_in(detections: DetectionSequence) -> Trust:
     """What is believed of a recording's cameras: all, unless it is `Trusted`."""
     return detections.trust if isinstance(detections, Trusted) else BELIEVED
+
+
+def without_poses(rig: Rig, times: FrameTimes) -> tuple[Spell, ...]:
+    """When cameras that move have no pose: before, behind and in gaps of their trajectories."""
+    time_s, spells = times.of_views(len(rig)), list[Spell]()
+    for view, number in enumerate(rig.carrier.tolist()):
+        if number >= 0:
+            missing = np.flatnonzero(~rig.trajectories[number].covers(time_s[:, view]))
+            spells += [(view, span.start, span.stop) for span in spans_of(missing.tolist())]
+    return tuple(spells)
+
+
+def with_poses(detections: DetectionSequence, rig: Rig, times: FrameTimes) -> DetectionSequence:
+    """The recording without the pictures of cameras that have no pose then; ValueError where one never has."""
+    spells, trust = without_poses(rig, times), trust_in(detections)
+    for view, first, last in spells:
+        if last - first == len(times):
+            path = rig.trajectories[int(rig.carrier[view])]
+            runs = f"{path.name} runs from {path.time_s[0]:.10g} to {path.time_s[-1]:.10g} s"
+            raise ValueError(
+                f"camera {rig.names[view]} has no pose at any picture: {runs}; give times of its clock"
+            )
+    if len(spells) == 0:
+        return detections
+    frames = detections.frames if isinstance(detections, Trusted) else detections
+    return Trusted(frames, replace(trust, left_out=(*trust.left_out, *spells)))

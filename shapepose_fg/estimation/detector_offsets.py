@@ -53,7 +53,7 @@ def confident_targets(observations: Observations, rig: Rig, config: ObservationC
 
     Without the body: what it pulled towards its own joint would hide the detector's.
     """
-    views = Views.of(rig)
+    views = Views.of(rig, observations.time_s)
     points = triangulate(observations, views, config)
     sigmas = observation_sigmas(observations, points, views, config, BODY_25.joints)
     evidence = linearise(observations, sigmas, points, views, config)

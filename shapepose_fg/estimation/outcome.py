@@ -8,6 +8,7 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
+from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.in_time import carried, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
@@ -53,6 +54,10 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     carried = carried_to_frames(rows, X, np.nan_to_num(velocity), state.views)
     final = linearise(carried, state.sigmas, X, state.views, state.config.observations)
     covariance = _calibrated(state, X, covariance, final)
+    if state.views.carried is not None:
+        covariance += carried_covariance(
+            final, state.of_body, state.sigmas, state.views, state.config.observations
+        )
     reported = strong(state)
     hiding = limbs_that_hide(state.config.joints)
     elsewhere = elsewhere_variance(X, rows.frame, reported, state.views, hiding)

@@ -87,7 +87,8 @@ class WindowSolution:
             values[~self.fit.ok] = np.nan
         dropped = np.where(self.contradicts[..., None], Gate.CONTRADICTS_BODY, Gate.TOO_FAR)
         gate = np.where(self.inlier, Gate.USED, dropped)
-        carried = carried_to_frames(rows, self.joints, np.nan_to_num(self.velocity), Views.of(rig))
+        views = Views.of(rig, rows.time_s)
+        carried = carried_to_frames(rows, self.joints, np.nan_to_num(self.velocity), views)
         names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
         return Reconstruction(
             frame=rows.frame,

@@ -2,6 +2,8 @@
 
 from dataclasses import fields, replace
 
+import numpy as np
+
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
@@ -9,6 +11,7 @@ from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import naming
+from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
@@ -29,36 +32,43 @@ def estimate_offsets(
     rig: Rig,
     config: PipelineConfig | None = None,
     *,
+    times: FrameTimes | None = None,
     fitter: BodyFitter | None = None,
 ) -> KeypointOffsets:
     """Where the detector of a recording puts its joints on the body, learnt without any truth.
 
     From frames spread over the recording and joints that at least three views see well; what `reconstruct` does
-    by itself. `fitter` says on which body, by default the shipped one. `config.offsets.source` is not looked at.
+    by itself. `times` are needed where cameras move. `fitter` says on which body, by default the shipped one.
+    `config.offsets.source` is not looked at.
     """
     config = config or PipelineConfig()
     fitter = fitter or make_fitter(config.body)
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     thinned = ThinnedFrames(WithoutRepeats(detections, len(rig)), len(rig), config.candidates)
-    offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, Notebook())
+    times = FrameTimes.assumed(len(detections)) if times is None else times
+    offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, times, Notebook())
     if offsets is None:
         raise ValueError(f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}")
     return offsets
 
 
-def kept_offsets(kept: KeptArrays, setup: Setup, frames: ThinnedFrames, book: Notebook) -> KeypointOffsets | None:
+def kept_offsets(
+    kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
+) -> KeypointOffsets | None:
     """`offsets_of`; what a run began with it goes on with."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         with naming(kept.place(_OFFSETS), ANEW):
             return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
-    offsets = offsets_of(setup, frames, book)
+    offsets = offsets_of(setup, frames, times, book)
     if offsets is not None:
         kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
     return offsets
 
 
-def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> KeypointOffsets | None:
+def offsets_of(
+    setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
+) -> KeypointOffsets | None:
     """Where the detector puts its joints; None where nothing says it. ValueError where a file is of no use."""
     config, rig, fitter = setup.config, setup.rig, setup.fitter
     source = config.offsets.source
@@ -74,7 +84,10 @@ def offsets_of(setup: Setup, detections: ThinnedFrames, book: Notebook) -> Keypo
         spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
         # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
         hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).of_few()
-        people = [hips(detections[detections.first + t], rig) for t in spread]
+        people, time_s = list[Observations](), times.of_views(len(rig))
+        for frame in (detections.first + t for t in spread):
+            found = hips(detections[frame], rig.at(time_s[frame]))
+            people.append(replace(found, time_s=np.tile(time_s[frame], (len(found), 1))))
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations)

@@ -18,7 +18,9 @@ from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
+from shapepose_fg.core.trust import with_poses
 from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.estimation.trajectory_graph import CameraFactors
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -30,6 +32,7 @@ from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.setup import find_people as find_people
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
+from shapepose_fg.pipeline.trajectories import about, keep, kept_rig, refine, unrefined
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.presence import probability
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
@@ -62,6 +65,7 @@ def reconstruct(
     shapes: SubjectShapes | None = None,
     fitter: BodyFitter | None = None,
     extra_factors: ExtraFactors | None = None,
+    camera_factors: CameraFactors | None = None,
     execution: Execution | None = None,
 ) -> Reconstruction:
     """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
@@ -70,6 +74,7 @@ def reconstruct(
     without it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut:
     nothing carries over to them, identities least of all. `shapes` are people known from other recordings.
     `fitter` replaces the body fitter, and `extra_factors` adds factors of your own to every person's window.
+    Where cameras move, their trajectories are refined first (`refine_trajectories`), with your `camera_factors`.
     `Trusted(detections, check_setup(detections, rig).trust)` leaves out cameras that contradict the others.
     `execution` says what runs it: processes, a cluster, chunks, who is told how far it is.
 
@@ -80,8 +85,31 @@ def reconstruct(
     ValueError where an argument does not fit the recording.
     """
     config = PipelineConfig() if config is None else config
-    task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
+    task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors, camera_factors)
     return reconstruct_parts(InMemory(), task, execution).reconstruction(consume=True)
+
+
+def refine_trajectories(
+    detections: DetectionSequence,
+    rig: Rig,
+    config: PipelineConfig | None = None,
+    *,
+    frames: range | None = None,
+    times: FrameTimes | None = None,
+    cuts: Sequence[int] = (),
+    camera_factors: CameraFactors | None = None,
+) -> Rig:
+    """The rig with its trajectories as the people have them that its cameras see, covariances in them.
+
+    What `reconstruct` does first where cameras move; with the rig that this returns it takes poses as they are.
+    People tell of a pose where two cameras see them that do not move together; elsewhere the odometry goes on.
+    Where no camera stands still the world is that in which the first carrier starts. `camera_factors` are your own
+    on poses. Poses of frames that stand alone (`config.temporal` false) are taken as they are.
+    """
+    config = PipelineConfig() if config is None else config
+    task = Task(detections, rig, config, frames, times, cuts, camera_factors=camera_factors)
+    fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints), config.law)
+    return _with_refined(InMemory(), task, Setup(rig, detections.skeleton, config, fitter), Notebook()).rig
 
 
 @dataclass(frozen=True)
@@ -97,6 +125,7 @@ class Task:
     shapes: SubjectShapes | None = None
     fitter: BodyFitter | None = None
     extra_factors: ExtraFactors | None = None
+    camera_factors: CameraFactors | None = None
 
     def whole(self) -> tuple[range, FrameTimes, list[int]]:
         """Frames, times and cuts, those that are not given filled in; ValueError where they do not fit."""
@@ -126,14 +155,14 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             f" got {chunk}"
         )
     book, fitter = Notebook(), task.fitter
-    pictures = WithoutRepeats(task.detections, len(rig))
+    pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
     detections = ThinnedFrames(pictures, len(rig), config.candidates)
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
         check_fitter(fitter)
-    setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
-    offsets = kept_offsets(kept, setup, detections, book)
+    setup = _with_refined(kept, task, Setup(rig, skeleton, config, fitter, task.extra_factors), book)
+    offsets = kept_offsets(kept, setup, detections, times, book)
     if offsets is not None:
         setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
     parts = Parts(kept)
@@ -175,8 +204,27 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         notes.add(each)
     more = {"time": times.as_dict(), "cuts": cuts}
     more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}
+    if rig.moves:
+        more |= {"trajectories": about(rig, setup.rig)}
     more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return result.with_run(**_summary(notes, config, frames, result), **more)
+
+
+def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) -> Setup:
+    """The set-up with trajectories that people have corrected, where cameras move; a run keeps them."""
+    rig, config = setup.rig, setup.config
+    if not unrefined(rig) or not config.temporal:
+        return setup
+    if (known := kept_rig(kept, rig)) is None:
+        frames, times, cuts = task.whole()
+        pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
+        thinned = ThinnedFrames(pictures, len(rig), config.candidates)
+        # What it has to say of people is said when they are followed again.
+        windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, Notebook())
+        with book.stage("trajectories"):
+            known = refine(windows, task.camera_factors)
+        keep(kept, known)
+    return replace(setup, rig=known)
 
 
 def _fit_person(setup: Setup, person: Person) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class Setup:
         rounds = windows.again_alone if span.alone else windows.again_over_time
         solution = solve_window(
             rows,
-            Views.of(self.rig),
+            Views.of(self.rig, rows.time_s),
             self.fitter,
             self.estimator,
             assigning=Assigning(given, self.skeleton, rounds, over_time=not span.alone),

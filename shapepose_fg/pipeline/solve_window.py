@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Input
-from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.observations import Observations, rows_in
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.draft import Draft, redraft
@@ -36,7 +36,7 @@ class Assigning:
     """What detections are assigned again from, around drafts."""
 
     frames: Sequence[Input]
-    """All detections of the window's frames, before cameras that stand still."""
+    """All detections of the window's frames."""
     skeleton: Skeleton
     """The detector's joints."""
     rounds: int
@@ -86,6 +86,7 @@ def solve_window(
         least = None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
         before = observations
         observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, least)
+        views = views if views.rows_known is None else views.rows(rows_in(before, observations))
         if assigning.over_time and changed(before, observations) < _SETTLED:
             break
     assigned = time.perf_counter()

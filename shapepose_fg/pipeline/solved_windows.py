@@ -57,6 +57,9 @@ class SolvedWindows:
             # Who is who among more detections than people make is chance.
             doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
             said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
+            if self.setup.rig.moves:
+                rig = replace(self.setup.rig.at(self._time_s[frame]), dark=said[0], doubted=said[1])
+                return Input(frame, self._time_s[frame], self.detections[frame], rig)
             if said not in self._rigs:
                 self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
             return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[said])

@@ -102,13 +102,14 @@ def _solved(
     """Each window of the recording: its own frames, and its rows with those around it, solved."""
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
-    config, views = solver.config, Views.of(solver.rig)
+    config, rig = solver.config, solver.rig
     settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
     for own, segment in _windows(rows, config):
         part = rows.rows(_rows_of(rows, own, segment, config.windows.overlap_s))
         assert part.observations is not None
         # From the views: the joints as they are may be somebody else's.
         observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
+        views = Views.of(rig, observations.time_s)
         found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
         yield own, part, found
 

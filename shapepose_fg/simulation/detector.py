@@ -121,14 +121,18 @@ def simulate(
     frames = range(len(scene)) if frames is None else frames
     skin = Skin.of(scene.body, config.visibility.cell_m)
     detector = Detector(scene.rig, scene.people, scene.fps, config, seed)
-    people = ((scene.truth_at(frame), scene.vertices_at(frame, skin.vertices)) for frame in frames)
+    rigs = [scene.rig.at(np.full(len(scene.rig), frame / scene.fps)) for frame in frames]
+    people = (
+        (scene.truth_at(frame), scene.vertices_at(frame, skin.vertices), rig)
+        for frame, rig in zip(frames, rigs, strict=True)
+    )
     found = []
     worker = VisibilityWorker(scene.rig, skin, config.visibility)
     watched = worker.all(people, min(workers, max(len(frames), 1)))
     with closing(watched):
-        for frame, seen in zip(frames, watched, strict=True):
+        for frame, rig, seen in zip(frames, rigs, watched, strict=True):
             detector.skip_to(frame)
-            found.append(detector.detect(scene.truth_at(frame), seen))
+            found.append(detector.detect(scene.truth_at(frame), seen, rig))
             if progress is not None:
                 progress(len(found), len(frames))
     return Recording(BODY_25, found)
@@ -153,9 +157,12 @@ class Detector:
             self._false.next(self._frame)
             self._frame += 1
 
-    def detect(self, joints: Array, visibility: Visibility) -> Detections:
-        """The candidates of the next frame: BODY_25 `joints` (P, 25, 3), of which `visibility` is known."""
-        config = self._config
+    def detect(self, joints: Array, visibility: Visibility, rig: Rig | None = None) -> Detections:
+        """The candidates of the next frame: BODY_25 `joints` (P, 25, 3), of which `visibility` is known.
+
+        `rig` is where the cameras are, if they move.
+        """
+        config, self._rig = self._config, self._rig if rig is None else rig
         noise, false = self._noise.next(self._frame), self._false.next(self._frame)
         rng = np.random.default_rng([self._seed, self._frame, 2])
         self._frame += 1

@@ -33,8 +33,8 @@ FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "L
 _RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
 """Where rays go around a joint, in units of the probe's radius."""
 
-FramePeople = tuple[Array, NDArray[np.float32]]
-"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres."""
+FramePeople = tuple[Array, NDArray[np.float32]] | tuple[Array, NDArray[np.float32], Rig]
+"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres; where the cameras are then."""
 AHEAD = 4
 """Frames a worker that are under way: they are short work."""
 FRAMES_WORTH_A_WORKER = 100
@@ -140,7 +140,8 @@ class VisibilityWorker:
 
     def one(self, people: FramePeople) -> Visibility:
         """What the cameras see of one frame."""
-        return see(self.rig, *people, self.skin, self.config)
+        joints, surfaces, *moved = people
+        return see(moved[0] if len(moved) > 0 else self.rig, joints, surfaces, self.skin, self.config)
 
     def all(self, frames: Iterable[FramePeople], workers: int = 1) -> Generator[Visibility, None, None]:
         """What the cameras see, frame after frame; in `workers` processes, or here if that is 1.

@@ -33,6 +33,7 @@ from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.recording import read_moments, write_moments
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps
+from shapepose_fg.io.trajectories import POSE, read_trajectory
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
@@ -129,6 +130,18 @@ def _times(folder: Path, seed: int) -> Read:
 def _moments(folder: Path, seed: int) -> Read:
     write_moments(folder / "moments.csv", _rig(seed, 2), np.array([[4, 0], [5, -1], [6, 2]]))
     return lambda: read_moments(folder / "moments.csv")
+
+
+def _trajectory(folder: Path, seed: int) -> Read:
+    rng, count = np.random.default_rng(seed), 9
+    turn = rng.normal(size=(count, 4))
+    pose = np.column_stack(
+        [np.arange(count) / 25, rng.normal(size=(count, 3)), turn / np.linalg.norm(turn, axis=1)[:, None]]
+    )
+    names = [*POSE, *(f"{each}_{each}" for each in ("rx", "ry", "rz", "x", "y", "z"))]
+    lines = [" ".join(names), *(" ".join(map(repr, [*row, *[0.01] * 6])) for row in pose.tolist())]
+    (folder / "robot.csv").write_text("\n".join(lines) + "\n")
+    return lambda: read_trajectory(folder / "robot.csv")
 
 
 def _project(folder: Path, seed: int) -> Read:
@@ -327,6 +340,7 @@ READERS: dict[str, Prepare] = {
     "settings": _settings,
     "times": _times,
     "moments": _moments,
+    "trajectory": _trajectory,
     "project of Pose2Sim": _project,
     "recordings": _recordings,
     "batch": _batch,

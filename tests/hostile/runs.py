@@ -163,7 +163,7 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
             made = Assembly(parts, joints, own.rig.names)
             if "bodies-0.safetensors" in valid:
                 known = SubjectShapes.empty("body")
-                kept_offsets(kept, setup, detections, Notebook())
+                kept_offsets(kept, setup, detections, times, Notebook())
                 made = replace(made, bodies=fit_everybody(made.rows_of, made.person, list, kept, known))
             return made.reconstruction()
 

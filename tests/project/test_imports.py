@@ -13,7 +13,8 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.compiled core.errors core.moved",
-    "core.camera core.skeleton core.pieces",
+    "core.skeleton core.pieces core.lens core.trajectory",
+    "core.camera",
     "core.drawing",
     "core.storage.files core.bounds",
     "core.storage.npz",
@@ -39,6 +40,7 @@ LEVELS = (
     "pipeline.runs",
     "pipeline.setup pipeline.execution",
     "pipeline.offsets pipeline.solved_windows",
+    "pipeline.trajectories",
     "pipeline.pipeline",
     "io",
     "pipeline.solving",

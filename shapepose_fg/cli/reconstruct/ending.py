@@ -64,6 +64,15 @@ def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds:
     table.add_column(overflow="fold")
     table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}")
     over_time = run.get("configuration", {}).get("temporal", False)
+    for each in run.get("trajectories", []):
+        corrected = f"corrected by up to {each['moved_mm']:.0f} mm and {each['turned_deg']:.1f} degrees"
+        known = f"known to {each['sigma_mm']:.0f} mm and {each['sigma_deg']:.1f} degrees"
+        words = (
+            f"{each['way_m']:.1f} m; {corrected}; {known}"
+            if each["refined"]
+            else f"{each['way_m']:.1f} m, as given"
+        )
+        table.add_row("moving", f"{' '.join(each['cameras'])}: {words}")
     count = f"{len(result.rows_of)} people over time" if over_time else "no identities"
     table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
     table.add_row("rows", f"{len(result)} in all")

@@ -44,6 +44,9 @@ class Request(DetectionOptions, TimeOptions):
     config: Path | None = option(RESULT, "Settings as TOML, all that `shapepose-fg config` prints or some.")
     frames: str | None = frames_option()
     body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
+    trajectory: list[str] | None = option(
+        INPUT, "Poses of a camera that moves: TUM or CSV; may be given several times.", metavar="CAMERA=FILE"
+    )
     readout: float | None = option(TIME, "Seconds that rolling shutters take from first to last row.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
@@ -58,6 +61,10 @@ class Request(DetectionOptions, TimeOptions):
         from shapepose_fg.core.camera import LONGEST_READOUT_S
 
         found = super().rig()
+        if self.trajectory:
+            from shapepose_fg.io.calibration import with_trajectories
+
+            found = with_trajectories(found, self.trajectory)
         if self.readout is None:
             return found
         if not 0 <= self.readout <= LONGEST_READOUT_S:

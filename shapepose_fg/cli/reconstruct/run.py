@@ -19,6 +19,7 @@ from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -27,7 +28,7 @@ from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
-from shapepose_fg.core.trust import Trusted, trust_in
+from shapepose_fg.core.trust import Trusted, trust_in, without_poses
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
@@ -38,6 +39,7 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
+from shapepose_fg.pipeline.trajectories import kept_rig
 from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
@@ -67,7 +69,8 @@ def carry_out(
     end.
     """
     asked, output = known.request, known.output
-    files = (known.calibration, asked.config, asked.body, asked.timestamps)
+    poses = [Path(each.partition("=")[2]) for each in asked.trajectory or ()]
+    files = (known.calibration, asked.config, asked.body, asked.timestamps, *poses)
     reading = ReadInputs((*files, known.detections))
     rig = asked.rig()
     refuse_corrected(output)
@@ -91,14 +94,46 @@ def carry_out(
                 note(f"{asked.body}: fitted by the plain optimiser; {cure} trains a better one for it, once")
         task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
         inputs = reading.checksums((known.calibration, *recording.sources, *files[1:]))
+        beside = rig.trajectories[: len(rig.trajectories) - len(poses)]
+        inputs |= checksums([known.calibration.parent / each.name for each in beside])
         if settings.offsets.source not in ("recording", "none"):
             inputs |= checksums([settings.offsets.source])
         if fitter is not None and fitter.weights is not None and fitter.weights.file is not None:
             inputs |= checksums([fitter.weights.file])
         del reading  # of half a million files it is large
-        report = check_setup(known, task) if asked.check else None
+        note(*_about_moving(task))
+        report = check_setup(known, task) if asked.check and not rig.moves else None
         task = task if report is None else replace(task, detections=Trusted(recording, report.trust))
         return _Run(task, recording, known, inputs, execution, report).carried_out(resume=resume, restart=restart)
+
+
+def _about_moving(task: Task) -> list[str]:
+    """What is not done, and which pictures are not used, because cameras move."""
+    rig, (_, times, _) = task.rig, task.whole()
+    if not rig.moves:
+        return []
+    told = ["cameras move: the check whether cameras and detections fit is of fixed cameras, and is left out"]
+    if (rig.carrier >= 0).all():
+        told.append(
+            "no camera stands still: the world is that of the first trajectory's start, and drifts with it"
+        )
+    if not task.config.temporal:
+        told.append("frames stand alone: trajectories are taken as they are, with no error")
+    spells = without_poses(rig, times)
+    for view in sorted({view for view, _, _ in spells}):
+        spans = [(first, last) for each, first, last in spells if each == view]
+        count, where = sum(last - first for first, last in spans), ", ".join(f"{a}-{b - 1}" for a, b in spans[:4])
+        told.append(
+            f"{rig.names[view]}: {count} pictures are outside its trajectory and are not used (frames {where}"
+            f"{' ...' * (len(spans) > 4)})"
+        )
+        if count == len(times):
+            path, time_s = rig.trajectories[int(rig.carrier[view])], times.frame_s
+            raise InputError(
+                f"{path.name}: runs from {path.time_s[0]:.10g} to {path.time_s[-1]:.10g} s, the pictures of"
+                f" {rig.names[view]} from {time_s[0]:.10g} to {time_s[-1]:.10g}; give --timestamps of its clock"
+            )
+    return told
 
 
 @contextmanager
@@ -197,6 +232,7 @@ class _Run:
         every = max(1, -(-len(result) // MOST_ROWS))
         if every > 1:
             note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
+        rig = kept_rig(kept, rig) or rig
         people = result.reconstruction(every=every)
         report = self.report
         checked = None if report is None else result_check(report, people, task.detections, rig, frames)
@@ -217,7 +253,7 @@ class _Run:
         else:
             (output / MOMENTS).unlink(missing_ok=True)
         summary = summary_table(result, people, self.task, seconds)
-        for n, written in enumerate(self._written(result, people, every)):
+        for n, written in enumerate(self._written(result, people, rig, every)):
             summary.add_row("" if n > 0 else "written", written)
         if file is not None and known is not None and result.shapes is not None:
             manifest.write_people(kept, file, known.updated(result.shapes))
@@ -229,13 +265,15 @@ class _Run:
         count = len(result.rows_of) if self.task.config.temporal else None
         return Ended(len(frames), len(result), count, () if checked is None else tuple(checked.warnings))
 
-    def _written(self, result: Assembly, people: Reconstruction, every: int) -> list[str]:
+    def _written(self, result: Assembly, people: Reconstruction, rig: Rig, every: int) -> list[str]:
         """Report and files for other programs are left; what there is now."""
         output, project = self.known.output, self.known.project
         files = ["people.npz", "run.json", *(["observations.npz"] if len(result) > 0 else []), CAMERAS]
         written = [str(output / name) for name in files]
+        if rig.moves:
+            written.append(f"{output / 'trajectories'}  where cameras went: CSV with covariances, and TUM")
         if self.known.request.report:
-            written.append(f"{write_report(output, people, self.task.rig, every=every)}  to look at, in a browser")
+            written.append(f"{write_report(output, people, rig, every=every)}  to look at, in a browser")
         else:  # that of an earlier result would say what is no longer true
             (output / REPORT).unlink(missing_ok=True)
         if project is not None:

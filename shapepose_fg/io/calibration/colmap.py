@@ -6,8 +6,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from shapepose_fg.core.camera import Lens
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import LARGE, read_text
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of

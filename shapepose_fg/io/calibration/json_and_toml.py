@@ -7,13 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from shapepose_fg.core.camera import Axis, Lens, Rig
+from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import write_content
+from shapepose_fg.core.trajectory import DRIFT, Trajectory
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, Node, Unit, WrittenCamera, WrittenRig, intrinsics
+from shapepose_fg.io.trajectories import read_trajectory, write_trajectory
 from shapepose_fg.io.validation import describe, validated
 
 RIG_FORMAT = "shapepose-fg rig 1"
@@ -26,6 +30,9 @@ _EXTRINSICS = "calibrate the extrinsics of this camera too, or delete its table"
 _SIZE = "write width and height in pixels"
 _CURES = {
     **{"K": _MATRIX, "matrix": _MATRIX, "RT": _CAMERA_FROM_WORLD, "cTw": _CAMERA_FROM_WORLD, "R": _ROTATION},
+    **{"bTc": "write the 4x4 carrier-from-camera matrix row by row"},
+    **{"wTo": "write the 4x4 matrix, metres, from the trajectory's world to that of the cameras"},
+    **{"drift": "write the part of the way by which an odometry errs, such as 0.01"},
     **{"T": "write the 3 numbers of the translation", "wTc": "write the 4x4 world-from-camera matrix row by row"},
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
@@ -37,7 +44,15 @@ _CURES = {
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write `rig` as a rig file of our own, which `read_rig` reads back to the last digit."""
+    """Write `rig` as a rig file of our own, which `read_rig` reads back to the last digit.
+
+    Trajectories go into the folder `trajectories` beside it, as CSV with covariances and as TUM's text.
+    """
+    stems = [Path(each.name).stem for each in rig.trajectories]
+    files = {
+        each.name: f"trajectories/{stem if stems.count(stem) == 1 else f'{n}-{stem}'}.csv"
+        for n, (each, stem) in enumerate(zip(rig.trajectories, stems, strict=True))
+    }
     cameras = [
         {
             "name": camera.name,
@@ -45,12 +60,25 @@ def write_rig(rig: Rig, path: str | Path) -> None:
             "K": camera.K.tolist(),
             "lens": camera.lens,
             "distortion": camera.distortion.tolist(),
-            "wTc": camera.wTc.tolist(),
         }
+        | (
+            {"trajectory": files[camera.carrier], "bTc": camera.bTc.tolist()}
+            if camera.carrier
+            else {"wTc": camera.wTc.tolist()}
+        )
         | ({"readout_s": camera.readout_s} if camera.readout_s > 0 else {})
         for camera in rig.cameras
     ]
     content = {"format": RIG_FORMAT, "unit": "m", "up": rig.up, "cameras": cameras}
+    if rig.moves:
+        content["trajectories"] = {
+            files[each.name]: {"drift": each.drift, "refined": each.refined} for each in rig.trajectories
+        }
+        (Path(path).parent / "trajectories").mkdir(parents=True, exist_ok=True)
+        for each in rig.trajectories:
+            file = Path(path).parent / files[each.name]
+            write_trajectory(each, file)
+            write_trajectory(each, file.with_suffix(".tum"))
     write_content(Path(path), json.dumps(content, indent=1, allow_nan=False))
 
 
@@ -65,7 +93,16 @@ class _Camera(BaseModel):
     distortion: Any = None
     wTc: Any = None
     cTw: Any = None
+    bTc: Any = None
+    trajectory: Annotated[str, Field(min_length=1)] | None = None
     readout_s: float = 0.0
+
+
+class _Trajectory(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+    drift: Annotated[float, Field(gt=0, le=1)] = DRIFT
+    refined: bool = False
+    wTo: Any = None
 
 
 class _Rig(BaseModel):
@@ -74,6 +111,7 @@ class _Rig(BaseModel):
     unit: Unit | None = None
     up: Axis | None = None
     cameras: list[_Camera]
+    trajectories: dict[str, _Trajectory] = {}
 
 
 def _members(content: Content) -> dict[str, Any]:
@@ -96,12 +134,30 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
     cameras = []
     for camera in rig.cameras:
         node = Node(vars(camera), f'{content.path}: camera "{camera.name}"', _CURES)
-        if (camera.wTc is None) == (camera.cTw is None):
-            raise InputError(f"{node.place}: give exactly one of wTc and cTw; {_CURES['wTc']}")
-        wTc = node.pose_of_rows("cTw") if camera.wTc is None else node.pose_of_matrix("wTc")
+        given = [key for key in ("wTc", "cTw", "trajectory") if getattr(camera, key) is not None]
+        if len(given) != 1 or (camera.bTc is not None and camera.trajectory is None):
+            moves = "or trajectory, with bTc, of a camera that moves"
+            raise InputError(f"{node.place}: give exactly one of wTc and cTw, {moves}; {_CURES['wTc']}")
+        if camera.trajectory is not None:
+            wTc = np.eye(4) if camera.bTc is None else node.pose_of_matrix("bTc")
+        else:
+            wTc = node.pose_of_rows("cTw") if camera.wTc is None else node.pose_of_matrix("wTc")
         one = node.camera(camera.name, "K", wTc, ["image_size"], "distortion", camera.lens)
-        cameras.append(replace(one, readout_s=camera.readout_s))
-    return WrittenRig(cameras, rig.unit, rig.up, cures)
+        cameras.append(replace(one, readout_s=camera.readout_s, trajectory=camera.trajectory or ""))
+    named = dict.fromkeys(camera.trajectory for camera in cameras if camera.trajectory)
+    trajectories = [_trajectory(content.path, name, rig.trajectories.get(name)) for name in named]
+    return WrittenRig(cameras, rig.unit, rig.up, cures, trajectories)
+
+
+def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
+    """The trajectory in the file `name` beside the rig file, in the rig's world."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InputError(f"{path}: trajectory {name[:80]} must lie beside the rig file or below; move it there")
+    about = _Trajectory() if about is None else about
+    found = read_trajectory(path.parent / name, name)
+    node = Node({"wTo": about.wTo}, f'{path}: trajectory "{name}"', _CURES)
+    wTo = np.eye(4) if about.wTo is None else node.pose_of_matrix("wTo")
+    return replace(found, wTb=wTo @ found.wTb, drift=about.drift, refined=about.refined)
 
 
 def _read_association(content: Content) -> WrittenRig | None:

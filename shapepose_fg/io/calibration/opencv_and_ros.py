@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Lens
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.lens import Lens
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.written import Format, Node, WrittenCamera, WrittenRig, pose, rotation_of
 

@@ -1,5 +1,7 @@
 """Calibration files to a `Rig`: the formats that are known, which one a file is, and what it does not say."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -14,6 +16,7 @@ from shapepose_fg.io.calibration.opencv_and_ros import OPENCV, ROS
 from shapepose_fg.io.calibration.written import METRES, Format, Unit
 from shapepose_fg.io.calibration.xml_files import QUALISYS, VICON
 from shapepose_fg.io.camera_names import listing
+from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
@@ -66,7 +69,37 @@ def read_rig(
         names = f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'}"
         raise InputError(f"{path}: recognised as {form.name}, where {names} missing; {cures}")
     with naming(path):
-        return Rig(tuple(camera.finished(METRES[unit], image_size, path) for camera in written.cameras), up)
+        cameras = [camera.finished(METRES[unit], image_size, path) for camera in written.cameras]
+        return carried(Rig(tuple(cameras), up, trajectories=tuple(written.trajectories)))
+
+
+def carried(rig: Rig) -> Rig:
+    """The rig with each camera that moves where its trajectory begins."""
+    if not rig.moves:
+        return rig
+    first = {each.name: each.wTb[0] for each in rig.trajectories}
+    cameras = (replace(each, wTc=first[each.carrier] @ each.bTc) if each.carrier else each for each in rig.cameras)
+    return replace(rig, cameras=tuple(cameras))
+
+
+def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
+    """The rig whose cameras move as `given` says, `CAMERA=FILE` each: the file has the camera's own poses.
+
+    What the calibration says of these cameras' poses is passed over. InputError where it cannot be used.
+    """
+    cameras, trajectories = {each.name: each for each in rig.cameras}, list(rig.trajectories)
+    for each in given:
+        name, _, file = each.partition("=")
+        if name not in cameras or not file:
+            cure = f"write CAMERA=FILE with one of {listing(list(rig.names))}"
+            raise InputError(f"--trajectory {each[:80]}: must name a camera and a file; {cure}")
+        if cameras[name].carrier or any(file == other.partition("=")[2] for other in given if other is not each):
+            cure = 'say in a rig file with "trajectory" and "bTc" how each camera stands on its carrier'
+            raise InputError(f"--trajectory {each[:80]}: a camera has one trajectory of its own; {cure}")
+        trajectories.append(read_trajectory(file, name))
+        cameras[name] = replace(cameras[name], carrier=name, bTc=np.eye(4))
+    with naming("--trajectory"):
+        return carried(replace(rig, cameras=tuple(cameras.values()), trajectories=tuple(trajectories)))
 
 
 @np.errstate(over="ignore", invalid="ignore")

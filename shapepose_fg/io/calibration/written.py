@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Axis, Camera, Lens, padded_distortion
+from shapepose_fg.core.camera import Axis, Camera
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.lens import Lens, padded_distortion
+from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.validation import describe
 
@@ -45,6 +47,8 @@ class WrittenCamera:
     """Which lens the coefficients belong to."""
     readout_s: float = 0.0
     """How long its shutter takes from the first row of a picture to the last, seconds."""
+    trajectory: str = ""
+    """The name of the trajectory along which it is carried; then `wTc` is its pose on the carrier, instead."""
 
     def finished(self, metres: float, image_size: tuple[int, int] | None, path: Path) -> Camera:
         """The camera in metres; InputError where its numbers are those of no camera."""
@@ -53,7 +57,8 @@ class WrittenCamera:
         size = self.image_size or image_size or (0, 0)
         with naming(path, "correct it in the file"):
             bend = padded_distortion(self.distortion, self.lens)
-            return Camera(self.name, self.K, wTc, size, bend, self.lens, self.readout_s)
+            mount = {"carrier": self.trajectory, "bTc": wTc} if self.trajectory else {}
+            return Camera(self.name, self.K, wTc, size, bend, self.lens, self.readout_s, **mount)
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,8 @@ class WrittenRig:
     """Which axis points up; None where the file and its format do not say."""
     cures: Mapping[str, str] = field(default_factory=dict)
     """How the user can say what the file does not, by field: "unit", "up" or "image_size"."""
+    trajectories: Sequence[Trajectory] = ()
+    """Where the carriers of cameras go."""
 
 
 @dataclass(frozen=True)

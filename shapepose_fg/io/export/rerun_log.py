@@ -69,7 +69,7 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
     up = f"RIGHT_HAND_{take.up[-1].upper()}_{'DOWN' if take.up[0] == '-' else 'UP'}"
     stream.log("world", getattr(rr.ViewCoordinates, up), static=True)
     if take.rig is not None:
-        _log_cameras(rr, stream, take.rig)
+        _log_cameras(rr, stream, take, take.rig)
         _log_observations(rr, stream, take, take.rig)
     mesh = None if arrays is None else thinned(arrays.template, arrays.faces)[:2]
     for person in range(len(take.persons)):
@@ -154,8 +154,14 @@ def _log_bodies(
             stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))
 
 
-def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
-    """The cameras, which stand still; their pictures are those of cameras without distortion."""
+def _log_cameras(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
+    """The cameras, frame by frame those that move; their pictures are those of cameras without distortion."""
+    for index, time_s in enumerate(take.times_s if rig.moves else ()):
+        _set_time(stream, take, index)
+        for camera, moves in zip(rig.at(np.full(len(rig), time_s)).cameras, rig.carrier >= 0, strict=True):
+            if moves:
+                pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
+                stream.log(camera_path(camera.name), pose)
     for camera in rig.cameras:
         pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
         lens = rr.Pinhole(
@@ -164,7 +170,7 @@ def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=0.4,
         )
-        stream.log(camera_path(camera.name), pose, lens, static=True)
+        stream.log(camera_path(camera.name), *([] if camera.carrier else [pose]), lens, static=True)
     words = {gate: gate.name.lower().replace("_", " ") for gate in _GATES}
     reasons = [rr.AnnotationInfo(id=int(gate), label=words[gate], color=_GATES[gate]) for gate in _GATES]
     stream.log(_CAMERAS, rr.AnnotationContext(reasons), static=True)

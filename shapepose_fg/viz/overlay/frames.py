@@ -52,9 +52,12 @@ class Overlay:
         people = people.rows(np.argsort(people.person, kind="stable"))
         body = self.body
         vertices, rows = (np.zeros((0, 0, 3)), ()) if body is None else surfaces(people, body)
-        drawn = []
+        drawn, rig = [], self.rig
+        if rig.moves and len(people) > 0:
+            lead_s = 0.0 if people.observations is None else people.observations.lead_s[0]
+            rig = rig.at(np.broadcast_to(people.time_s[0] + lead_s, len(rig)))
         for (used, footage), size in zip(self.cameras, sizes, strict=True):
-            camera = self.rig.cameras[self.rig.names.index(used.name)]
+            camera = rig.cameras[rig.names.index(used.name)]
             view = drawing.PictureView(camera, used.placement, size)
             picture = _picture(used, footage, frame, size)
             if body is not None:

@@ -61,7 +61,8 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
     frame, person = np.nonzero(take.rows[:, index].T >= 0)
     rows = take.rows[person, index[frame]]
     joints = take.people.joints[rows] @ axes.T
-    cameras = () if take.rig is None else take.rig.cameras
+    # Cameras that move are drawn where they are at first.
+    cameras = () if take.rig is None else take.rig.at(np.full(len(take.rig), take.times_s[:1].sum())).cameras
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3) @ axes.T
     pack = _packing(joints)
     sigma = sigma_m(take.people.covariance[rows])

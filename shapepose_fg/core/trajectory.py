@@ -1,0 +1,144 @@
+"""Where what carries cameras goes: a robot, a person, a crane; poses over time, from odometry or SLAM."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index, Mask
+
+DRIFT = 0.01
+"""Of an odometry that says nothing of its errors: wheels and cameras drift by about 1 % of the way."""
+LONGEST_GAP_S = 0.5
+"""Between poses that are farther apart nothing is interpolated: at a walk that is 0.7 m, at a turn 45 degrees."""
+_MOST_DRIFT = 1.0
+_START_M, _START_RAD = 0.05, 0.02
+"""How surely it is known where an odometry starts in the world of the cameras that stand still, per axis."""
+_M_A_RAD, _M_A_S = 0.5, 0.05
+"""A turn by a radian, and a second of standing still, count as so much way, metres."""
+_RAD_A_M = 0.5
+"""An odometry errs by so many radians where it errs by a metre: after 10 m of a straight way both count alike."""
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of what carries cameras, over time."""
+
+    name: str
+    """What it is called; cameras name their carrier so."""
+    time_s: Array
+    """(F,) seconds, rising, of the clock that the pictures' times are of."""
+    wTb: Array
+    """(F, 4, 4) world from carrier, metres."""
+    covariance: Array | None = None
+    """(F, 6, 6) of each pose against the world, turn then way along the carrier's own axes, rad² and m² (GTSAM's
+    order); None of an odometry, which knows its start and drifts."""
+    drift: float = DRIFT
+    """How far an odometry errs after a metre, as a part of it; errors add up like steps of a random walk."""
+    refined: bool = False
+    """Whether the people of a recording have corrected it (`pipeline.trajectories`): it is taken as it is."""
+
+    def __post_init__(self) -> None:
+        def refuse(problem: str) -> ValueError:
+            return ValueError(f"trajectory {self.name}: {problem}")
+
+        time_s, wTb = np.asarray(self.time_s, dtype=np.float64), np.asarray(self.wTb, dtype=np.float64)
+        if len(time_s) < 2 or time_s.ndim != 1 or wTb.shape != (len(time_s), 4, 4):
+            raise refuse(
+                f"time_s must be (F,) and wTb (F, 4, 4), F at least 2, got {time_s.shape} and {wTb.shape}"
+            )
+        if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
+            raise refuse("times and poses must be finite")
+        if (np.diff(time_s) <= 0).any():
+            raise refuse(f"times must rise, at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1} they do not")
+        R = wTb[:, :3, :3]
+        if np.abs(R @ R.mT - np.eye(3)).max() > _ROTATION_TOLERANCE or (np.linalg.det(R) < 0).any():
+            raise refuse("rotations must be orthonormal with determinant 1")
+        if not 0 < self.drift <= _MOST_DRIFT:
+            raise refuse(f"drift must be above 0 and at most {_MOST_DRIFT:g}, got {self.drift}")
+        if self.covariance is not None:
+            covariance = np.asarray(self.covariance, dtype=np.float64)
+            if covariance.shape != (len(time_s), 6, 6) or not np.isfinite(covariance).all():
+                raise refuse(f"covariance must be finite and {(len(time_s), 6, 6)}, got {covariance.shape}")
+            if np.linalg.eigvalsh(covariance)[:, 0].min() < -1e-9:
+                raise refuse("covariances must have no negative eigenvalue")
+            object.__setattr__(self, "covariance", covariance)
+        object.__setattr__(self, "time_s", time_s)
+        object.__setattr__(self, "wTb", wTb)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def covers(self, time_s: Array) -> Mask:
+        """(...,) which times lie between two poses that are near enough to each other."""
+        after = np.clip(np.searchsorted(self.time_s, time_s), 1, len(self) - 1)
+        near = (np.diff(self.time_s)[after - 1] <= LONGEST_GAP_S) | (self.time_s[after] == time_s)
+        return np.asarray((time_s >= self.time_s[0]) & (time_s <= self.time_s[-1]) & near)
+
+    def at(self, time_s: Array) -> Array:
+        """(..., 4, 4) poses at times (...,): places on straight lines, turns about one axis; ends stay."""
+        from scipy.spatial.transform import Rotation
+
+        flat, pose = np.ravel(time_s), np.tile(np.eye(4), (np.size(time_s), 1, 1))
+        before, part = self._place(flat)
+        R, last = self.wTb[before, :3, :3], self.wTb[before + 1, :3, :3]
+        turn = part[:, None] * Rotation.from_matrix(R.mT @ last).as_rotvec()
+        pose[:, :3, :3] = R @ Rotation.from_rotvec(turn).as_matrix()
+        pose[:, :3, 3] = self._between(self.wTb[:, :3, 3], flat)
+        return pose.reshape(*np.shape(time_s), 4, 4)
+
+    def covariance_at(self, time_s: Array) -> Array:
+        """(..., 6, 6) how surely the poses are known at times (...,); 0 where nothing is said of it."""
+        if self.covariance is None:
+            return np.zeros((*np.shape(time_s), 6, 6))
+        return self._between(self.covariance, np.ravel(time_s)).reshape(*np.shape(time_s), 6, 6)
+
+    def start_covariance(self) -> Array:
+        """(6, 6) how surely the first pose is known."""
+        if self.covariance is not None:
+            return self.covariance[0]
+        return np.diag([_START_RAD**2] * 3 + [_START_M**2] * 3)
+
+    def drifted(self, poses: Array, time_s: Array) -> Array:
+        """(T - 1, 6, 6) covariances of the steps between `poses` (T, 4, 4) of this odometry at `time_s` (T,)."""
+        steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+        cosine = np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1.0, 1.0)
+        way = np.linalg.norm(steps[:, :3, 3], axis=1) + _M_A_RAD * np.arccos(cosine) + _M_A_S * np.diff(time_s)
+        sigmas = np.array([_RAD_A_M] * 3 + [1.0] * 3) * self.drift
+        return way[:, None, None] * np.diag(sigmas**2)
+
+    def _between(self, values: Array, time_s: Array) -> Array:
+        """(M, ...) of `values` (F, ...) at times (M,), on straight lines; ends stay."""
+        before, part = self._place(time_s)
+        part = part.reshape(-1, *[1] * (values.ndim - 1))
+        return (1 - part) * values[before] + part * values[before + 1]
+
+    def _place(self, time_s: Array) -> tuple[Index, Array]:
+        """(M,) the pose before each of the times (M,), and how far each is on the way to the next, 0 to 1."""
+        before = np.clip(np.searchsorted(self.time_s, time_s) - 1, 0, len(self) - 2)
+        first, last = self.time_s[before], self.time_s[before + 1]
+        return before, np.clip((time_s - first) / (last - first), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Where carriers of cameras are at N moments, and how surely."""
+
+    carrier: Index
+    """(V,) which of the B carriers each view is on; -1 of a camera that stands still."""
+    wTb: Array
+    """(N, B, 4, 4) world from carrier."""
+    covariance: Array
+    """(N, B, 6, 6) as in `Trajectory`."""
+
+    @classmethod
+    def of(cls, trajectories: Iterable[Trajectory], carrier: Index, time_s: Array) -> "Carried":
+        """Those of N moments, at `time_s` (N,)."""
+        every = tuple(trajectories)
+        poses = np.stack([each.at(time_s) for each in every], axis=1)
+        return cls(carrier, poses, np.stack([each.covariance_at(time_s) for each in every], axis=1))
+
+    def rows(self, index: Index) -> "Carried":
+        """Some of the moments."""
+        return Carried(self.carrier, self.wTb[index], self.covariance[index])

@@ -1,0 +1,56 @@
+"""What it means for joints that poses of cameras that move are not known exactly."""
+
+import numpy as np
+
+from factors import kernel_weight
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Views
+from shapepose_fg.estimation.linearisation import Message, ObservationConfig, ViewEvidence, inverses
+
+_NOTHING = 1.0
+"""What a joint of which nothing is known is known to, 1/m²: a metre."""
+
+
+def carried_covariance(
+    evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
+) -> Array:
+    """(N, J, 3, 3) covariance of joints, m², that comes of their cameras' poses; zero where all stand still.
+
+    Joints are where they are most probable given the poses; the law of total covariance adds G S G^T, with S the
+    covariance of a pose and G how the joint goes with it: the share of its information that comes from cameras on
+    that carrier, times how a point goes with the carrier. A body is where its views have it: what it says goes
+    with each carrier as its person's joints do on average, and so does a joint that nothing is said of.
+    """
+    carried, points = views.carried, np.nan_to_num(evidence.points)
+    covariance = np.zeros((*points.shape, 3))
+    if carried is None or len(points) == 0:
+        return covariance
+    _, _, slope = views.project(points)
+    used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
+    sigma = np.where(used, sigmas, 1.0)
+    off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / sigma
+    weight = np.where(used, kernel_weight(config.robust_kernel, off) / sigma**2, 0.0)
+    slope = np.where(used[..., None, None], slope, 0.0)
+    of_views = np.einsum("njv,njvki,njvkl->njil", weight, slope, slope)
+    least = _NOTHING * np.eye(3)
+    total = inverses(of_views + body.information + least)
+    whole = np.maximum(np.trace(of_views.sum(axis=1), axis1=1, axis2=2), 1e-9)
+    for number in range(carried.wTb.shape[1]):
+        on = carried.carrier == number
+        own = np.einsum("njv,njvki,njvkl->njil", weight[..., on], slope[..., on, :, :], slope[..., on, :, :])
+        share = np.trace(own.sum(axis=1), axis1=1, axis2=2) / whole
+        gain = total @ (own + share[:, None, None, None] * (body.information + least))
+        R, t = carried.wTb[:, number, :3, :3], carried.wTb[:, number, :3, 3]
+        arm = points - t[:, None]
+        # With a turn w and a way v along the carrier's axes a point goes by R w x arm + R v.
+        goes = np.concatenate([-_cross(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
+        goes = gain @ goes
+        covariance += goes @ carried.covariance[:, number][:, None] @ goes.swapaxes(-1, -2)
+    return covariance
+
+
+def _cross(v: Array) -> Array:
+    """(..., 3, 3) the matrices of the cross products with vectors (..., 3)."""
+    x, y, z = (v[..., n] for n in range(3))
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)

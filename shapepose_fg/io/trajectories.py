@@ -1,0 +1,125 @@
+"""Trajectories of what carries cameras: TUM's text and our own CSV, which may say how surely poses are known."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.io.validation import is_number
+
+POSE = ("time_s", "x", "y", "z", "qx", "qy", "qz", "qw")
+"""The columns of a pose: TUM's eight numbers, in its order."""
+_ERRORS = ("rx", "ry", "rz", "x", "y", "z")
+COVARIANCE = tuple(f"{a}_{b}" for n, a in enumerate(_ERRORS) for b in _ERRORS[n:])
+"""The columns of a covariance: `rx_rx` to `z_z`, its upper triangle, rad and m along the carrier's own axes."""
+_MOST_BYTES = 2**28
+_MOST_METRES = 1e6
+_UNIT = 0.01
+"""How far the length of a quaternion may be from 1."""
+_SHORTEST_S = 1e-6
+
+
+def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
+    """Read the poses of a carrier: world from carrier, metres, seconds on the clock of the pictures.
+
+    Eight numbers a line (TUM: time x y z qx qy qz qw), apart by blanks or commas; or with a header that names the
+    columns `POSE` in any order, and those of `COVARIANCE` that there are: the diagonal at least. `#` begins a
+    comment. InputError, one sentence that names file, line and cure.
+    """
+    from scipy.spatial.transform import Rotation
+
+    path = Path(path)
+    names, numbers, lines = _table(path)
+    if len(numbers) < 2:
+        raise InputError(f"{path}: a trajectory needs 2 poses or more, got {len(numbers)}; write a line for each")
+    columns = {each: numbers[:, place] for place, each in enumerate(names)}
+    pose = np.column_stack([columns[each] for each in POSE])
+    far = np.abs(pose[:, 1:4]).max(axis=1) > _MOST_METRES
+    if far.any():
+        raise InputError(f"{path}: line {lines[far][0]} is over {_MOST_METRES:g} m away; write metres")
+    length = np.linalg.norm(pose[:, 4:], axis=1)
+    wrong = ~(np.abs(length - 1) < _UNIT)
+    if wrong.any():
+        got = f"line {lines[wrong][0]}: the quaternion qx qy qz qw must have length 1, got {length[wrong][0]:.4g}"
+        raise InputError(f"{path}: {got}; write time x y z qx qy qz qw, qw last")
+    late = np.flatnonzero(np.diff(pose[:, 0]) < _SHORTEST_S)
+    if len(late) > 0:
+        raise InputError(f"{path}: line {lines[late[0] + 1]} must be later than the pose before; sort by time")
+    wTb = np.tile(np.eye(4), (len(pose), 1, 1))
+    wTb[:, :3, :3], wTb[:, :3, 3] = Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4]
+    covariance = None
+    if any(each in columns for each in COVARIANCE):
+        zero = np.zeros(len(pose))
+        upper = np.column_stack([columns.get(each, zero) for each in COVARIANCE])
+        covariance = np.zeros((len(pose), 6, 6))
+        row, column = np.triu_indices(6)
+        covariance[:, row, column] = covariance[:, column, row] = upper
+        odd = np.linalg.eigvalsh(covariance)[:, 0] < -1e-9
+        if odd.any():
+            what = f"line {lines[odd][0]}: the covariance must have no negative eigenvalue"
+            raise InputError(f"{path}: {what}; write variances, rad² and m², of the carrier's own axes")
+    with naming(path, "correct it in the file"):
+        return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
+
+
+def write_trajectory(trajectory: Trajectory, path: Path) -> None:
+    """Write a trajectory as CSV with a header, covariances in it; or, `.tum`, as TUM's text, without."""
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(trajectory.wTb[:, :3, :3]).as_quat(canonical=True)
+    numbers = np.column_stack([trajectory.time_s, trajectory.wTb[:, :3, 3], quaternions])
+    if path.suffix == ".tum":
+        write_content(path, "".join(" ".join(map(repr, row)) + "\n" for row in numbers.tolist()))
+        return
+    header = list(POSE)
+    if trajectory.covariance is not None:
+        row, column = np.triu_indices(6)
+        numbers, header = np.column_stack([numbers, trajectory.covariance[:, row, column]]), [*POSE, *COVARIANCE]
+    text = "".join(",".join(map(repr, row)) + "\n" for row in numbers.tolist())
+    write_content(path, ",".join(header) + "\n" + text)
+
+
+def _table(path: Path) -> tuple[list[str], Array, Index]:
+    """Names of the columns, the numbers (F, C), and the line of the file that each row is from."""
+    names, rows, lines = list[str](), list[list[float]](), list[int]()
+    for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
+        words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
+        if len(words) == 0:
+            continue
+        if len(names) == 0:
+            names = list(POSE) if is_number(words[0]) else words
+            _check_columns(path, line, names)
+            if names is words:
+                continue
+        if len(words) != len(names):
+            raise InputError(
+                f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; correct the line"
+            )
+        wrong = next((word[:20] for word in words if not is_number(word)), None)
+        if wrong is not None:
+            raise InputError(f"{path}: line {line} must hold numbers, got {wrong!r}; write seconds and metres")
+        rows.append([float(word) for word in words])
+        lines.append(line)
+    return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
+
+
+def _check_columns(path: Path, line: int, names: list[str]) -> None:
+    """InputError where the columns are not those of a trajectory."""
+    known = {*POSE, *COVARIANCE}
+    odd = next((name[:20] for name in names if name not in known or names.count(name) > 1), None)
+    missing = next((name for name in POSE if name not in names), None)
+    if odd is not None or missing is not None:
+        what = (
+            f"column {odd!r} is not known, or twice there" if odd is not None else f"column {missing} is missing"
+        )
+        raise InputError(
+            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and of covariances rx_rx ..."
+        )
+    diagonal = [f"{each}_{each}" for each in _ERRORS]
+    lacks = next((name for name in diagonal if name not in names), None)
+    if lacks is not None and any(name in names for name in COVARIANCE):
+        raise InputError(f"{path}: line {line}: the covariance lacks {lacks}; give {' '.join(diagonal)} at least")

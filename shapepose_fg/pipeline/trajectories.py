@@ -1,0 +1,227 @@
+"""Where the cameras of a recording that move went: their odometry, corrected by the people that they see.
+
+People are followed with the poses as they are corrected so far; each window's people and poses are solved together
+(`estimation/trajectory_graph.py`), and at the end the poses of the whole recording in one graph, in which each
+window's people stand as what they say of the poses.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import gaussian
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import naming
+from shapepose_fg.core.frame_times import segments
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
+from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.estimation.trajectory_graph import CameraFactors, Mounted, TrajectoryGraph, poses_of, symmetric
+from shapepose_fg.pipeline.solved_windows import SolvedWindows
+from shapepose_fg.pipeline.windows import Span
+
+_SAME_S = 1e-4
+"""Poses nearer to a frame than this are not kept beside the frame's own."""
+_KEPT = "trajectories"
+"""The name under which a run keeps them, and the number of each behind it."""
+
+
+def unrefined(rig: Rig) -> bool:
+    """Whether cameras move whose trajectories people have not corrected yet."""
+    return rig.moves and not all(each.refined for each in rig.trajectories)
+
+
+def kept_rig(kept: KeptArrays, rig: Rig) -> Rig | None:
+    """The rig with the trajectories that a run has kept; None where it has none yet, or needs none."""
+    if not rig.moves:
+        return None
+    found = []
+    for number, trajectory in enumerate(rig.trajectories):
+        name = f"{_KEPT}-{number}"
+        if len(kept.names(name)) == 0:
+            return None
+        with naming(kept.place(name), ANEW):
+            arrays = {each: kept.array(name, each) for each in ("time_s", "wTb", "covariance")}
+            found.append(replace(trajectory, **arrays, refined=True))
+    return replace(rig, trajectories=tuple(found))
+
+
+def keep(kept: KeptArrays, rig: Rig) -> None:
+    """What `kept_rig` gives."""
+    for number, each in enumerate(rig.trajectories):
+        kept.keep(
+            f"{_KEPT}-{number}",
+            {"time_s": each.time_s, "wTb": each.wTb, "covariance": each.covariance_at(each.time_s)},
+        )
+
+
+def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) -> Rig:
+    """The rig of `windows` with trajectories as the people of the recording have them, and their covariances."""
+    rig, time_s = windows.setup.rig, windows.times.of_views(len(windows.setup.rig))
+    frames = np.arange(windows.frames.start, windows.frames.stop)
+    if len(frames) < 2:
+        return replace(rig, trajectories=tuple(replace(each, refined=True) for each in rig.trajectories))
+    whole = Mounted(rig, frames, time_s[frames])
+    poses, of_people = whole.odometry.copy(), list[gtsam.NonlinearFactor]()
+    still = (rig.carrier < 0).any()
+    if still or len(rig.trajectories) > 1 or camera_factors is not None:
+        passing = _Pass(windows, time_s, camera_factors)
+        for graph in passing.graphs():
+            own = graph.mounted.frames - frames[0]
+            poses[own[0] :] = passing.corrected(whole.odometry[own[0] :])
+            poses[own] = graph.poses
+            of_people += graph.of_poses()
+    poses, covariance = _smoothed(whole, poses, of_people)
+    refined = [
+        _refined(trajectory, whole.time_s, poses[:, n], whole.odometry[:, n], covariance[:, n])
+        for n, trajectory in enumerate(rig.trajectories)
+    ]
+    return replace(rig, trajectories=tuple(refined))
+
+
+def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
+    """What run.json says of trajectories: cameras, way, how far people corrected them, how sure they are."""
+    told = []
+    for number, (old, new) in enumerate(zip(given.trajectories, refined.trajectories, strict=True)):
+        cameras = [name for name, on in zip(given.names, given.carrier, strict=True) if on == number]
+        was, covariance = old.at(new.time_s), new.covariance_at(new.time_s)
+        moved = np.linalg.norm(new.wTb[:, :3, 3] - was[:, :3, 3], axis=1)
+        cosine = (np.trace(new.wTb[:, :3, :3] @ was[:, :3, :3].mT, axis1=1, axis2=2) - 1) / 2
+        variance = np.einsum("tii->ti", covariance)
+        told.append(
+            {
+                "carrier": new.name,
+                "cameras": cameras,
+                "refined": new.refined,
+                "way_m": round(float(np.linalg.norm(np.diff(new.wTb[:, :3, 3], axis=0), axis=1).sum()), 3),
+                "moved_mm": round(1e3 * float(moved.max()), 1),
+                "turned_deg": round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).max())), 3),
+                "sigma_mm": round(1e3 * float(np.sqrt(np.median(variance[:, 3:].mean(axis=1)))), 1),
+                "sigma_deg": round(float(np.degrees(np.sqrt(np.median(variance[:, :3].mean(axis=1))))), 3),
+            }
+        )
+    return told
+
+
+@dataclass
+class _Pass:
+    """Through the recording once, window by window."""
+
+    windows: SolvedWindows
+    """The recording."""
+    time_s: Array
+    """(T, V) when each view took each frame."""
+    camera_factors: CameraFactors | None
+    """The user's own."""
+    correction: Array = field(init=False)
+    """(B, 4, 4) from where the odometry has each carrier to where it is, in the world, so far."""
+    _before: gtsam.NonlinearFactorGraph | None = None
+    """What is known of the last poses of the last window; None before the first."""
+
+    def __post_init__(self) -> None:
+        self.correction = np.tile(np.eye(4), (len(self.windows.setup.rig.trajectories), 1, 1))
+
+    def corrected(self, odometry: Array) -> Array:
+        """(T, B, 4, 4) poses as the odometry has them, corrected by what is known so far."""
+        return self.correction @ odometry
+
+    def graphs(self) -> Iterator[TrajectoryGraph]:
+        """Each window's people and poses, solved."""
+        windows, setup = self.windows, self.windows.setup
+        engine, last = setup.engine(windows.book), None
+        for segment in segments(windows.frames, windows.cuts):
+            state = engine.start()
+            for start in range(segment.start, segment.stop, setup.config.batch_frames):
+                batch = range(start, min(start + setup.config.batch_frames, segment.stop))
+                reader = replace(windows, setup=replace(setup, rig=self._rig()))
+                given = [reader.read(frame) for frame in batch]
+                with windows.book.stage("trajectories"):
+                    spans, state = engine.follow(state, given, last=batch.stop == segment.stop)
+                    for span in spans:
+                        graph = self._solved(span, last)
+                        last = int(graph.mounted.frames[-1])
+                        yield graph
+
+    def _rig(self) -> Rig:
+        """The rig as it is corrected so far."""
+        rig = self.windows.setup.rig
+        moved = [
+            replace(each, wTb=correction @ each.wTb)
+            for each, correction in zip(rig.trajectories, self.correction, strict=True)
+        ]
+        return replace(rig, trajectories=tuple(moved))
+
+    def _solved(self, span: Span, last: int | None) -> TrajectoryGraph:
+        """A window's own frames, and the `last` one before them, whose poses are known."""
+        setup = self.windows.setup
+        own = span.decided[span.start : span.stop]
+        frames = np.array([*([] if last is None else [last]), *(frame.frame for frame, _ in own)])
+        mounted = Mounted(setup.rig, frames, self.time_s[frames])
+        anchors = gtsam.NonlinearFactorGraph() if self._before is None else self._before
+        for carrier in range(len(setup.rig.trajectories)):
+            for factor in mounted.steps(carrier) + mounted.known(carrier)[0 if last is None else 1 :]:
+                anchors.push_back(factor)
+        graph = TrajectoryGraph(
+            mounted,
+            Observations.concatenate([rows for _, rows in own]),
+            self.corrected(mounted.odometry),
+            setup.config.observations,
+            setup.skeleton.joints,
+            self.camera_factors,
+        )
+        graph.solve(anchors)
+        self.correction = graph.poses[-1] @ np.linalg.inv(mounted.odometry[-1])
+        self._before = _known(graph, anchors)
+        return graph
+
+
+def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+    """What a solved window knows of its last poses, each carrier by itself."""
+    both, values = gtsam.NonlinearFactorGraph(anchors), gtsam.Values()
+    for factor in graph.of_poses():
+        both.push_back(factor)
+    for key, pose in zip(graph.keys.ravel().tolist(), graph.poses.reshape(-1, 4, 4), strict=True):
+        values.insert(key, gtsam.Pose3(pose))
+    marginals, known = gtsam.Marginals(both, values), gtsam.NonlinearFactorGraph()
+    for key in graph.keys[-1].tolist():
+        noise = gaussian(symmetric(marginals.marginalCovariance(key)))
+        known.addPriorPose3(key, values.atPose3(key), noise)
+    return known
+
+
+def _smoothed(whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFactor]) -> tuple[Array, Array]:
+    """(T, B, 4, 4) the poses of all frames in one graph, from `poses` on, and their covariances (T, B, 6, 6)."""
+    graph, values, keys = gtsam.NonlinearFactorGraph(), gtsam.Values(), whole.keys()
+    for key, pose in zip(keys.ravel().tolist(), poses.reshape(-1, 4, 4), strict=True):
+        values.insert(key, gtsam.Pose3(pose))
+    for carrier in range(keys.shape[1]):
+        for factor in whole.steps(carrier) + whole.known(carrier):
+            graph.push_back(factor)
+    for factor in of_people:
+        graph.push_back(factor)
+    parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    parameters.setOrdering(gtsam.Ordering(keys.ravel().tolist()))
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    marginals = gtsam.Marginals(graph, solved)
+    covariance = np.array([marginals.marginalCovariance(key) for key in keys.ravel().tolist()])
+    return poses_of(solved, keys), symmetric(covariance).reshape(*keys.shape, 6, 6)
+
+
+def _refined(given: Trajectory, time_s: Array, poses: Array, odometry: Array, covariance: Array) -> Trajectory:
+    """The trajectory through `poses` (T, 4, 4) at the frames' times, and between them along the odometry."""
+    middle = time_s.mean(axis=1)
+    first, last = np.searchsorted(given.time_s, [time_s.min(), time_s.max()])
+    own = given.time_s[max(first - 1, 0) : last + 1]
+    # What is as good as at a frame is the frame's.
+    place = np.clip(np.searchsorted(middle, own), 1, len(middle) - 1)
+    near = np.minimum(np.abs(middle[place] - own), np.abs(middle[place - 1] - own)) < _SAME_S
+    times = np.sort(np.concatenate([own[~near], middle]))
+    correction = Trajectory(given.name, middle, poses @ np.linalg.inv(odometry))
+    surely = Trajectory(given.name, middle, poses, covariance).covariance_at(times)
+    return replace(
+        given, time_s=times, wTb=correction.at(times) @ given.at(times), covariance=surely, refined=True
+    )
