@@ -6,6 +6,7 @@ import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.shapes import SubjectShapes as SubjectShapes
 
 _OPEN_BODY = Path(__file__).with_name("data") / "open_body.npz"
@@ -33,9 +34,7 @@ def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -
     factor = _log_evidence(seen, gradient, known.betas, known.information)
     factor -= _log_evidence(seen, gradient, np.zeros((1, len(eye))), eye[None])
     gain = np.maximum(factor - np.log(ratio), 0.0)
-    from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
-
-    rows, columns = linear_sum_assignment(gain, maximize=True)
+    rows, columns = least_cost_pairs(-gain)
     kept = gain[rows, columns] > 0
     whose[rows[kept]] = columns[kept]
     return whose

@@ -23,6 +23,8 @@ _SETTLED_M = 5e-4
 """Chains are solved until no joint moves by more, metres."""
 _STEPS = 20
 """Or for so many steps: under a robust kernel the last ones halve what is left."""
+_HELD = 1e-6
+"""Information that holds a joint of a frame by itself where it is, 1/m²: a kilometre."""
 UNDETERMINED_M = 10.0
 """A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
 determined."""
@@ -128,6 +130,35 @@ class Chains:
         parts = states.reshape(*states.shape[:2], -1, 3).swapaxes(0, 1)
         for n, part in enumerate(self.parts):
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
+
+
+def solved_apart(seen: Projections, pulls: Message, initial: Array, steps: int, settled_m: float) -> Array:
+    """(R, J, 3) joints of least cost, metres, in R frames that have nothing to do with each other; NaN where
+    `initial` (R, J, 3) is. One that is led farther away than `UNDETERMINED_M` stays there. There are at the most
+    so many `steps`, until one is shorter than `settled_m`.
+    """
+    R, J = initial.shape[:2]
+    known = np.isfinite(initial).all(axis=-1, keepdims=True)
+    start = np.where(known, initial, 0.0)
+    # Held where it is by next to nothing: with one view its depth would be nowhere.
+    information = pulls.information + _HELD * np.eye(3)
+    right = (pulls.information @ pulls.xyz[..., None])[..., 0] + _HELD * start
+    found = start.copy()
+    together = [slice(None)] if len(seen.views.projection) == 1 else [slice(n, n + 1) for n in range(R)]
+    for n, rows in enumerate(together):  # one state a chain
+        states, xy, weight, own, to = (
+            ready(each[rows].reshape(-1, *each.shape[2:]))
+            for each in (found, seen.xy, seen.weight, information, right)
+        )
+        states = states[:, None]
+        solve_chains(
+            states, np.arange(len(states)), own[:, None], np.empty((len(states), 0, 3, 3)), to[:, None],
+            seen.views.projection[n : n + 1], xy[None], weight[None], np.zeros((1, *weight.shape)),
+            ROBUST[seen.kernel], seen.width, steps, settled_m, np.empty((0, 1, 1, 1)),
+        )  # fmt: skip
+        found[rows] = states.reshape(-1, J, 3)
+    far = np.abs(found - start).max(axis=-1, keepdims=True) > UNDETERMINED_M
+    return np.where(known, np.where(far, start, found), np.nan)
 
 
 def motion_information(law: Motion, dt_s: Array, density: Array) -> tuple[Array, Array]:

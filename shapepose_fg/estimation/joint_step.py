@@ -1,26 +1,62 @@
-"""The X step: one person's joints, solved with what the views and the body say of them."""
+"""The X step: people's joints, solved with what the views and the body say of them."""
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import interpolated
+from shapepose_fg.estimation.joint_chains import Projections, solved_apart
 from shapepose_fg.estimation.linearisation import Message, ViewEvidence
 from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import WindowGraph
 
+_SIGMA_M = 0.02
+"""Of a joint that several views see, about, metres."""
+
+
+def solve_between(
+    observed: Observations,
+    sigmas_px: Array,
+    cameras: Views,
+    evidence: ViewEvidence,
+    of_body: Message,
+    config: EstimatorConfig,
+) -> Array:
+    """X (R, J, 3) of people in frames by themselves, metres, without a graph: what goes from round to round.
+
+    About what GTSAM comes to from the same; it starts there when it has the last word.
+    """  # fmt: skip
+    initial = _start(evidence.points, evidence.sigma_m, of_body, config)
+    scale = 1.0 / np.sqrt(config.graph.weight_2d)  # as in `WindowGraph`
+    used = evidence.inlier & (sigmas_px > 0) & np.isfinite(initial[..., :1])
+    kernel, in_step = config.observations.robust_kernel, np.zeros(used.shape)
+    seen = Projections(cameras, observed.xy, sigmas_px * scale, used, in_step, kernel, scale)
+    pulls, solver = of_body.where(of_body.known, config.graph.weight_shape), config.graph
+    # The error changes with the square of a step: about one of a hundredth of a sigma is the tolerance of 1e-4.
+    return solved_apart(seen, pulls, initial, solver.max_iterations, _SIGMA_M * float(np.sqrt(solver.tolerance)))
+
 
 def solve_joints(
-    person: WindowGraph, evidence: ViewEvidence, of_body: Message, part: slice, config: EstimatorConfig
+    person: WindowGraph,
+    evidence: ViewEvidence,
+    of_body: Message,
+    part: slice,
+    config: EstimatorConfig,
+    near: Array | None = None,
 ) -> Array:
-    """X (T, J, 3) of one person, metres, whose rows are a `part` of those of views and body; NaN where unknown."""
+    """X (T, J, 3) of one person, metres, whose rows are a `part` of those of views and body; NaN where unknown.
+
+    Of a frame by itself the solver may start `near` (1, J, 3) what `solve_between` came to.
+    """
     views, body = evidence.message.rows(part), of_body.rows(part)
     inlier, sigma_m, points = evidence.inlier[part], evidence.sigma_m[part], evidence.points[part]
-    placed = sigma_m <= config.refine.max_sigma_m
-    initial = np.where(placed[..., None], points, np.where(body.known[..., None], body.xyz, np.nan))
+    initial = _start(points, sigma_m, body, config)
     if not person.temporal:
-        return person.solve(inlier & (placed | body.known)[..., None], views, body, initial)
+        used = inlier & np.isfinite(initial[..., :1])
+        return person.solve(used, views, body, initial if near is None else near)
     initial = interpolated(np.where(np.isfinite(points), points, initial), person.times_s)
     # X_0 alone is no evidence: a joint that nobody says anything of has nothing that determines it.
     mentioned = (inlier.any(axis=-1) | body.known).any(axis=0) | person.touched
@@ -28,3 +64,9 @@ def solve_joints(
     lost = sigma_m > LOST_M
     feet = feet_of(config.joints if config.motion.contact else ())
     return person.solve(inlier, views, body, initial, lost, feet)
+
+
+def _start(points: Array, sigma_m: Array, body: Message, config: EstimatorConfig) -> Array:
+    """Where joints (R, J, 3) start that views place, at `points`, or the body; NaN where neither does."""
+    placed = sigma_m <= config.refine.max_sigma_m
+    return np.where(placed[..., None], points, np.where(body.known[..., None], body.xyz, np.nan))

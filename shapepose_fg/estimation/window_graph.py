@@ -250,7 +250,7 @@ class WindowGraph:
         by_joint = self.states.swapaxes(0, 1)
         ordering = gtsam.Ordering(by_joint[self._there.swapaxes(0, 1)].tolist())
         try:
-            if not (self.temporal and not self.touched.any() and self._confirmed(ordering)):
+            if self.touched.any() or not self._confirmed(ordering):
                 self._descend(None if self.coupled else ordering)
         except RuntimeError:
             self.failure = "the solver failed: its system is singular"

@@ -15,14 +15,14 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.joint_step import solve_joints
+from shapepose_fg.estimation.joint_step import solve_between, solve_joints
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import carried_to_frames, velocities_of, widened
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
-from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
@@ -122,25 +122,37 @@ def solve_window(
         pulled |= evidence.sigma_m > config.refine.max_sigma_m
         of_body = step.message(body, targets, pulled)
 
-        # Joints: the X step.
+        # Joints: the X step. GTSAM has the last word on frames by themselves when they are done.
         parts = parts_of(moving)
-        X_new = np.concatenate([solve_joints(person, evidence, of_body, part, config) for person, part in parts])
-        state.put(rows, X_new, evidence, wrong, of_body, body)
-        for person, _ in parts:
-            velocity[person.rows] = np.nan_to_num(person.velocity)
+        near = X
+        if any(map(_waits, moving)):
+            near = solve_between(observed, sigma, cameras, evidence, of_body, config)
+        X_new = np.concatenate([
+            near[part] if _waits(person) else solve_joints(person, evidence, of_body, part, config)
+            for person, part in parts
+        ])  # fmt: skip
 
         # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
         before = np.where((of_body.known | wrong)[..., None], X, fitted)
         still = np.linalg.norm(X_new - before, axis=-1) < config.refine.settled_m
         settled = (still | np.isnan(X_new).any(axis=-1)).all(axis=1)
-        more = n + 1 < config.refine.window_alternations
-        moving = [
-            person
-            for person, part in parts
-            if not settled[part].all() and (more or not person.temporal or person.touched.any())
-        ]
+        last, more = n + 1 == config.refine.alternations, n + 1 < config.refine.window_alternations
+        moving = list[WindowGraph]()
+        for person, part in parts:
+            goes_on = more or not person.temporal or person.touched.any()
+            if not last and goes_on and not settled[part].all():
+                moving.append(person)
+            elif _waits(person):
+                X_new[part] = solve_joints(person, evidence, of_body, part, config, near[part])
+            velocity[person.rows] = np.nan_to_num(person.velocity)
+        state.put(rows, X_new, evidence, wrong, of_body, body)
         if len(moving) == 0:
             break
     solution = outcome(state, fitter)
     solution.seconds.update({"associate again": assigned - began, "solve": time.perf_counter() - assigned})
     return solution
+
+
+def _waits(person: WindowGraph) -> bool:
+    """Whether a person's graph is solved in the last round only."""
+    return not person.temporal and not person.touched.any()

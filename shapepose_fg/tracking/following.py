@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.bounds import Seconds, Settings
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
@@ -153,12 +154,9 @@ def _identities(
     early = np.flatnonzero(needed & (chosen.start == 0))
     carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
     apart = core_distance(found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton)
-    if apart.size > 0:
-        from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
-
-        for row, column in zip(*linear_sum_assignment(np.minimum(apart, 2 * _SAME_M)), strict=True):
-            if apart[row, column] < _SAME_M:
-                identity[early[row]] = found.carried[carried[column]]
+    for row, column in zip(*least_cost_pairs(np.minimum(apart, 2 * _SAME_M)), strict=True):
+        if apart[row, column] < _SAME_M:
+            identity[early[row]] = found.carried[carried[column]]
     next_id = state.next_id
     for k in np.argsort(chosen.start, kind="stable").tolist():
         if not needed[k] or identity[k] >= 0:

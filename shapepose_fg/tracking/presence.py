@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
+from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.pieces import project
 from shapepose_fg.core.skeleton import Skeleton
@@ -272,9 +273,7 @@ class Account:
         owners = owners[:, :-1][:, (owners[:, :-1] >= 0).any(axis=0)]
         shared = np.zeros((len(one.start) + 1, len(other.start) + 1))
         np.add.at(shared, tuple(owners), 1.0)  # the last row and column are nobody's
-        from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
-
-        same = linear_sum_assignment(shared[:-1, :-1], maximize=True)
+        same = least_cost_pairs(-shared[:-1, :-1])
         return float(shared[same].sum() / owners.shape[1]) if owners.shape[1] > 0 else 1.0
 
     def left_over(self, chosen: Chosen) -> Chosen:

@@ -162,13 +162,13 @@ def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
 
 def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
     """For tracks that are joined the one before, of pairs (K,) that may be: as many as can be, the likeliest."""
-    if len(before) == 0:
-        return {}
+    rows, row = np.unique(before, return_inverse=True)
+    columns, column = np.unique(after, return_inverse=True)
+    if len(rows) == len(columns) == len(before):  # nobody has a choice
+        return dict(zip(after.tolist(), before.tolist(), strict=True))
     from scipy.sparse import csr_array  # with all of SciPy that it needs: a sixth of a second
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-    rows, row = np.unique(before, return_inverse=True)
-    columns, column = np.unique(after, return_inverse=True)
     count, nobody = len(rows), len(columns) + np.arange(len(rows))  # each track may have nobody after it
     # A pair more counts more than all that others can gain by it. A cost of 0 would be no pair.
     alone = 2.0 + count * float(cost.max(initial=0.0))

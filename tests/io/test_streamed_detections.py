@@ -13,6 +13,7 @@ from shapepose_fg.core.storage import files
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.detections.association_text import NumberStream
 from shapepose_fg.io.detections.json_people import read_one_file
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
@@ -181,3 +182,16 @@ def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypa
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0]
+
+
+@pytest.mark.parametrize("other", ["", "1e-07", "+3", "1234567890123456789", "0.1234567890123456789"])
+def test_numbers_are_read_as_python_reads_them(other, tmp_path):
+    rng = np.random.default_rng(0)
+    words = [f"{value:.{digits}f}" for digits in range(13) for value in rng.normal(0, 9, 200)]
+    words += ["-0", "5.", ".5", "-.25", "0000.10", "999999999999999", "0.00000000000001", *other.split()]
+    file = tmp_path / "numbers.txt"
+    file.write_bytes(" \n\t\r\n".join(words).encode())
+    stream = NumberStream(file)
+    assert stream.reaches(len(words)) and not stream.reaches(len(words) + 1)
+    expected = np.array([float(word) for word in words])
+    assert stream.values.tobytes() == expected.tobytes()  # to the last bit, and the sign of zero

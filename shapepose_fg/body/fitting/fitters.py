@@ -1,6 +1,7 @@
 """The body fitter: judge targets, plan passes, fit them, share shapes, fit again; with the network on or off."""
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -89,8 +90,6 @@ class SmplFitter(BodyFitter):
         self.weights = weights
         """Of the network; None: it is off."""
         self.energy = BodyEnergy(self.model, self.prior)
-        self.sets = left_out_sets(self.energy, self.prior)
-        """(J,) which joints are left out together."""
         plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
         names = self.model.keypoint_names
         if weights is None:
@@ -100,6 +99,11 @@ class SmplFitter(BodyFitter):
             weights.check(self.model)
             self.optimiser = NetworkDescent(self.energy, weights, config.kernel_scale, config.polish_steps)
             self._fallback, self._unfinished, self._spread = plain, config.unfinished, weights.spread_of(names)
+
+    @cached_property
+    def sets(self) -> Index:
+        """(J,) which joints are left out together."""
+        return left_out_sets(self.energy, self.prior)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "SmplFitter":
         """The same fitter for a detector that puts its joints so far from the body's."""
@@ -151,7 +155,7 @@ class SmplFitter(BodyFitter):
         self, targets: JointTargets, initial: BodyFit | None, groups: Index | None, *, leave_out: bool
     ) -> BodyFit:
         """A body for every row."""
-        count = len(self.sets)
+        count = len(self.model.keypoint_names)
         if targets.xyz.shape[1] != count:
             raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
         if initial is not None and len(initial) != len(targets):

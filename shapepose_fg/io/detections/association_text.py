@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
 from shapepose_fg.core.storage.files import text_pieces
@@ -23,6 +25,8 @@ from shapepose_fg.proposal.assignment import match_best_first
 
 _LONGEST_WORD = 2**20
 """No number is as long."""
+_POWERS: Array = np.array([10.0**power for power in range(16)])
+"""Of ten."""
 _SPACE = " \n\t"
 """Pieces end behind one of these, so that no number, letter or end of line is cut."""
 SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
@@ -94,11 +98,16 @@ class NumberStream:
         self._pieces = _whole_words(path)
         self._most = path.stat().st_size // 2 + 1
 
+    @property
+    def known(self) -> int:
+        """How many numbers of the file have been read."""
+        return self.first + len(self.values)
+
     def reaches(self, count: int) -> bool:
         """Whether the file has so many numbers; they are in memory then."""
         if count > self._most:  # no room in the file: it is not read to its end for that
             return False
-        parts, known = [self.values], self.first + len(self.values)
+        parts, known = [self.values], self.known
         while known < count and (text := next(self._pieces, None)) is not None:
             parts.append(self._numbers(text, known))
             known += len(parts[-1])
@@ -116,6 +125,10 @@ class NumberStream:
 
     def _numbers(self, text: str, first: int) -> Array:
         """The numbers of a piece, finite; `first` are before it."""
+        plain = np.empty(len(text) // 2 + 1)
+        count = _plain_numbers(np.frombuffer(bytearray(text, "utf-8"), dtype=np.uint8), _POWERS, plain)
+        if count >= 0:
+            return plain[:count].copy()
         tokens = text.split()
         try:
             values = np.array(tokens, dtype=np.float64)
@@ -140,6 +153,35 @@ class NumberStream:
             # A line that goes on in the next piece is not over.
             lines += len((text + "|").splitlines()) - 1
         return last
+
+
+@kernel
+def _plain_numbers(text: NDArray[np.uint8], powers: Array, values: Array) -> int:
+    """Fill in the numbers of a `text`, each a sign, up to 15 digits and a point, as the nearest doubles: a whole
+    number and a power of ten, both exact, are divided. Returns how many; -1 where one is written otherwise.
+    """
+    at, count = 0, 0
+    while at < len(text):
+        if text[at] == 32 or 9 <= text[at] <= 13:
+            at += 1
+            continue
+        sign, whole, digits, places, point = 1.0, 0.0, 0, 0, False
+        if text[at] == 45:
+            sign, at = -1.0, at + 1
+        while at < len(text) and text[at] > 32:
+            if 48 <= text[at] <= 57:
+                whole, digits = 10.0 * whole + (text[at] - 48.0), digits + 1
+                places += point
+            elif text[at] == 46 and not point:
+                point = True
+            else:
+                return -1
+            at += 1
+        if not 0 < digits < len(powers):
+            return -1
+        values[count] = sign * whole / powers[places]
+        count += 1
+    return count
 
 
 def read_association_text(path: Path, camera: Camera) -> ViewStream:
@@ -229,16 +271,18 @@ def _layout(
     arrays.
     """
 
-    def reach(count: int, frame: int, what: str) -> None:
+    def reach(count: int, what: str) -> None:
         if not numbers.reaches(count):
             problem = f"the file ends in frame {frame} of {frame_count}, where {what} should be"
             raise numbers.refuse(None, problem, "copy or write it again whole")
 
-    counts, starts = [], []
+    known, counts, starts = numbers.known, [], []
     for frame in frames:
         frame_counts, frame_starts = [], []
         for name in kind.joints:
-            reach(position + 1, frame, f"the number of candidates of {name}")
+            if position >= known:
+                reach(position + 1, f"the number of candidates of {name}")
+                known = numbers.known
             n = numbers.values[position - numbers.first]
             if n < 0 or n != int(n):
                 raise numbers.refuse(
@@ -249,11 +293,15 @@ def _layout(
             frame_counts.append(int(n))
             frame_starts.append(position + 1)
             position += 1 + 3 * int(n)
-            reach(position, frame, f"the candidates of {name}")
+            if position > known:
+                reach(position, f"the candidates of {name}")
+                known = numbers.known
         frame_starts.append(position)
         for first, second in kind.limbs:
             position += frame_counts[first] * frame_counts[second]
-            reach(position, frame, f"the affinities of {kind.joints[first]}-{kind.joints[second]}")
+            if position > known:
+                reach(position, f"the affinities of {kind.joints[first]}-{kind.joints[second]}")
+                known = numbers.known
         counts.append(frame_counts)
         starts.append(frame_starts)
     return np.array(counts, dtype=np.intp), np.array(starts, dtype=np.intp), position

@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observations import Observations
@@ -127,9 +128,7 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
     for i, a in enumerate(old):
         mine = before.rows(before.track == a)
         alike[i] = [_alike(mine, after.rows(after.track == b)) for b in new]
-    from scipy.optimize import linear_sum_assignment  # loads for a fifth of a second
-
-    rows, columns = linear_sum_assignment(-alike)
+    rows, columns = least_cost_pairs(-alike)
     return {int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if alike[i, k] > 0}
 
 
