@@ -88,11 +88,11 @@ class Moment:
 
     def rows(self, index: NDArray) -> "Moment":
         """Some of the tracks."""
-        own = {name: getattr(self, name)[index] for name in _OF_TRACKS}
+        own = {name: getattr(self, name)[index] for name in OF_TRACKS}
         return replace(self, tracks=self.tracks.rows(index), **own)
 
 
-_OF_TRACKS = ("views", "of_body", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
+OF_TRACKS = ("views", "of_body", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
 """What a `Moment` has a row of for each track."""
 
 
@@ -183,7 +183,7 @@ class Filter:
         centre = self._trace(self.placed(left)).centre
         gone, more = now.gone, (left.identity, left.tracks.evident_s, centre, bones)
         recent = now.tracks.time_s - gone.time_s <= self.stitching.longest_gap_s
-        columns = [
+        columns: Any = [
             np.concatenate([getattr(gone, each.name)[recent], new])[-_MOST_GONE:]
             for each, new in zip(fields(Gone), more, strict=True)
         ]
@@ -217,7 +217,7 @@ class Filter:
             "length_m": blank,
             "count": blank,
         }
-        both = {name: np.concatenate([getattr(now, name), columns[name]]) for name in _OF_TRACKS}
+        both = {name: np.concatenate([getattr(now, name), columns[name]]) for name in OF_TRACKS}
         now = replace(now, tracks=tracks.joined(new), next_track=now.next_track + count, **both)
         return now, np.concatenate([candidate, own])
 

@@ -4,6 +4,7 @@ import threading
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
@@ -15,13 +16,16 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
+from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.filtering import Filter, Moment
 from shapepose_fg.live.now import Bodies, fed_back, people_at
-from shapepose_fg.live.refining import Refinery, Slot
+from shapepose_fg.live.refining import LiveState, Refinery, Slot
+from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
 from shapepose_fg.live.views import ViewsInStep, joined
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
@@ -108,21 +112,38 @@ class OnlineReconstructor:
         check_fitter(fitter)
         self.rig, self.lag_s = rig, lag_s
         setup = Setup(rig, skeleton, config, fitter)
-        self._setup, self._config = setup, config
+        self._setup, self._config, self._id = setup, config, setup_id(rig, skeleton, config, lag_s)
         self._filter = Filter(setup.engine(Notebook()).tracker, config.stitching)
+        self._motion = MotionModel.load(skeleton.joints, config.motion, config.law)
         self._lock = threading.RLock()
         self._workers = Workers(workers, setup).__enter__()
         self._most_waiting = 1 if workers == 1 else 2 * workers
         self._refinery = Refinery(self._workers, self._filter)
-        self._slots = list[Slot]()
-        self._before: Detections | None = None
-        self._watch = CameraWatch.of(len(rig))
-        self._views = ViewsInStep(len(rig))
-        self._frame = self._late = self._dropped = self._unrefined = self._not_taken = 0
+        self._state = LiveState(CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
         self._said = deque[Said](maxlen=_MOST_SAID)
-        self._settled = deque[Reconstruction]()
-        self._bodies: Bodies | None = None
         self._now: tuple[int, Moment, Bodies | None] = 0, self._filter.nobody, None
+
+    @classmethod
+    def load(
+        cls,
+        path: Path | str,
+        rig: Rig,
+        config: PipelineConfig | None = None,
+        *,
+        skeleton: Skeleton = BODY_25,
+        lag_s: float = 0.3,
+        workers: int = 2,
+        fitter: BodyFitter | None = None,
+    ) -> "OnlineReconstructor":
+        """Go on from what `save` wrote, with the same cameras, settings and lag; else InputError."""
+        found = cls(rig, config, skeleton=skeleton, lag_s=lag_s, workers=workers, fitter=fitter)
+        try:
+            found._state = read_state(Path(path), found._id, rig, found._filter)
+            found._show()
+        except InputError:
+            found.close()
+            raise
+        return found
 
     def __enter__(self) -> "OnlineReconstructor":
         return self
@@ -167,10 +188,10 @@ class OnlineReconstructor:
         own = replace(detections, view=np.full(len(detections), view))
         self._check(own)
         with self._lock:
-            if self._views.is_late(view, time_s):
+            if self._state.views.is_late(view, time_s):
                 self._join(view, own, time_s)
                 return
-            for frame, times in self._views.add(view, own, time_s):
+            for frame, times in self._state.views.add(view, own, time_s):
                 self._take(frame, times)
 
     def people(self, time_s: float | None = None) -> Reconstruction:
@@ -188,7 +209,7 @@ class OnlineReconstructor:
                 f"people are known from {newest_s:g} s, the newest frame, to {AHEAD_S:g} s later, not at"
                 f" {time_s:g} s; what was before is in settled()"
             )
-        return people_at(self._filter.tracker, frame, moment, bodies, max(ahead_s, 0.0))
+        return people_at(self._filter.tracker, self._motion, frame, moment, bodies, max(ahead_s, 0.0))
 
     def settled(self, *, wait: bool = False) -> Reconstruction:
         """The refined rows of all frames that have settled since this was asked last; with `wait`, until all that
@@ -196,23 +217,40 @@ class OnlineReconstructor:
         """
         with self._lock:
             self._collect(wait=wait)
-            parts = list(self._settled)
-            self._settled.clear()
+            parts = list(self._state.settled)
+            self._state.settled.clear()
         names = self._setup.skeleton.joints
         return Reconstruction.concatenate(parts) if len(parts) > 0 else Reconstruction.empty(names)
 
     def finish(self) -> Reconstruction:
         """`settled` of all frames up to the newest: the stream has ended."""
         with self._lock:
-            for frame, times in self._views.rest():
+            for frame, times in self._state.views.rest():
                 self._take(frame, times)
             self._refine(last=True)
             return self.settled(wait=True)
 
+    def save(self, path: Path | str) -> None:
+        """Write all that is needed to go on with `load`; what is under way is waited for. The same state gives the
+        same bytes. What was noticed of cameras (`said`) is left out.
+        """
+        with self._lock:
+            self._collect(wait=True)
+            arrays = state_arrays(self._state)
+        write_state(Path(path), arrays, self._id)
+
     def report(self) -> LiveReport:
         """How it goes: counts, and how each camera is."""
-        cameras = {name: CameraState(code) for name, code in zip(self.rig.names, self._watch.state, strict=True)}
-        counts = self._frame, self._late, self._dropped, self._unrefined, self._not_taken
+        cameras = {
+            name: CameraState(code) for name, code in zip(self.rig.names, self._state.watch.state, strict=True)
+        }
+        counts = (
+            self._state.frames,
+            self._state.late,
+            self._state.dropped,
+            self._state.unrefined,
+            self._state.not_taken,
+        )
         return LiveReport(*counts, cameras)
 
     def said(self) -> list[Said]:
@@ -231,66 +269,68 @@ class OnlineReconstructor:
 
     def _take(self, detections: Detections, times: Array) -> None:
         """A frame, in its place among those that came."""
-        time_s, slots = float(times.mean()), self._slots
+        time_s, slots = float(times.mean()), self._state.slots
         detections, _ = thinned(detections, len(self.rig), self._config.candidates)
         if len(slots) > 0 and time_s <= slots[-1].time_s:
             self._insert(detections, times, time_s)
             return
         last_s = slots[-1].time_s if len(slots) > 0 else time_s
-        before = self._watch
-        watch, rig = before.seen(detections, self._before, self.rig, time_s)
-        given = Input(self._frame, times, _without(detections, rig), rig)
+        before = self._state.watch
+        watch, rig = before.seen(detections, self._state.before, self.rig, time_s)
+        given = Input(self._state.frames, times, _without(detections, rig), rig)
         moment, candidate = self._filter.step(slots[-1].moment if len(slots) > 0 else self._filter.nobody, given)
-        self._frame += 1
-        self._before = detections
+        self._state.frames += 1
+        self._state.before = detections
         seen = (moment.views >= 2) & moment.named[:, None]
         shown = np.where(seen[..., None], moment.tracks.joints.position, np.nan)
-        self._watch = watch.compared(detections, shown, self.rig, time_s - last_s)
+        self._state.watch = watch.compared(detections, shown, self.rig, time_s - last_s)
         for view in np.flatnonzero(watch.state != before.state).tolist():
             self._said.append(Said(time_s, self.rig.names[view], CameraState(watch.state[view])))
         slots.append(Slot(given, moment, candidate))
         self._refine()
         self._collect()
-        self._now = slots[-1].given.frame, slots[-1].moment, self._bodies
 
     def _insert(self, detections: Detections, times: Array, time_s: float) -> None:
         """A frame that came after later ones: these are followed once more."""
-        slots = self._slots
+        slots = self._state.slots
         at = bisect_left([slot.time_s for slot in slots], time_s)
         if at == 0 or slots[-1].time_s - time_s > self.lag_s or slots[at].time_s == time_s:
-            self._dropped += 1
+            self._state.dropped += 1
             return
         rig = replace(slots[at].given.rig, dark=slots[at].given.rig.dark)
-        given = Input(self._frame, times, _without(detections, rig), rig)
+        given = Input(self._state.frames, times, _without(detections, rig), rig)
         slots.insert(at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled))
-        self._frame, self._late = self._frame + 1, self._late + 1
+        self._state.frames, self._state.late = self._state.frames + 1, self._state.late + 1
         self._again(at)
 
     def _join(self, view: int, detections: Detections, time_s: float) -> None:
         """A camera's detections that came after their frame: it is made anew with them."""
-        times = np.array([slot.time_s for slot in self._slots])
+        times = np.array([slot.time_s for slot in self._state.slots])
         at = int(np.abs(times - time_s).argmin()) if len(times) > 0 else 0
-        near_s = self._views.period_s / 2
+        near_s = self._state.views.period_s / 2
         if at == 0 or abs(times[at] - time_s) > near_s or times[-1] - time_s > self.lag_s:
-            self._dropped += 1
+            self._state.dropped += 1
             return
-        slot = self._slots[at]
+        slot = self._state.slots[at]
         if (slot.given.detections.view == view).any():
-            self._dropped += 1
+            self._state.dropped += 1
             return
         at_s = slot.given.time_s.copy()
         at_s[view] = time_s
         both = joined([slot.given.detections, detections])
         rig = replace(slot.given.rig, dark=tuple(each for each in slot.given.rig.dark if each != view))
-        slot.given, self._late = replace(slot.given, time_s=at_s, detections=both, rig=rig), self._late + 1
+        slot.given, self._state.late = (
+            replace(slot.given, time_s=at_s, detections=both, rig=rig),
+            self._state.late + 1,
+        )
         self._again(at)
 
     def _again(self, first: int) -> None:
         """Follow from slot `first` on once more."""
-        for at in range(first, len(self._slots)):
-            slot = self._slots[at]
-            slot.moment, slot.candidate = self._filter.step(self._slots[at - 1].moment, slot.given)
-        self._now = self._slots[-1].given.frame, self._slots[-1].moment, self._bodies
+        for at in range(first, len(self._state.slots)):
+            slot = self._state.slots[at]
+            slot.moment, slot.candidate = self._filter.step(self._state.slots[at - 1].moment, slot.given)
+        self._show()
 
     def _refine(self, *, last: bool = False) -> None:
         """Send what is due, forget what is done.
@@ -298,7 +338,7 @@ class OnlineReconstructor:
         A window settles what is older than a third of the lag as soon as something is as old as the lag, with a
         third of the lag before and after it.
         """
-        slots, around_s = self._slots, self.lag_s / 3
+        slots, around_s = self._state.slots, self.lag_s / 3
         if len(slots) == 0:
             return
         newest_s, first = slots[-1].time_s, next((n for n, s in enumerate(slots) if not s.settled), len(slots))
@@ -320,7 +360,7 @@ class OnlineReconstructor:
                     slot.settled = True
             elif newest_s - slots[first].time_s > _BEHIND * self.lag_s:
                 slots[first].settled = True
-                self._unrefined += 1
+                self._state.unrefined += 1
         keep_s = newest_s - self.lag_s - around_s - 1e-6
         done = next(
             (n for n, slot in enumerate(slots) if not slot.settled or slot.time_s >= keep_s), len(slots) - 1
@@ -333,15 +373,22 @@ class OnlineReconstructor:
         """Take in windows that were solved meanwhile: rows that are settled, and bodies for the newest moment."""
         for refined in self._refinery.came(wait=wait):
             if len(refined.rows) > 0:
-                self._settled.append(refined.rows)
+                self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
-                self._bodies = Bodies.of(refined.newest, self._setup.skeleton)
-                self._slots[-1].moment = fed_back(self._filter.tracker, self._slots[-1].moment, refined.newest)
-        newest_s = self._slots[-1].time_s if len(self._slots) > 0 else -np.inf
-        while len(self._settled) > 0 and newest_s - float(self._settled[0].time_s.max()) > _KEPT_S:
-            self._not_taken += len(self._settled.popleft())
-        if len(self._slots) > 0:
-            self._now = self._slots[-1].given.frame, self._slots[-1].moment, self._bodies
+                self._state.bodies = Bodies.of(refined.newest, self._setup.skeleton)
+                self._state.slots[-1].moment = fed_back(
+                    self._filter.tracker, self._state.slots[-1].moment, refined.newest
+                )
+        newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
+        while len(self._state.settled) > 0 and newest_s - float(self._state.settled[0].time_s.max()) > _KEPT_S:
+            self._state.not_taken += len(self._state.settled.popleft())
+        self._show()
+
+    def _show(self) -> None:
+        """From now on `people` is asked of the newest moment as it is."""
+        if len(self._state.slots) > 0:
+            newest = self._state.slots[-1]
+            self._now = newest.given.frame, newest.moment, self._state.bodies
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:

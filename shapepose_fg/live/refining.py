@@ -2,15 +2,18 @@
 
 from collections import deque
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Index, Whole
-from shapepose_fg.core.detections import Input
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.live.cameras import CameraWatch
 from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
+from shapepose_fg.live.now import Bodies
+from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.windows import Span
@@ -34,6 +37,30 @@ class Slot:
     def time_s(self) -> float:
         """When it was, the mean of its views."""
         return float(self.given.time_s.mean())
+
+
+@dataclass
+class LiveState:
+    """All that changes while frames come in, but for windows that are under way."""
+
+    watch: CameraWatch
+    """Which cameras are believed."""
+    views: ViewsInStep
+    """Views that wait for the others of their frame."""
+    slots: list[Slot] = field(default_factory=list)
+    """The last frames, in order of time: those that are not settled, and what a window needs before them."""
+    before: Detections | None = None
+    """The newest frame's detections, all of them."""
+    settled: deque[Reconstruction] = field(default_factory=deque)
+    """Rows that nobody has taken yet."""
+    bodies: Bodies | None = None
+    """The newest refined ones."""
+    frames: int = 0
+    """How many frames were taken in, and so on (`LiveReport`)."""
+    late: int = 0
+    dropped: int = 0
+    unrefined: int = 0
+    not_taken: int = 0
 
 
 @dataclass(frozen=True)
