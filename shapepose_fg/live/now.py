@@ -18,7 +18,7 @@ from shapepose_fg.tracking.worlds import PLACED_M
 _OWN_S, _TOGETHER_S = 0.3, 0.7
 """So long a joint goes on as it moves beside its person, and the person as it moves: 0.3 and 1 s ahead errors are
 11 and 39 % smaller than straight on (simulated, split tune and crossing)."""
-_LATER = 1.5
+_LATER = 2.0
 """What the density of accelerations is multiplied with (`MotionModel.psd_still`, `psd_speed`), and """
 _PACE = 0.1
 """what the filter's variances of velocities are: it follows as if everybody were fast (`pipeline.setup.FAST_M_S`).

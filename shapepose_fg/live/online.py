@@ -175,10 +175,10 @@ class OnlineReconstructor:
     def push_view(self, camera: str, detections: Detections, time_s: float) -> None:
         """Take in what one camera saw at `time_s`, seconds, on the clock that all share.
 
-        Views make a frame: it is complete when every camera that was heard in the last half second is in it, or
-        when one comes again. What comes for a frame that was complete joins it where it is within half a frame
-        of it and within the lag; else it is counted and left out. `detections` are of this camera whatever their
-        `view` says. ValueError as `push`, and for a camera that there is not.
+        Views make a frame: it is complete when every camera that was heard in the last half second is in it (the
+        first one: every camera), or when one comes again. What comes for a frame that was complete joins it where
+        it is within half a frame of it and within the lag; else it is counted and left out. `detections` are of
+        this camera whatever their `view` says. ValueError as `push`, and for a camera that there is not.
         """
         if camera not in self.rig.names:
             raise ValueError(f"there is no camera {camera}; there are {', '.join(self.rig.names)}")
@@ -189,6 +189,7 @@ class OnlineReconstructor:
         self._check(own)
         with self._lock:
             if self._state.views.is_late(view, time_s):
+                self._state.views.heard(view, time_s)
                 self._join(view, own, time_s)
                 return
             for frame, times in self._state.views.add(view, own, time_s):

@@ -41,6 +41,10 @@ class ViewsInStep:
         """Whether the frame of this view is complete without it."""
         return time_s <= max(self.heard_s[view], self.done_s + self.period_s / 2)
 
+    def heard(self, view: int, time_s: float) -> None:
+        """A camera was heard, if late."""
+        self.heard_s[view] = max(self.heard_s[view], time_s)
+
     def add(self, view: int, detections: Detections, time_s: float) -> list[Frame]:
         """Take in a view; the frames that are complete with it."""
         found = self.rest() if view in self.waiting else []
@@ -49,7 +53,9 @@ class ViewsInStep:
             self.period_s += _FRESH * (step_s - self.period_s)
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
-        alive = np.flatnonzero(time_s - self.heard_s <= _HEARD_S).tolist()
+        # Before the first frame every camera is waited for, until one comes again.
+        awaited = (time_s - self.heard_s <= _HEARD_S) | np.isinf(self.done_s)
+        alive = np.flatnonzero(awaited).tolist()
         return found + (self.rest() if all(each in self.waiting for each in alive) else [])
 
     def rest(self) -> list[Frame]:
