@@ -107,8 +107,9 @@ def test_cameras_on_their_own_clocks(start, dance, truth):
         now.append(live.people())
     live.push_view("cam0", dance.recording[0].only(dance.recording[0].view == 0), 0.0)
     assert live.report().frames == 24 and live.report().dropped == 1
-    error, found = errors_mm(rows(now), truth)
-    assert len(found.missed) <= 12 and np.nanmean(error) < 35, (len(found.missed), np.nanmean(error), np.nanmedian(error), np.unique(rows(now).frame))
+    error, found = errors_mm(rows(now), truth[:24])
+    # Of views 10 ms apart, as if they were of one time: hands move by centimetres.
+    assert len(found.missed) <= 12 and np.nanmean(error) < 30
     assert live.people().time_s[0] == pytest.approx(23 / 30 + 0.005)
 
 
