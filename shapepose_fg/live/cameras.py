@@ -73,10 +73,15 @@ class CameraWatch:
         state = self._judged()
         state = np.where(silent, CameraState.SILENT, state)
         state = np.where(frozen, CameraState.FROZEN, state)
-        out = ~there | frozen | (state == CameraState.CONTRADICTS)
-        doubted = np.flatnonzero(state == CameraState.DOUBTED).tolist()
-        said = replace(rig, dark=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
-        return CameraWatch(self.apart_m, heard_s, state.astype(np.int64)), said
+        now = CameraWatch(self.apart_m, heard_s, state.astype(np.int64))
+        return now, now.believed(given, rig)
+
+    def believed(self, given: Detections, rig: Rig) -> Rig:
+        """The rig of a frame with these detections, without the cameras that are left out."""
+        there = np.bincount(given.view, minlength=len(rig)) > 0
+        out = ~there | np.isin(self.state, (CameraState.FROZEN, CameraState.CONTRADICTS))
+        doubted = np.flatnonzero(self.state == CameraState.DOUBTED).tolist()
+        return replace(rig, dark=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
 
     def compared(self, given: Detections, places: Array, rig: Rig, lasts_s: float) -> "CameraWatch":
         """With how far the detections are from people at `places` (A, J, 3), metres, NaN where unknown."""

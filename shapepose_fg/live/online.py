@@ -298,7 +298,7 @@ class OnlineReconstructor:
         if at == 0 or slots[-1].time_s - time_s > self.lag_s or slots[at].time_s == time_s:
             self._state.dropped += 1
             return
-        rig = replace(slots[at].given.rig, dark=slots[at].given.rig.dark)
+        rig = self._state.watch.believed(detections, self.rig)
         given = Input(self._state.frames, times, _without(detections, rig), rig)
         slots.insert(at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled))
         self._state.frames, self._state.late = self._state.frames + 1, self._state.late + 1
@@ -320,10 +320,8 @@ class OnlineReconstructor:
         at_s[view] = time_s
         both = joined([slot.given.detections, detections])
         rig = replace(slot.given.rig, dark=tuple(each for each in slot.given.rig.dark if each != view))
-        slot.given, self._state.late = (
-            replace(slot.given, time_s=at_s, detections=both, rig=rig),
-            self._state.late + 1,
-        )
+        slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)
+        self._state.late += 1
         self._again(at)
 
     def _again(self, first: int) -> None:
@@ -342,33 +340,23 @@ class OnlineReconstructor:
         slots, around_s = self._state.slots, self.lag_s / 3
         if len(slots) == 0:
             return
-        newest_s, first = slots[-1].time_s, next((n for n, s in enumerate(slots) if not s.settled), len(slots))
-        if first < len(slots) and (last or newest_s - slots[first].time_s >= self.lag_s - 1e-6):
-            stop = (
-                len(slots)
-                if last
-                else next(
-                    n
-                    for n in range(first, len(slots))
-                    if n == len(slots) - 1 or newest_s - slots[n].time_s < around_s
-                )
-            )
+        age_s = slots[-1].time_s - np.array([slot.time_s for slot in slots]) + 1e-6
+        settled = np.array([*(slot.settled for slot in slots), False])
+        first = int(settled.argmin())
+        if first < len(slots) and (last or age_s[first] >= self.lag_s):
+            stop = len(slots) if last else int((age_s >= around_s).sum())
             if last or self._refinery.waiting < self._most_waiting:
-                begin_s = slots[first].time_s - around_s - 1e-6
-                begin = next(n for n, slot in enumerate(slots) if slot.time_s >= begin_s)
+                begin = int((age_s > age_s[first] + around_s).sum())
                 self._refinery.send(slots[begin:], first - begin, stop - first)
                 for slot in slots[first:stop]:
                     slot.settled = True
-            elif newest_s - slots[first].time_s > _BEHIND * self.lag_s:
+                first = stop
+            elif age_s[first] > _BEHIND * self.lag_s:
                 slots[first].settled = True
                 self._state.unrefined += 1
-        keep_s = newest_s - self.lag_s - around_s - 1e-6
-        done = next(
-            (n for n, slot in enumerate(slots) if not slot.settled or slot.time_s >= keep_s), len(slots) - 1
-        )
-        first = next((n for n, slot in enumerate(slots) if not slot.settled), len(slots) - 1)
-        around = next(n for n, s in enumerate(slots) if s.time_s >= slots[first].time_s - around_s - 1e-6)
-        del slots[: min(done, around)]
+        # What a late frame is put behind, and what the next window begins with.
+        needed_s = max(self.lag_s, age_s[first] if first < len(slots) else 0.0) + around_s
+        del slots[: int((age_s > needed_s).sum())]
 
     def _collect(self, *, wait: bool = False) -> None:
         """Take in windows that were solved meanwhile: rows that are settled, and bodies for the newest moment."""
