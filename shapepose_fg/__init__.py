@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from shapepose_fg.io.calibration import write_rig as write_rig
     from shapepose_fg.io.config import read_config as read_config
     from shapepose_fg.io.detections import read_detections as read_detections
+    from shapepose_fg.live.online import OnlineReconstructor as OnlineReconstructor
     from shapepose_fg.pipeline.execution import Execution as Execution
     from shapepose_fg.pipeline.pipeline import PipelineConfig as PipelineConfig
     from shapepose_fg.pipeline.pipeline import reconstruct as reconstruct
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Execution": "shapepose_fg.pipeline.execution",
     "InputError": "shapepose_fg.core.errors",
+    "OnlineReconstructor": "shapepose_fg.live.online",
     "PipelineConfig": "shapepose_fg.pipeline.pipeline",
     "Reconstruction": "shapepose_fg.core.reconstruction",
     "read_config": "shapepose_fg.io.config",

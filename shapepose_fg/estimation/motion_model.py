@@ -79,7 +79,11 @@ class MotionModel:
 
     def density(self, speed_m_s: Array, within_s: float = MEASURED_S) -> Array:
         """Density (..., J) of the noise in the motion of joints of this speed (..., J); see `Motion.density`."""
-        return self.law.density(self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2, within_s)
+        return self.law.density(self.acceleration(speed_m_s), within_s)
+
+    def acceleration(self, speed_m_s: Array) -> Array:
+        """Power spectral density (..., J) of the accelerations of joints of this speed (..., J), m²/s³."""
+        return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
     def density_lost(self, speed_m_s: Array) -> Array:
         """The same while joints are lost from sight, and their speed is a guess."""

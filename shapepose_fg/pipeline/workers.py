@@ -69,6 +69,15 @@ class Workers(Generic[Shared]):
             self._lifeline.close()
             self._pool = None
 
+    def submit(self, work: Callable[[Shared, Item], Result], item: Item) -> Future[Result]:
+        """`work(shared, item)`, which is done on return where there are no further processes."""
+        if self._pool is not None:
+            with _telling_of_lost_ones():
+                return self._pool.submit(_work, work, item)
+        done: Future[Result] = Future()
+        done.set_result(work(self._shared, item))
+        return done
+
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
 

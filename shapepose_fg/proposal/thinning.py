@@ -33,20 +33,20 @@ class ThinnedFrames(DerivedFrames):
     """How many are allowed."""
 
     def __getitem__(self, frame: int, /) -> Detections:
-        every = self.frames[frame]
-        found = every.rows(self._rows(every))
-        order = np.lexsort(found.pairs.T)
-        return replace(found, pairs=found.pairs[order], affinity=found.affinity[order])
+        return thinned(self.frames[frame], self.views, self.config)[0]
 
     def is_thinned(self, frame: int) -> bool:
         """Whether detections of a frame were left out."""
         return kept_detections(self.frames[frame], self.views, self.config) is not None
 
-    def _rows(self, every: Detections) -> Index:
-        """Which detections stay, in order."""
-        order = np.lexsort((every.confidence, every.joint, *every.xy.T))
-        kept = kept_detections(every.rows(order), self.views, self.config)
-        return order if kept is None else order[kept]
+
+def thinned(every: Detections, views: int, config: CandidateConfig) -> tuple[Detections, bool]:
+    """What stays of a frame's detections, in an order of their own, and whether any were left out."""
+    order = np.lexsort((every.confidence, every.joint, *every.xy.T))
+    kept = kept_detections(every.rows(order), views, config)
+    found = every.rows(order if kept is None else order[kept])
+    order = np.lexsort(found.pairs.T)
+    return replace(found, pairs=found.pairs[order], affinity=found.affinity[order]), kept is not None
 
 
 def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> Mask | None:

@@ -28,15 +28,15 @@ _SURE_AFFINITY = 0.6
 """Mean affinity to the person's other detections from which on a detection counts wholly."""
 _ALONE = 0.5
 """What a detection counts whose neighbours on the skeleton nobody saw: affinities say nothing of it."""
-_APPEARS_S = 0.125
+APPEARS_S = 0.125
 """What it costs to appear or vanish while others are watched, as much as not being seen in plain view for 0.3
 seconds: people are where they were, and nobody comes out of nothing."""
 _WORLDS = 8
 """How many worlds are tried as those that come first, the most promising ones."""
-_LEAST_S = 0.1
+LEAST_S = 0.1
 """Least evidence of a person, seconds; of less than 0.4 seconds of frames a quarter of their time."""
 _ON_TRIAL = 0.25
-"""Share of `_APPEARS_S` and `_LEAST_S` that is enough for people who are followed again: who is with them in one
+"""Share of `APPEARS_S` and `LEAST_S` that is enough for people who are followed again: who is with them in one
 world may leave them more."""
 _SCALE, _PRIOR = 13.7, -0.6
 """Evidence to log-odds, and those of a person without any: logistic fit to 482 people, of whom 11 were nobody or
@@ -238,7 +238,7 @@ class Account:
         weights = np.where(candidate >= 0, weight, np.float32(0)).reshape(shape)
         place, weights = place.astype(np.int32, copy=False), weights.astype(np.float32, copy=False)
         seen = np.append(np.flatnonzero(counts), 0)
-        span, least_s = (int(seen[0]), int(seen.max())), min(_LEAST_S, 0.25 * float(lasts_s.sum()))
+        span, least_s = (int(seen[0]), int(seen.max())), min(LEAST_S, 0.25 * float(lasts_s.sum()))
         return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
 
     def choose(self, world: Index) -> Chosen:
@@ -257,7 +257,7 @@ class Account:
         first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(world) == 0:
             return [self.in_turn(first)]
-        segment, costs = np.zeros(3, dtype=np.intp), (asked * _APPEARS_S, self.begins, self.ends)
+        segment, costs = np.zeros(3, dtype=np.intp), (asked * APPEARS_S, self.begins, self.ends)
         best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.alone])
         bound = np.bincount(world, np.maximum(best_s, 0.0))
         tried = np.argsort(-bound, kind="stable")[:_WORLDS]
@@ -306,7 +306,7 @@ class Account:
         before = np.zeros((0, 3), dtype=np.intp)
         if besides is not None:
             before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
-        appears_s = asked * _APPEARS_S if besides is None else 0.0
+        appears_s = asked * APPEARS_S if besides is None else 0.0
         given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first, before
         costs, (H, T) = (appears_s, self.begins, self.ends, asked * self.least_s), self.there.shape
         free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)

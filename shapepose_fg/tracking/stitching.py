@@ -15,7 +15,7 @@ _BONE_SIGMA_M = 0.015
 """Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
 _PLACE_SIGMA_M = 0.05
 """Error of the centre of somebody's core joints, metres, at the least."""
-_LEAST_ROWS = 10
+LEAST_ROWS = 10
 """Rows that a track needs for its build to be known."""
 _BUILD = 2.0
 """Mean squared difference of bone lengths, in their standard deviations, up to which two builds are one. For
@@ -86,7 +86,7 @@ class Ends:
             tracks.append(each.track)
             times.append(each.time_s[[0, -1]])
             places.append(each.centre[[0, -1]])
-            enough = np.isfinite(each.bones).sum(axis=0) >= _LEAST_ROWS
+            enough = np.isfinite(each.bones).sum(axis=0) >= LEAST_ROWS
             median = np.full(each.bones.shape[1], np.nan)
             median[enough] = np.nanmedian(each.bones[:, enough], axis=0)
             bones.append(median)

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 _KEY_S = 0.33
 """People are sought among all detections so often, seconds: in some frame everybody is seen well. With 0.67 crowds
 before three cameras at 10 to 20 frames a second lose half as many rows more (seven seeds, simulated)."""
-_BIRTHS_S = 0.1
+BIRTHS_S = 0.1
 """New people are sought so often among what a world's people leave: who is found later is followed back.
 Seconds."""
 _RESTART_S = 1.3
@@ -37,7 +37,7 @@ _ALIKE = 0.95
 """Two ways to choose people that agree on so many of the detections are one. The best is followed again, and the
 best of the others: of ten simulated recordings, most before three cameras, IDF1 is 95.0 (92.8 without; 95.2 with
 two others, for twice the time)."""
-_PLACED_M = 0.2
+PLACED_M = 0.2
 """Sigma of a track's joint that counts as placed."""
 _PLAIN, _PLAIN_S = 0.25, 0.3
 """People whose evidence is so much a second, at any time for so many seconds, are followed once: in simulated
@@ -259,7 +259,7 @@ def _follow(
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
             tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
-        if abs(time_s - sought_s) < _BIRTHS_S:
+        if abs(time_s - sought_s) < BIRTHS_S:
             continue
         sought_s = time_s
         gone, same = _twins(tracks, candidate, births)
@@ -289,7 +289,7 @@ def _twins(
     Their detections (A, J, V) are the same, and what is placed is in the same places. Worlds with `births` stay.
     """
     gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    known, kept = tracks.joints.sigma_m < _PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
+    known, kept = tracks.joints.sigma_m < PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
     for world in sorted(np.unique(tracks.world).tolist(), key=lambda world: world not in births):
         who = np.flatnonzero(tracks.world == world)
         names = [candidate[row].tobytes() for row in who.tolist()]
@@ -324,7 +324,7 @@ class _Log:
         if len(tracks) == 0:
             return
         frame, joints = self.frames[t], tracks.joints
-        places = np.where((joints.sigma_m < _PLACED_M)[..., None], joints.position, np.nan)
+        places = np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
         sight = Sight.of(frame.detections, frame.rig, self.tracker.skeleton)
         weight, price = weighed(candidate, places, sight, self.tracker.skeleton, tracks.world)
         self.parts.append((t, tracks.ids, candidate, places, weight, price))

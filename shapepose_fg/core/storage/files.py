@@ -123,7 +123,11 @@ def read_json(path: Path, *, most: int = LARGE) -> Any:
 
     NaN and Infinity are let through as floats: who checks the values names their key.
     """
-    text = read_text(path, most=most)
+    return parse_json(read_text(path, most=most), path)
+
+
+def parse_json(text: str, path: Path) -> Any:
+    """The same of text that is from the file at `path`."""
     try:
         value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
     except json.JSONDecodeError as error:

@@ -150,14 +150,14 @@ def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: i
             frame = np.concatenate([part.frame for part in parts] or [waiting.frame])
             keypoints = np.concatenate([part.keypoints for part in parts] or [waiting.keypoints])
             own = int(np.searchsorted(frame, end))
-            yield _candidates(frame[:own] - first, keypoints[:own], rule, skeleton)
+            yield joints_of_people(frame[:own] - first, keypoints[:own], rule, skeleton)
             waiting = PeopleBlock(frame[own:], keypoints[own:])
 
     return ViewStream(people.camera.source, count, blocks(), first)
 
 
-def _candidates(frame: Index, keypoints: Array, rule: Scores, skeleton: Skeleton) -> ViewCandidates:
-    """The joints of the people of some frames."""
+def joints_of_people(frame: Index, keypoints: Array, rule: Scores, skeleton: Skeleton) -> ViewCandidates:
+    """The joints of N people of some `frame` (N,), of `keypoints` (N, K, 3), as candidates of one view."""
     joints = _joints(keypoints, rule, skeleton)
     person, joint = np.nonzero(joints[..., 2] > 0)
     order = np.lexsort((person, joint, frame[person]))

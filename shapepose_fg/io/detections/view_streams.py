@@ -196,3 +196,8 @@ class _Undistorted:
         what = f"{self.source}: the distortion of camera {camera.name} cannot be undone at frame"
         self.reasons[1].add(undone, lambda row: f"{what} {certain.frame[row]}")
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
+
+
+def undistorted(view: ViewCandidates, source: Path, camera: Camera) -> ViewCandidates:
+    """What one camera saw in pixels of a camera without distortion; joints without a place there are left out."""
+    return _Undistorted(source, camera).undistorted(view)

@@ -1,0 +1,54 @@
+"""What one camera saw in one picture as a line of JSON: OpenPose's frame, with camera and time beside it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import parse_json
+from shapepose_fg.io.detections.people import OVERSHOOT, joints_of_people
+from shapepose_fg.io.detections.view_streams import undistorted
+from shapepose_fg.io.validation import validated
+
+_CURE = 'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}'
+
+
+class _Person(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+    pose_keypoints_2d: list[float]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+    camera: str
+    time_s: Annotated[FiniteFloat, Field(ge=-1e12, le=1e12)]
+    people: list[_Person]
+
+
+def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[str, Detections, float]:
+    """The camera, what it saw, undistorted, and when, seconds; joints far outside the picture are left out.
+
+    InputError naming the `place` of a line that is none.
+    """
+    line = validated(_Line, parse_json(text.strip(), Path(place)), place, _CURE)
+    if line.camera not in rig.names:
+        raise InputError(f"{place}: there is no camera {line.camera[:40]}; there are {', '.join(rig.names)}")
+    K = skeleton.keypoint_count
+    flat = [person.pose_keypoints_2d for person in line.people]
+    if any(len(each) != 3 * K for each in flat):
+        wrong = next(len(each) for each in flat if len(each) != 3 * K)
+        raise InputError(
+            f"{place}: {3 * K} numbers a person were expected, of {skeleton.name}, got {wrong}; {_CURE}"
+        )
+    keypoints = np.array(flat, dtype=np.float64).reshape(len(flat), K, 3)
+    if np.nanmax(keypoints[..., 2], initial=0.0) > OVERSHOOT:
+        raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; divide them")
+    frame = np.zeros(len(flat), dtype=np.intp)
+    view = joints_of_people(frame, keypoints, lambda score: np.minimum(score, 1.0), skeleton)
+    seen = undistorted(view, Path(place), rig.cameras[rig.names.index(line.camera)]).seen
+    return line.camera, seen, float(line.time_s)

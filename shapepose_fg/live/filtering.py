@@ -1,0 +1,278 @@
+"""One moment after the other: who is there, and where, from what came so far; a function of its arguments alone.
+
+Following, finding and measuring are those of recordings (`tracking/`). The future is missing: who is there is
+decided by the same evidence as it comes in.
+"""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.detections import Input
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.tracking.following import observed
+from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.presence import APPEARS_S, LEAST_S, own_evidence, weighed
+from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
+from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.worlds import BIRTHS_S, PLACED_M
+
+ON_TRIAL = -1
+"""The identity of who has too little evidence yet."""
+_SURE = 0.3
+"""Evidence a second of a new person who is shown at once: a probability of 0.97 (`presence.probability`)."""
+_WAITS_S = 1.0
+"""Whoever may be somebody who left waits no longer for their bones to be known."""
+_MOST_GONE = 256
+"""So many who left are remembered at the most."""
+_LONGEST_S = 0.1
+"""A frame stands for no more, however long nothing came before it: evidence is of what was seen."""
+
+
+@dataclass(frozen=True)
+class Gone:
+    """G people who left and may come back."""
+
+    identity: Whole
+    """(G,) who."""
+    time_s: Array
+    """(G,) when they were seen last, seconds."""
+    place: Array
+    """(G, 3) centre of their core joints then, metres."""
+    bones: Array
+    """(G, B) mean length of each bone between core joints, metres; NaN where it is not known."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The people after a frame: A tracks, and who left. Arrays and numbers only, so that they can be saved."""
+
+    tracks: Tracks
+    """Where they are."""
+    views: Whole
+    """(A, J) how many views' detections of each joint the last frame had."""
+    of_body: Mask
+    """(A, J) joints that are where the refined body has them, moved on: none of their detections came since."""
+    identity: Whole
+    """(A,) who each is for good; `ON_TRIAL` for whom too little speaks yet."""
+    running_s: Array
+    """(A,) evidence since they appeared, seconds in which all of a person is seen by all views."""
+    peak_s: Array
+    """(A,) the most that it was."""
+    born_s: Array
+    """(A,) when they were found, seconds."""
+    place: Array
+    """(A, 3) the centre of their core joints then, metres."""
+    length_m: Array
+    """(A, B) sum of each bone's lengths, metres."""
+    count: Array
+    """(A, B) of so many frames."""
+    gone: Gone
+    """Who left."""
+    sought_s: float = -np.inf
+    """When new people were sought last."""
+    next_track: int = 0
+    """The number of the next track."""
+    next_identity: int = 0
+    """The identity of the next new person."""
+
+    @property
+    def named(self) -> Mask:
+        """(A,) who is somebody."""
+        return self.identity != ON_TRIAL
+
+    def rows(self, index: NDArray) -> "Moment":
+        """Some of the tracks."""
+        own = {name: getattr(self, name)[index] for name in OF_TRACKS}
+        return replace(self, tracks=self.tracks.rows(index), **own)
+
+
+OF_TRACKS = ("views", "of_body", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
+"""What a `Moment` has a row of for each track."""
+
+
+@dataclass(frozen=True)
+class Filter:
+    """From one moment to the next."""
+
+    tracker: Tracker
+    """Follows people, finds new ones: that of recordings."""
+    stitching: StitchingConfig
+    """Who is recognised when they come back."""
+
+    @cached_property
+    def nobody(self) -> Moment:
+        """Before the first frame."""
+        J, B = len(self.tracker.skeleton), self._trace(np.zeros((0, len(self.tracker.skeleton), 3))).bones.shape[1]
+        whole, real = np.zeros(0, np.int64), np.zeros(0)
+        gone = Gone(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
+        per_bone = np.zeros((0, B)), np.zeros((0, B))
+        own = (
+            np.zeros((0, J), np.int64),
+            np.zeros((0, J), dtype=bool),
+            whole,
+            real,
+            real,
+            real,
+            np.zeros((0, 3)),
+            *per_bone,
+        )
+        return Moment(self.tracker.nobody(), *own, gone)
+
+    def step(self, before: Moment, given: Input) -> tuple[Moment, Index]:
+        """The next frame, and the detections (A, J, V) of each of its tracks, -1 for none.
+
+        People are predicted, given their detections and measured; ten times a second others are sought in what is
+        left over.
+        """
+        tracker, detections, rig = self.tracker, given.detections, given.rig
+        time_s = float(given.time_s.mean())
+        last_s = before.tracks.time_s
+        tracks, candidate = tracker.step(before.tracks, detections, rig, time_s)
+        now = replace(before, tracks=replace(tracks, time_s=time_s))
+        now, candidate = self._weighed(now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S))
+        now, candidate = self._without_ended(now, candidate)
+        if not abs(time_s - now.sought_s) < BIRTHS_S:
+            now, candidate = self._with_newcomers(now, candidate, given)
+        return self._with_names(now), candidate
+
+    def placed(self, now: Moment) -> Array:
+        """(A, J, 3) where joints are, metres; NaN where that is not known well."""
+        joints = now.tracks.joints
+        return np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
+
+    def observations(self, now: Moment, candidate: Index, given: Input) -> Observations:
+        """The rows of a frame: its tracks and their detections, for stage II."""
+        return observed(given, candidate, self.placed(now), now.tracks.ids)
+
+    def _weighed(self, now: Moment, candidate: Index, given: Input, lasts_s: float) -> tuple[Moment, Index]:
+        """What the frame says for and against everybody being there, and how long their bones are."""
+        if len(now.tracks) == 0:
+            return now, candidate
+        places, tracker = self.placed(now), self.tracker
+        sight = Sight.of(given.detections, given.rig, tracker.skeleton)
+        weight, price = weighed(candidate, places, sight, tracker.skeleton, now.tracks.world)
+        running_s = now.running_s + lasts_s * own_evidence(candidate, weight, price)
+        views = (candidate >= 0).sum(axis=2)
+        seen = np.where((views >= 2)[..., None], places, np.nan)
+        bones = self._trace(seen).bones
+        known = np.isfinite(bones)
+        return replace(
+            now,
+            views=views,
+            of_body=now.of_body & (views == 0),
+            running_s=running_s,
+            peak_s=np.maximum(now.peak_s, running_s),
+            length_m=now.length_m + np.where(known, bones, 0.0),
+            count=now.count + known,
+        ), candidate
+
+    def _without_ended(self, now: Moment, candidate: Index) -> tuple[Moment, Index]:
+        """Without those who had no evidence lately, or of whom more is missing than appearing anew costs."""
+        stays = self.tracker.alive(now.tracks) & (now.running_s >= now.peak_s - 2 * APPEARS_S)
+        if stays.all():
+            return now, candidate
+        left = now.rows(~stays & now.named)
+        known = left.count >= LEAST_ROWS
+        bones = np.where(known, left.length_m / np.maximum(left.count, 1), np.nan)
+        centre = self._trace(self.placed(left)).centre
+        gone, more = now.gone, (left.identity, left.tracks.evident_s, centre, bones)
+        recent = now.tracks.time_s - gone.time_s <= self.stitching.longest_gap_s
+        columns: Any = [
+            np.concatenate([getattr(gone, each.name)[recent], new])[-_MOST_GONE:]
+            for each, new in zip(fields(Gone), more, strict=True)
+        ]
+        return replace(now.rows(stays), gone=Gone(*columns)), candidate[stays]
+
+    def _with_newcomers(self, now: Moment, candidate: Index, given: Input) -> tuple[Moment, Index]:
+        """And those who are found in what everybody leaves over."""
+        tracker, tracks = self.tracker, now.tracks
+        tracker.search(given.frame)
+        places, own = tracker.newcomers(tracks, candidate, given.detections, given.rig)
+        now = replace(now, sought_s=tracks.time_s)
+        count = len(places)
+        if count == 0:
+            return now, candidate
+        ids, zero = now.next_track + np.arange(count), np.zeros(count, dtype=np.intp)
+        new = tracker.at(places, ids, zero, tracks.time_s)
+        trace = self._trace(places)
+        blank = np.zeros((count, trace.bones.shape[1]))
+        # Who is surely a person by one frame has been evident long enough.
+        sight, world = Sight.of(given.detections, given.rig, tracker.skeleton), np.zeros(count, dtype=np.intp)
+        evidence = own_evidence(own, *weighed(own, places, sight, tracker.skeleton, world))
+        running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
+        columns: dict[str, Any] = {
+            "views": (own >= 0).sum(axis=2),
+            "of_body": np.zeros(own.shape[:2], dtype=bool),
+            "identity": np.full(count, ON_TRIAL),
+            "running_s": running_s,
+            "peak_s": running_s,
+            "born_s": np.full(count, tracks.time_s),
+            "place": trace.centre,
+            "length_m": blank,
+            "count": blank,
+        }
+        both = {name: np.concatenate([getattr(now, name), columns[name]]) for name in OF_TRACKS}
+        now = replace(now, tracks=tracks.joined(new), next_track=now.next_track + count, **both)
+        return now, np.concatenate([candidate, own])
+
+    def _with_names(self, now: Moment) -> Moment:
+        """Those for whom enough speaks are somebody: who left and fits in place, time and build, or a new person.
+
+        Whoever may be somebody who left waits until enough bones are known.
+        """
+        ready = np.flatnonzero(~now.named & (now.running_s >= LEAST_S))
+        if len(ready) == 0:
+            return now
+        identity, next_identity, gone = now.identity.copy(), now.next_identity, now.gone
+        back = self._returned(now, ready) if len(gone.identity) > 0 else {}
+        for row in ready.tolist():
+            name = back.get(row, ON_TRIAL)
+            if name == ON_TRIAL and self._may_be_back(now, row):
+                continue
+            if name == ON_TRIAL:
+                name, next_identity = next_identity, next_identity + 1
+            identity[row] = name
+        stays = ~np.isin(gone.identity, identity)
+        gone = Gone(*(getattr(gone, each.name)[stays] for each in fields(Gone)))
+        return replace(now, identity=identity, next_identity=next_identity, gone=gone)
+
+    def _may_be_back(self, now: Moment, row: int) -> bool:
+        """Whether too little is known of somebody to tell from those who left nearby."""
+        if now.tracks.time_s - now.born_s[row] > _WAITS_S or (now.count[row] >= LEAST_ROWS).mean() >= 0.5:
+            return False
+        gap_s = now.born_s[row] - now.gone.time_s
+        apart_m = np.linalg.norm(now.gone.place - now.place[row], axis=1)
+        near = (gap_s >= 0) & (gap_s <= self.stitching.longest_gap_s)
+        return bool((near & (apart_m <= self.stitching.reach_m + 1.5 * gap_s)).any())
+
+    def _returned(self, now: Moment, ready: Index) -> dict[int, int]:
+        """Of the rows `ready` those who left before, by `tracking.stitching`, and who they are."""
+        gone, G, R = now.gone, len(now.gone.identity), len(ready)
+        bones = np.where(
+            now.count[ready] >= LEAST_ROWS, now.length_m[ready] / np.maximum(now.count[ready], 1), np.nan
+        )
+        begin = np.column_stack([now.born_s[ready], np.full(R, now.tracks.time_s)])
+        ends = Ends(
+            np.arange(G + R),
+            np.concatenate([np.column_stack([gone.time_s, gone.time_s]), begin]),
+            np.concatenate([gone.place, now.place[ready]])[:, None].repeat(2, axis=1),
+            np.concatenate([gone.bones, bones]),
+        )
+        names = stitch(ends, self.stitching)
+        return {int(row): int(gone.identity[names[G + n]]) for n, row in enumerate(ready) if names[G + n] < G}
+
+    def _trace(self, places: Array) -> Trace:
+        """Centres and bones of people at `places` (A, J, 3)."""
+        return Trace.of(0, np.zeros(len(places)), places, self.tracker.skeleton)
+
+
+def replaced(joints: JointStates, by: JointStates, where: Mask) -> JointStates:
+    """States of which some (A, J) are others'."""
+    mean = np.where(where[..., None], by.mean, joints.mean)
+    return JointStates(mean, np.where(where[..., None, None], by.covariance, joints.covariance))

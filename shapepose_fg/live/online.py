@@ -1,0 +1,387 @@
+"""People as detections come: `push` what the cameras see, ask for `people` at any time, take what is `settled`."""
+
+import threading
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from shapepose_fg.body.fitting.fitter import BodyFitter, check_fitter
+from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.notes import Notebook
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25, Skeleton
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.live.cameras import CameraState, CameraWatch
+from shapepose_fg.live.filtering import Filter, Moment
+from shapepose_fg.live.now import Bodies, fed_back, people_at
+from shapepose_fg.live.refining import LiveState, Refinery, Slot
+from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
+from shapepose_fg.live.views import ViewsInStep, joined
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.pipeline.workers import Workers
+from shapepose_fg.proposal.thinning import thinned
+
+AHEAD_S = 1.0
+"""People can be asked for up to so long after the newest frame."""
+_ROUNDS = 2
+"""Detections of a window are assigned again so often at the most: the filter has assigned them already."""
+_KEPT_S = 10.0
+"""What is settled and nobody takes is kept for so long."""
+_BEHIND = 3.0
+"""Frames older than so many lags are settled as they are, where solving does not keep up."""
+_MOST_SAID = 1000
+
+
+@dataclass(frozen=True)
+class Said:
+    """What was noticed of a camera while it ran."""
+
+    time_s: float
+    """When."""
+    camera: str
+    """Which."""
+    state: CameraState
+    """What is the matter with it from then on."""
+
+
+@dataclass(frozen=True)
+class LiveReport:
+    """How it goes."""
+
+    frames: int
+    """Frames that were taken in."""
+    late: int
+    """Of these, those that came after a later one."""
+    dropped: int
+    """Frames, or a camera's detections, that came too late, or twice: left out."""
+    unrefined: int
+    """Frames that nobody refined, because solving did not keep up."""
+    not_taken: int
+    """Settled rows that nobody took in time."""
+    cameras: dict[str, CameraState]
+    """How each camera is."""
+
+
+class OnlineReconstructor:
+    """Follows people from frame to frame as they come, and refines them within a fixed lag.
+
+    A context: processes that refine end with it. `push`, `push_view`, `settled`, `save` and `close` wait for each
+    other; `people` and `report` wait for nobody and may be called by any thread.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        config: PipelineConfig | None = None,
+        *,
+        skeleton: Skeleton = BODY_25,
+        lag_s: float = 0.3,
+        workers: int = 2,
+        fitter: BodyFitter | None = None,
+    ) -> None:
+        """`skeleton` are the detector's joints; `lag_s` is how much later the refined people are handed out.
+
+        `workers` processes refine; with 1 it is done within `push`, in the same order, so that the same frames
+        give the same bytes. Where the detector puts its joints comes from `config.offsets.source`, where that is a
+        file. ValueError for fewer than two cameras, or a lag that is not 0.1 to 2 seconds.
+        """
+        config = PipelineConfig() if config is None else config
+        if len(rig) < 2:
+            raise ValueError(f"at least 2 cameras are needed to see depth, got {len(rig)}")
+        if not 0.1 <= lag_s <= 2.0:
+            raise ValueError(f"lag_s must be 0.1 to 2 seconds, got {lag_s}")
+        if not config.temporal:
+            raise ValueError("people are followed over time here: leave config.temporal at true")
+        rounds = min(config.windows.again_over_time, _ROUNDS)
+        config = replace(config, windows=replace(config.windows, again_over_time=rounds))
+        if fitter is None:
+            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
+            if config.offsets.source not in ("none", "recording"):
+                fitter = fitter.with_keypoint_offsets(KeypointOffsets.load(config.offsets.source))
+        check_fitter(fitter)
+        self.rig, self.lag_s = rig, lag_s
+        setup = Setup(rig, skeleton, config, fitter)
+        self._setup, self._config, self._id = setup, config, setup_id(rig, skeleton, config, lag_s)
+        self._filter = Filter(setup.engine(Notebook()).tracker, config.stitching)
+        self._motion = MotionModel.load(skeleton.joints, config.motion, config.law)
+        self._lock = threading.RLock()
+        self._workers = Workers(workers, setup).__enter__()
+        self._most_waiting = 1 if workers == 1 else 2 * workers
+        self._refinery = Refinery(self._workers, self._filter)
+        self._state = LiveState(CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
+        self._said = deque[Said](maxlen=_MOST_SAID)
+        self._now: tuple[int, Moment, Bodies | None] = 0, self._filter.nobody, None
+
+    @classmethod
+    def load(
+        cls,
+        path: Path | str,
+        rig: Rig,
+        config: PipelineConfig | None = None,
+        *,
+        skeleton: Skeleton = BODY_25,
+        lag_s: float = 0.3,
+        workers: int = 2,
+        fitter: BodyFitter | None = None,
+    ) -> "OnlineReconstructor":
+        """Go on from what `save` wrote, with the same cameras, settings and lag; else InputError."""
+        found = cls(rig, config, skeleton=skeleton, lag_s=lag_s, workers=workers, fitter=fitter)
+        try:
+            found._state = read_state(Path(path), found._id, rig, found._filter)
+            found._show()
+        except InputError:
+            found.close()
+            raise
+        return found
+
+    def __enter__(self) -> "OnlineReconstructor":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the processes that refine. What was settled can still be taken."""
+        with self._lock:
+            self._workers.__exit__(None)
+
+    def push(self, detections: Detections, time_s: float | Array) -> None:
+        """Take in a frame of all cameras, taken at `time_s`: seconds, or (V,) for cameras out of step.
+
+        A camera that gave nothing has no detections in it. Frames may come late or out of order by up to the lag:
+        everything after them is followed once more. Older ones, and a second one of the same time, are counted and
+        left out. ValueError where a detection is of a camera or joint that there is not, or not finite.
+        """
+        times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
+        if not np.isfinite(times).all():
+            raise ValueError("time_s must be finite")
+        self._check(detections)
+        with self._lock:
+            self._take(detections, times)
+
+    def push_view(self, camera: str, detections: Detections, time_s: float) -> None:
+        """Take in what one camera saw at `time_s`, seconds, on the clock that all share.
+
+        Views make a frame: it is complete when every camera that was heard in the last half second is in it (the
+        first one: every camera), or when one comes again. What comes for a frame that was complete joins it where
+        it is within half a frame of it and within the lag; else it is counted and left out. `detections` are of
+        this camera whatever their `view` says. ValueError as `push`, and for a camera that there is not.
+        """
+        if camera not in self.rig.names:
+            raise ValueError(f"there is no camera {camera}; there are {', '.join(self.rig.names)}")
+        if not np.isfinite(time_s):
+            raise ValueError("time_s must be finite")
+        view = self.rig.names.index(camera)
+        own = replace(detections, view=np.full(len(detections), view))
+        self._check(own)
+        with self._lock:
+            if self._state.views.is_late(view, time_s):
+                self._state.views.heard(view, time_s)
+                self._join(view, own, time_s)
+                return
+            for frame, times in self._state.views.add(view, own, time_s):
+                self._take(frame, times)
+
+    def people(self, time_s: float | None = None) -> Reconstruction:
+        """The people at `time_s`, from the newest frame's time (the default) to a second after it.
+
+        A row per person, of the newest frame's number. Joints are predicted by the model of motion, and their
+        covariances grow with the time ahead. Bodies are the last refined ones, moved along with the joints.
+        ValueError for another time.
+        """
+        frame, moment, bodies = self._now
+        newest_s = moment.tracks.time_s
+        ahead_s = 0.0 if time_s is None or not np.isfinite(newest_s) else time_s - newest_s
+        if not -1e-9 <= ahead_s <= AHEAD_S + 1e-9:
+            raise ValueError(
+                f"people are known from {newest_s:g} s, the newest frame, to {AHEAD_S:g} s later, not at"
+                f" {time_s:g} s; what was before is in settled()"
+            )
+        return people_at(self._filter.tracker, self._motion, frame, moment, bodies, max(ahead_s, 0.0))
+
+    def settled(self, *, wait: bool = False) -> Reconstruction:
+        """The refined rows of all frames that have settled since this was asked last; with `wait`, until all that
+        are under way are there. Rows that nobody takes within ten seconds are counted and forgotten.
+        """
+        with self._lock:
+            self._collect(wait=wait)
+            parts = list(self._state.settled)
+            self._state.settled.clear()
+        names = self._setup.skeleton.joints
+        return Reconstruction.concatenate(parts) if len(parts) > 0 else Reconstruction.empty(names)
+
+    def finish(self) -> Reconstruction:
+        """`settled` of all frames up to the newest: the stream has ended."""
+        with self._lock:
+            for frame, times in self._state.views.rest():
+                self._take(frame, times)
+            self._refine(last=True)
+            return self.settled(wait=True)
+
+    def save(self, path: Path | str) -> None:
+        """Write all that is needed to go on with `load`; what is under way is waited for. The same state gives the
+        same bytes. What was noticed of cameras (`said`) is left out.
+        """
+        with self._lock:
+            self._collect(wait=True)
+            arrays = state_arrays(self._state)
+        write_state(Path(path), arrays, self._id)
+
+    def report(self) -> LiveReport:
+        """How it goes: counts, and how each camera is."""
+        cameras = {
+            name: CameraState(code) for name, code in zip(self.rig.names, self._state.watch.state, strict=True)
+        }
+        counts = (
+            self._state.frames,
+            self._state.late,
+            self._state.dropped,
+            self._state.unrefined,
+            self._state.not_taken,
+        )
+        return LiveReport(*counts, cameras)
+
+    def said(self) -> list[Said]:
+        """What was noticed of cameras, oldest first; the last thousand."""
+        return list(self._said)
+
+    def _check(self, detections: Detections) -> None:
+        for name, values, count in (
+            ("view", detections.view, len(self.rig)),
+            ("joint", detections.joint, len(self._setup.skeleton)),
+        ):
+            if len(values) > 0 and (values.min() < 0 or values.max() >= count):
+                raise ValueError(f"{name} must be 0 to {count - 1}, got {values.min()} to {values.max()}")
+        if not (np.isfinite(detections.xy).all() and np.isfinite(detections.confidence).all()):
+            raise ValueError("xy and confidence must be finite")
+
+    def _take(self, detections: Detections, times: Array) -> None:
+        """A frame, in its place among those that came."""
+        time_s, slots = float(times.mean()), self._state.slots
+        detections, _ = thinned(detections, len(self.rig), self._config.candidates)
+        if len(slots) > 0 and time_s <= slots[-1].time_s:
+            self._insert(detections, times, time_s)
+            return
+        last_s = slots[-1].time_s if len(slots) > 0 else time_s
+        before = self._state.watch
+        watch, rig = before.seen(detections, self._state.before, self.rig, time_s)
+        given = Input(self._state.frames, times, _without(detections, rig), rig)
+        moment, candidate = self._filter.step(slots[-1].moment if len(slots) > 0 else self._filter.nobody, given)
+        self._state.frames += 1
+        self._state.before = detections
+        seen = (moment.views >= 2) & moment.named[:, None]
+        shown = np.where(seen[..., None], moment.tracks.joints.position, np.nan)
+        self._state.watch = watch.compared(detections, shown, self.rig, time_s - last_s)
+        for view in np.flatnonzero(watch.state != before.state).tolist():
+            self._said.append(Said(time_s, self.rig.names[view], CameraState(watch.state[view])))
+        slots.append(Slot(given, moment, candidate))
+        self._refine()
+        self._collect()
+
+    def _insert(self, detections: Detections, times: Array, time_s: float) -> None:
+        """A frame that came after later ones: these are followed once more."""
+        slots = self._state.slots
+        at = bisect_left([slot.time_s for slot in slots], time_s)
+        if at == 0 or slots[-1].time_s - time_s > self.lag_s or slots[at].time_s == time_s:
+            self._state.dropped += 1
+            return
+        rig = self._state.watch.believed(detections, self.rig)
+        given = Input(self._state.frames, times, _without(detections, rig), rig)
+        slots.insert(at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled))
+        self._state.frames, self._state.late = self._state.frames + 1, self._state.late + 1
+        self._again(at)
+
+    def _join(self, view: int, detections: Detections, time_s: float) -> None:
+        """A camera's detections that came after their frame: it is made anew with them."""
+        times = np.array([slot.time_s for slot in self._state.slots])
+        at = int(np.abs(times - time_s).argmin()) if len(times) > 0 else 0
+        near_s = self._state.views.period_s / 2
+        if at == 0 or abs(times[at] - time_s) > near_s or times[-1] - time_s > self.lag_s:
+            self._state.dropped += 1
+            return
+        slot = self._state.slots[at]
+        if (slot.given.detections.view == view).any():
+            self._state.dropped += 1
+            return
+        at_s = slot.given.time_s.copy()
+        at_s[view] = time_s
+        both = joined([slot.given.detections, detections])
+        rig = replace(slot.given.rig, dark=tuple(each for each in slot.given.rig.dark if each != view))
+        slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)
+        self._state.late += 1
+        self._again(at)
+
+    def _again(self, first: int) -> None:
+        """Follow from slot `first` on once more."""
+        for at in range(first, len(self._state.slots)):
+            slot = self._state.slots[at]
+            slot.moment, slot.candidate = self._filter.step(self._state.slots[at - 1].moment, slot.given)
+        self._show()
+
+    def _refine(self, *, last: bool = False) -> None:
+        """Send what is due, forget what is done.
+
+        A window settles what is older than a third of the lag as soon as something is as old as the lag, with a
+        third of the lag before and after it.
+        """
+        slots, around_s = self._state.slots, self.lag_s / 3
+        if len(slots) == 0:
+            return
+        age_s = slots[-1].time_s - np.array([slot.time_s for slot in slots]) + 1e-6
+        settled = np.array([*(slot.settled for slot in slots), False])
+        first = int(settled.argmin())
+        if first < len(slots) and (last or age_s[first] >= self.lag_s):
+            stop = len(slots) if last else int((age_s >= around_s).sum())
+            if last or self._refinery.waiting < self._most_waiting:
+                begin = int((age_s > age_s[first] + around_s).sum())
+                self._refinery.send(slots[begin:], first - begin, stop - first)
+                for slot in slots[first:stop]:
+                    slot.settled = True
+                first = stop
+            elif age_s[first] > _BEHIND * self.lag_s:
+                slots[first].settled = True
+                self._state.unrefined += 1
+        # What a late frame is put behind, and what the next window begins with.
+        needed_s = max(self.lag_s, age_s[first] if first < len(slots) else 0.0) + around_s
+        del slots[: int((age_s > needed_s).sum())]
+
+    def _collect(self, *, wait: bool = False) -> None:
+        """Take in windows that were solved meanwhile: rows that are settled, and bodies for the newest moment."""
+        for refined in self._refinery.came(wait=wait):
+            if len(refined.rows) > 0:
+                self._state.settled.append(refined.rows)
+            if len(refined.newest) > 0:
+                self._state.bodies = Bodies.of(refined.newest, self._setup.skeleton)
+                self._state.slots[-1].moment = fed_back(
+                    self._filter.tracker, self._state.slots[-1].moment, refined.newest
+                )
+        newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
+        while len(self._state.settled) > 0 and newest_s - float(self._state.settled[0].time_s.max()) > _KEPT_S:
+            self._state.not_taken += len(self._state.settled.popleft())
+        self._show()
+
+    def _show(self) -> None:
+        """From now on `people` is asked of the newest moment as it is."""
+        if len(self._state.slots) > 0:
+            newest = self._state.slots[-1]
+            self._now = newest.given.frame, newest.moment, self._state.bodies
+
+
+def _without(detections: Detections, rig: Rig) -> Detections:
+    """Detections before those cameras that are not dark."""
+    gone = np.zeros(len(rig), dtype=bool)
+    gone[list(rig.dark)] = True
+    return detections.only(~gone[detections.view]) if gone[detections.view].any() else detections

@@ -1,0 +1,138 @@
+"""Behind the newest moment: windows of frames solved by stage II, in order, here or in processes of their own."""
+
+from collections import deque
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Index, Whole
+from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.live.cameras import CameraWatch
+from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
+from shapepose_fg.live.now import Bodies
+from shapepose_fg.live.views import ViewsInStep
+from shapepose_fg.pipeline.runs.parts import Part
+from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.pipeline.windows import Span
+from shapepose_fg.pipeline.workers import Workers
+
+
+@dataclass
+class Slot:
+    """A frame, and the people after it."""
+
+    given: Input
+    """What the cameras gave that is believed; its number counts frames as they came."""
+    moment: Moment
+    """The people."""
+    candidate: Index
+    """(A, J, V) the detections of its tracks; -1 for none."""
+    settled: bool = False
+    """Whether its rows have been refined, or are being refined."""
+
+    @property
+    def time_s(self) -> float:
+        """When it was, the mean of its views."""
+        return float(self.given.time_s.mean())
+
+
+@dataclass
+class LiveState:
+    """All that changes while frames come in, but for windows that are under way."""
+
+    watch: CameraWatch
+    """Which cameras are believed."""
+    views: ViewsInStep
+    """Views that wait for the others of their frame."""
+    slots: list[Slot] = field(default_factory=list)
+    """The last frames, in order of time: those that are not settled, and what a window needs before them."""
+    before: Detections | None = None
+    """The newest frame's detections, all of them."""
+    settled: deque[Reconstruction] = field(default_factory=deque)
+    """Rows that nobody has taken yet."""
+    bodies: Bodies | None = None
+    """The newest refined ones."""
+    frames: int = 0
+    """How many frames were taken in, and so on (`LiveReport`)."""
+    late: int = 0
+    dropped: int = 0
+    unrefined: int = 0
+    not_taken: int = 0
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A window that was solved."""
+
+    rows: Reconstruction
+    """The rows that are settled by it."""
+    newest: Reconstruction
+    """Those of its newest frame: as far as the bodies are known that people have now."""
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """A window under way."""
+
+    part: "Future[Part]"
+    frames: Whole
+    """(T,) the frames' own numbers."""
+    names: dict[int, int]
+    """Tracks to identities."""
+    own: int
+    """How many of its frames from `Span.start` on are settled by it."""
+    start: int
+
+
+class Refinery:
+    """Sends windows to be solved, and gives back what came of them in the order in which they were sent."""
+
+    def __init__(self, workers: Workers[Setup], following: Filter) -> None:
+        self._workers, self._filter = workers, following
+        self._sent = deque[_Sent]()
+
+    @property
+    def waiting(self) -> int:
+        """How many windows are under way."""
+        return len(self._sent)
+
+    def send(self, window: list[Slot], start: int, own: int) -> None:
+        """Have the `own` slots from `start` on solved with those around them."""
+        names = dict[int, int]()
+        for slot in window:
+            ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
+            names |= {track: name for track, name in zip(ids, who, strict=True) if name != ON_TRIAL}
+        decided = []
+        for n, slot in enumerate(window):
+            # Frames are numbered by their times, in whatever order they came.
+            given = replace(slot.given, frame=n)
+            rows = self._filter.observations(slot.moment, slot.candidate, given)
+            decided.append((given, rows.rows(np.isin(rows.track, list(names)))))
+        rows = Observations.concatenate([each for _, each in decided])
+        if len(rows) == 0:
+            return
+        frames = np.array([slot.given.frame for slot in window])
+        part = self._workers.submit(Setup.solve, Span(tuple(decided), start, len(decided)))
+        self._sent.append(_Sent(part, frames, names, own, start))
+
+    def came(self, *, wait: bool = False) -> list[Refined]:
+        """Windows that have been solved since, oldest first; with `wait` all of them."""
+        found = []
+        while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
+            sent = self._sent.popleft()
+            rows, at = sent.part.result().rows, 0
+            at = rows.frame
+            person = np.array([sent.names[track] for track in rows.person.tolist()], dtype=np.int64)
+            # Of two tracks of one identity in a frame, who came back while they were still followed, one stays.
+            _, first = np.unique(np.column_stack([at, person]), axis=0, return_index=True)
+            keep, frame = np.sort(first), sent.frames[at]
+            table = rows.observations
+            if table is not None:
+                table = replace(table, frame=frame, person=person)
+            rows = replace(rows, frame=frame, person=person, observations=table)
+            own, newest = at[keep] < sent.start + sent.own, at[keep] == len(sent.frames) - 1
+            found.append(Refined(rows.rows(keep[own]), rows.rows(keep[newest])))
+        return found

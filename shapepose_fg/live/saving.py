@@ -1,0 +1,249 @@
+"""What a running reconstruction is made of as arrays, and back: to go on elsewhere, or after a restart."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapepose_fg.core.arrays import Whole
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.npz import read_npz, write_npz
+from shapepose_fg.core.storage.schema import Column
+from shapepose_fg.live.cameras import CameraState, CameraWatch
+from shapepose_fg.live.filtering import OF_TRACKS, Filter, Gone, Moment
+from shapepose_fg.live.now import Bodies
+from shapepose_fg.live.refining import LiveState, Slot
+from shapepose_fg.live.views import ViewsInStep, joined
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.tracker import Tracks
+
+FORMAT = "shapepose-fg live state 1"
+_CURE = "begin without it"
+_WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place")
+_DETECTIONS = (*_SEEN, "pairs", "affinity")
+"""The columns of detections."""
+_COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken")
+"""The counts of a state."""
+_COLUMNS = {
+    "slots": Column("T 8", _WHOLE),
+    "times": Column("T 2"),
+    "time_s": Column("T V", most=1e12),
+    "out": Column("T V", _WHOLE),
+    "candidate": Column("A J V", _WHOLE),
+    "ids": Column("A", _WHOLE),
+    "world": Column("A", _WHOLE),
+    "mean": Column("A J S", most=1e9),
+    "covariance": Column("A J S S", most=1e18),
+    "evident_s": Column("A", most=1e12),
+    "views": Column("A J", _WHOLE),
+    "of_body": Column("A J", np.bool_),
+    "identity": Column("A", _WHOLE),
+    "running_s": Column("A", most=1e9),
+    "peak_s": Column("A", most=1e9),
+    "born_s": Column("A", most=1e12),
+    "place": Column("A 3", most=1e6),
+    "length_m": Column("A B", most=1e12),
+    "count": Column("A B", most=1e12),
+    "gone.identity": Column("G", _WHOLE),
+    "gone.time_s": Column("G", most=1e12),
+    "gone.place": Column("G 3", most=1e6),
+    "gone.bones": Column("G B", most=1e6),
+    "seen.view": Column("D", _WHOLE),
+    "seen.joint": Column("D", _WHOLE),
+    "seen.xy": Column("D 2", most=1e9),
+    "seen.confidence": Column("D", most=1e3),
+    "seen.place": Column("D", _WHOLE),
+    "seen.pairs": Column("E 2", _WHOLE),
+    "seen.affinity": Column("E", most=1e9),
+}
+"""What is kept of the frames, one after the other; `slots` says how much of it is each frame's: its number,
+whether it is settled, the next track and identity, and how many tracks, detections, pairs and people who left it
+has."""
+
+
+def setup_id(rig: Rig, skeleton: Skeleton, config: PipelineConfig, lag_s: float) -> str:
+    """A digest of all that a state goes with."""
+    told = repr((asdict(config), rig.names, skeleton.joints, skeleton.limbs, lag_s)).encode()
+    return hashlib.sha256(told + rig.K.tobytes() + rig.cTw.tobytes()).hexdigest()
+
+
+def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
+    """Frames and the people after each, as arrays: at least one frame."""
+    moments, given = [slot.moment for slot in slots], [slot.given for slot in slots]
+    seen = [each.detections for each in given]
+    views = len(given[0].rig)
+    out = np.zeros((len(slots), views), dtype=np.int64)
+    for row, each in zip(out, given, strict=True):
+        row[list(each.rig.doubted)], row[list(each.rig.dark)] = 2, 1
+    counts = [
+        (
+            slot.given.frame, slot.settled, slot.moment.next_track, slot.moment.next_identity,
+            len(slot.moment.tracks), len(slot.given.detections), len(slot.given.detections.pairs),
+            len(slot.moment.gone.identity),
+        )
+        for slot in slots
+    ]  # fmt: skip
+    arrays: dict[str, NDArray[Any]] = {
+        "slots": np.array(counts, dtype=np.int64),
+        "times": np.array([(each.tracks.time_s, each.sought_s) for each in moments]),
+        "time_s": np.array([each.time_s for each in given]),
+        "out": out,
+        "candidate": np.concatenate([slot.candidate for slot in slots]),
+        "mean": np.concatenate([each.tracks.joints.mean for each in moments]),
+        "covariance": np.concatenate([each.tracks.joints.covariance for each in moments]),
+    }
+    for name in ("ids", "world", "evident_s"):
+        arrays[name] = np.concatenate([getattr(each.tracks, name) for each in moments])
+    for name in OF_TRACKS:
+        arrays[name] = np.concatenate([getattr(each, name) for each in moments])
+    for each in fields(Gone):
+        arrays[f"gone.{each.name}"] = np.concatenate([getattr(moment.gone, each.name) for moment in moments])
+    for name in _DETECTIONS:
+        arrays[f"seen.{name}"] = np.concatenate([getattr(each, name) for each in seen])
+    return arrays
+
+
+def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> list[Slot]:
+    """The frames that `slot_arrays` made the arrays of; ValueError where they are not of these cameras, or of no
+    run.
+    """
+    J, B = nobody.views.shape[1], nobody.count.shape[1]
+    sizes = {"V": len(rig), "J": J, "B": B, "S": nobody.tracks.joints.mean.shape[2]}
+    found = {name: column.checked(name, arrays[name], sizes) for name, column in _COLUMNS.items()}
+    for name, column in _COLUMNS.items():
+        column.check_range(name, found[name])
+    counts = found["slots"]
+    if (counts < 0).any() or any(
+        counts[:, n].sum() != sizes.get(letter, 0) for n, letter in zip((4, 5, 6, 7), "ADEG", strict=True)
+    ):
+        raise ValueError("its rows are not of its frames")
+    if not all(np.isfinite(found[name]).all() for name in ("mean", "covariance", "time_s", "seen.xy")):
+        raise ValueError("its tracks, times and detections must be finite")
+    if (np.diff(found["time_s"].mean(axis=1)) <= 0).any():
+        raise ValueError("its frames must be in order of time")
+    slots, starts = [], np.vstack([np.zeros((1, 8), dtype=np.int64), np.cumsum(counts, axis=0)])
+    for n, (frame, settled, track, identity, *_) in enumerate(counts.tolist()):
+        a, d, e, g = (slice(*starts[n : n + 2, column].tolist()) for column in (4, 5, 6, 7))
+        dark, doubted = (tuple(np.flatnonzero(found["out"][n] == code).tolist()) for code in (1, 2))
+        seen = Detections(
+            **{name: found[f"seen.{name}"][d] for name in _SEEN},
+            pairs=found["seen.pairs"][e],
+            affinity=found["seen.affinity"][e],
+        )
+        given = Input(frame, found["time_s"][n], seen, replace(rig, dark=dark, doubted=doubted))
+        candidate = found["candidate"][a].astype(np.intp)
+        _check(seen, candidate, len(rig), J)
+        time_s, sought_s = found["times"][n].tolist()
+        joints = JointStates(found["mean"][a], found["covariance"][a])
+        tracks = Tracks(time_s, found["ids"][a], found["world"][a], joints, found["evident_s"][a])
+        own = {name: found[name][a] for name in OF_TRACKS}
+        gone = Gone(*(found[f"gone.{each.name}"][g] for each in fields(Gone)))
+        moment = Moment(tracks, **own, gone=gone, sought_s=sought_s, next_track=track, next_identity=identity)
+        slots.append(Slot(given, moment, candidate, bool(settled)))
+    return slots
+
+
+def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
+    """ValueError where detections are of no camera or joint, or people have others than these."""
+    within = all(
+        len(values) == 0 or (values.min() >= 0 and values.max() < most)
+        for values, most in ((seen.view, views), (seen.joint, joints), (seen.pairs, len(seen)))
+    )
+    if not within or (candidate.size > 0 and (candidate.min() < -1 or candidate.max() >= len(seen))):
+        raise ValueError("its detections are of other cameras, joints or people")
+
+
+def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
+    """A state as arrays."""
+    views = len(state.watch.state)
+    waiting_s = np.full(views, np.nan)
+    for view, (_, time_s) in state.views.waiting.items():
+        waiting_s[view] = time_s
+    arrays: dict[str, NDArray[Any]] = {
+        "counts": np.array([getattr(state, name) for name in _COUNTS]),
+        "cameras": np.array([state.watch.apart_m, state.watch.heard_s, state.watch.state, state.views.heard_s]),
+        "clock": np.array([state.views.done_s, state.views.period_s]),
+        "waiting_s": waiting_s,
+    }
+    waiting = joined([each for each, _ in state.views.waiting.values()] or [Detections.empty()])
+    for name, seen in (("waiting", waiting), ("before", state.before or Detections.empty())):
+        arrays |= {f"{name}.{each}": getattr(seen, each) for each in _DETECTIONS}
+    if len(state.settled) > 0:
+        settled = Reconstruction.concatenate(list(state.settled))
+        arrays |= {f"settled.{each}": getattr(settled, each) for each in Reconstruction.ROWS}
+    if state.bodies is not None:
+        arrays |= {f"bodies.{each}": getattr(state.bodies.rows, each) for each in Reconstruction.ROWS}
+    return arrays | (slot_arrays(state.slots) if len(state.slots) > 0 else {"slots": np.zeros((0, 8), np.int64)})
+
+
+def write_state(path: Path, arrays: Mapping[str, NDArray[Any]], setup: str) -> None:
+    """Write a state, whole or not at all; the same one gives the same bytes."""
+    told = {"format": np.array(FORMAT), "setup": np.array(setup), **arrays}
+    write_atomically(path, lambda stream: write_npz(stream, told))
+
+
+def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState:
+    """A state. InputError where it is none, or of another set-up."""
+    names = ["counts", "cameras", "clock", "waiting_s"]
+    names += [f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS]
+    optional = [f"{name}.{each}" for name in ("settled", "bodies") for each in Reconstruction.ROWS]
+    arrays = read_npz(path, ("format", "setup", *_COLUMNS, *names, *optional), _CURE)
+    if str(arrays.get("format", "")) != FORMAT:
+        raise InputError(f"{path}: is no state of a live reconstruction; {_CURE}")
+    if str(arrays.get("setup", "")) != setup:
+        raise InputError(f"{path}: was saved with other cameras, joints, settings or lag; give those, or {_CURE}")
+    missing = {*names, *(_COLUMNS if len(arrays.get("slots", ())) > 0 else ())} - arrays.keys()
+    if missing:
+        raise InputError(f"{path}: {min(missing)} is missing; {_CURE}")
+    try:
+        return _state_of(arrays, rig, following)
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: {error}; {_CURE}") from None
+
+
+def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -> LiveState:
+    """A state of its arrays; ValueError where they make none."""
+    V, skeleton = len(rig), following.tracker.skeleton
+    shapes = {"counts": (len(_COUNTS),), "cameras": (4, V), "clock": (2,), "waiting_s": (V,)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape or arrays[name].dtype.kind not in "if":
+            raise ValueError(f"{name} must be {shape}, got {arrays[name].shape}")
+    apart_m, heard_s, code, last_s = arrays["cameras"]
+    seen = {}
+    for name in ("waiting", "before"):
+        seen[name] = Detections(**{each: arrays[f"{name}.{each}"] for each in _DETECTIONS})
+        _check(seen[name], np.zeros(0, dtype=np.int64), V, len(skeleton))
+    waiting = {
+        view: (seen["waiting"].only(seen["waiting"].view == view), float(arrays["waiting_s"][view]))
+        for view in np.flatnonzero(np.isfinite(arrays["waiting_s"])).tolist()
+    }
+    if not np.isin(code, list(CameraState)).all():
+        raise ValueError("cameras must have states that there are")
+    watch = CameraWatch(apart_m, heard_s, code.astype(np.int64))
+    state = LiveState(watch, ViewsInStep(V, waiting, last_s, *arrays["clock"].tolist()))
+    for name, value in zip(_COUNTS, arrays["counts"].tolist(), strict=True):
+        setattr(state, name, int(value))
+    if "settled.frame" in arrays:
+        state.settled.append(_rows(arrays, "settled", skeleton))
+    if "bodies.frame" in arrays:
+        state.bodies = Bodies.of(_rows(arrays, "bodies", skeleton), skeleton)
+    if len(arrays["slots"]) > 0:
+        state.slots, state.before = slots_of(arrays, rig, following.nobody), seen["before"]
+    return state
+
+
+def _rows(arrays: Mapping[str, NDArray[Any]], name: str, skeleton: Skeleton) -> Reconstruction:
+    columns = {each: arrays[f"{name}.{each}"] for each in Reconstruction.ROWS}
+    rows = Reconstruction(joint_names=np.array(skeleton.joints), **cast(Any, columns))
+    rows.check_ranges()
+    return rows

@@ -1,0 +1,82 @@
+"""Cameras on their own clocks: views as they come, put together to frames."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.detections import Detections
+
+_HEARD_S = 0.5
+"""A frame waits for cameras that were heard so lately."""
+_ASSUMED_S = 1 / 30
+"""Between a camera's pictures, until it has given two."""
+_FRESH = 0.05
+"""How much of a camera's period its last step is."""
+
+Frame = tuple[Detections, Array]
+"""What all cameras saw, and (V,) when."""
+
+
+@dataclass
+class ViewsInStep:
+    """Views that wait for the others of their frame."""
+
+    views: int
+    """V."""
+    waiting: dict[int, tuple[Detections, float]] = field(default_factory=dict)
+    """By view: what it saw, and when."""
+    heard_s: Array = field(default_factory=lambda: np.zeros(0))
+    """(V,) time of the last view of each camera."""
+    done_s: float = -np.inf
+    """Time of the last frame that is complete."""
+    period_s: float = _ASSUMED_S
+    """Between pictures of a camera, about."""
+
+    def __post_init__(self) -> None:
+        if len(self.heard_s) == 0:
+            self.heard_s = np.full(self.views, -np.inf)
+
+    def is_late(self, view: int, time_s: float) -> bool:
+        """Whether the frame of this view is complete without it."""
+        return time_s <= max(self.heard_s[view], self.done_s + self.period_s / 2)
+
+    def heard(self, view: int, time_s: float) -> None:
+        """A camera was heard, if late."""
+        self.heard_s[view] = max(self.heard_s[view], time_s)
+
+    def add(self, view: int, detections: Detections, time_s: float) -> list[Frame]:
+        """Take in a view; the frames that are complete with it."""
+        found = self.rest() if view in self.waiting else []
+        step_s = time_s - float(self.heard_s[view])
+        if step_s < 3 * self.period_s:
+            self.period_s += _FRESH * (step_s - self.period_s)
+        self.heard_s[view] = time_s
+        self.waiting[view] = detections, time_s
+        # Before the first frame every camera is waited for, until one comes again.
+        awaited = (time_s - self.heard_s <= _HEARD_S) | np.isinf(self.done_s)
+        alive = np.flatnonzero(awaited).tolist()
+        return found + (self.rest() if all(each in self.waiting for each in alive) else [])
+
+    def rest(self) -> list[Frame]:
+        """What waits, as a frame."""
+        if len(self.waiting) == 0:
+            return []
+        mean = float(np.mean([time_s for _, time_s in self.waiting.values()]))
+        times = np.full(self.views, mean)
+        for view, (_, time_s) in self.waiting.items():
+            times[view] = time_s
+        together = joined([self.waiting[view][0] for view in sorted(self.waiting)])
+        self.waiting, self.done_s = {}, mean
+        return [(together, times)]
+
+
+def joined(parts: list[Detections]) -> Detections:
+    """The detections of several views, one after the other."""
+    first = np.cumsum([0, *(len(part) for part in parts)])
+    columns = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("view", "joint", "xy", "confidence", "affinity", "place")
+    }
+    pairs = np.concatenate([part.pairs + n for part, n in zip(parts, first, strict=False)])
+    return replace(parts[0], pairs=pairs, **columns)
