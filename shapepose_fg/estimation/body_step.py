@@ -15,6 +15,9 @@ MODEL_SIGMA_M = 0.02
 """How far a detector's joints lie from the body's, metres."""
 JOINT_SIGMA_M = 0.03
 """Sigma of every joint where the body is fitted to X, all joints alike, metres."""
+_SAME, _AS_MUCH = 2.5, 1.25
+"""The body of a frame by itself is as before where all targets moved by less than so many times what joints move
+that have settled, and weigh up to a quarter more or less: 5 mm, a quarter of `MODEL_SIGMA_M`."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,17 @@ class BodyStep:
         known = np.isfinite(evidence.points).all(axis=-1) & enough[:, None]
         information = known[..., None, None] * np.eye(3) / JOINT_SIGMA_M**2
         return JointTargets(np.nan_to_num(evidence.points), information)
+
+    def fit_changed(self, targets: JointTargets, last: BodyFit, told: JointTargets) -> tuple[BodyFit, Index]:
+        """Bodies (R), and which rows were fitted anew, from the `last` ones, fitted to what they were `told`."""
+        near_m = _SAME * self.config.refine.settled_m
+        over_time = np.concatenate([np.full(len(person), person.temporal) for person in self.people])
+        rows = np.arange(len(targets))
+        if near_m > 0:
+            rows = np.union1d(
+                changed_targets(told, targets, near_m, _AS_MUCH), np.flatnonzero(over_time | ~last.ok)
+            )
+        return last.with_rows(rows, self.fit(targets, last, rows)) if len(rows) > 0 else last, rows
 
     def fit(self, targets: JointTargets, last: BodyFit, rows: Index | None = None) -> BodyFit:
         """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on.
@@ -79,6 +93,14 @@ def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:
     """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
     information = np.where(enough[:, None, None, None], evidence.information, 0.0)
     return JointTargets(np.nan_to_num(evidence.target), information)
+
+
+def changed_targets(before: JointTargets, now: JointTargets, moved_m: float, times: float) -> Index:
+    """Rows with a joint whose target moved by more than `moved_m`, or weighs so many `times` more or less."""
+    weights = [np.trace(each.information, axis1=2, axis2=3) for each in (before, now)]
+    less, more = np.minimum(*weights), np.maximum(*weights)
+    moved = (more > 0) & (np.linalg.norm(now.xyz - before.xyz, axis=-1) > moved_m)
+    return np.flatnonzero((moved | (more > times * less)).any(axis=1))
 
 
 def disagreement(evidence: ViewEvidence, fit: BodyFit) -> Array:

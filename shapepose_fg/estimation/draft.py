@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.body_step import MODEL_SIGMA_M, joint_targets
+from shapepose_fg.estimation.body_step import MODEL_SIGMA_M, changed_targets, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
@@ -66,7 +66,7 @@ def draft(
         around = np.where(body.ok[:, None, None], body.joints, X)
         evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
         targets = joint_targets(evidence, enough)
-        rows = changed_targets(fitted, targets)
+        rows = changed_targets(fitted, targets, MOVED_M, 2.0)
         if len(rows) == 0:
             continue
         again = fitter.fit_whole(targets.rows(rows))
@@ -123,14 +123,6 @@ def first_places(observations: Observations, views: Views, fitter: BodyFitter, c
     complete = X.copy()
     complete[rows] = np.where(unknown[rows][..., None], places, X[rows])
     return complete
-
-
-def changed_targets(before: JointTargets, now: JointTargets) -> Index:
-    """Which rows have a joint whose target moved by more than `MOVED_M`, or weighs twice or half what it did."""
-    weights = [np.trace(each.information, axis1=2, axis2=3) for each in (before, now)]
-    less, more = np.minimum(*weights), np.maximum(*weights)
-    moved = (more > 0) & (np.linalg.norm(now.xyz - before.xyz, axis=-1) > MOVED_M)
-    return np.flatnonzero((moved | (more > 2 * less)).any(axis=1))
 
 
 def drafted(evidence: ViewEvidence, body: BodyFit, disagreement: float) -> tuple[Array, Array]:

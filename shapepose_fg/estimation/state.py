@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -51,6 +51,8 @@ class State:
     """(N,) rows whose views place enough joints to place a person."""
     fit: BodyFit
     """Theta: the bodies, N rows."""
+    told: JointTargets
+    """What they were fitted to."""
 
     @classmethod
     def start(
@@ -78,6 +80,7 @@ class State:
             np.zeros((N, J, V), dtype=bool), np.zeros((N, J), dtype=bool), of_views, of_body,
             np.zeros(N, dtype=bool),
             BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J),
+            JointTargets(np.zeros((N, J, 3)), np.zeros((N, J, 3, 3))),
         )  # fmt: skip
 
     def put(

@@ -108,7 +108,8 @@ def solve_window(
         # Bodies: the Theta step.
         step = BodyStep(fitter, moving, config)
         targets = step.targets(evidence, state.enough[rows])
-        body, fitted = step.fit(targets, state.fit.rows(rows)), evidence.target
+        body, anew = step.fit_changed(targets, state.fit.rows(rows), state.told.rows(rows))
+        fitted = evidence.target
         wrong = disagreement(evidence, body) > config.refine.contradiction
         if wrong.any():
             # Gated anew around the body's place; and the body is fitted again, without what was thrown away.
@@ -116,7 +117,8 @@ def solve_window(
             evidence = linearise(observed, sigma, there, cameras, config.observations)
             again = np.flatnonzero(wrong.any(axis=-1))
             targets = step.targets(evidence, state.enough[rows])
-            body = body.with_rows(again, step.fit(targets, body, again))
+            body, anew = body.with_rows(again, step.fit(targets, body, again)), np.union1d(anew, again)
+        state.told.put(rows[anew], targets.rows(anew))
         # delta of Eq. 4; and what its views do not determine needs the body however sure its one view is.
         pulled = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d
         pulled |= evidence.sigma_m > config.refine.max_sigma_m

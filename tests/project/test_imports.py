@@ -44,6 +44,7 @@ LEVELS = (
     "pipeline.pipeline",
     "io",
     "pipeline.solving",
+    "live",
     "simulation viz.bodies detection2d",
     "viz.overlay setup_check",
     "viz.viewer calibration",
@@ -55,7 +56,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command cli.refine cli.synchronise",
+    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live",
     "cli.main",
     "__main__",
 )
