@@ -9,7 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
@@ -132,7 +132,7 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     return Structure(points, xy, miss_px, depth, size, weight, slope)
 
 
-@kernel
+@kernel("f4 f3 f3 f3 f2 i0 f3 f3 f3 f3 f3")
 def _triangulate(
     xy: Array,
     prior: Array,
@@ -212,7 +212,7 @@ def _triangulate(
             points[p, j, 0], points[p, j, 1], points[p, j, 2] = x[0], x[1], x[2]
 
 
-@kernel
+@part
 def _solve(A: Array, b: Array, x: Array) -> None:
     """A x = b for a symmetric A (3, 3)."""
     c0 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
