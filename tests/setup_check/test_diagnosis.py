@@ -145,9 +145,7 @@ def test_cameras_that_see_nobody_are_named(recording, room):
 
 
 def test_of_a_crowded_picture_the_surest_people_are_compared():
-    """Time grows with the square of a picture's people: 80 ghosts a view beside two people leave 24 of each picture,
-    with the people whom the detector is surest of.
-    """
+    """Time grows with their square: of 80 ghosts a view and two people, of whom the detector is surer, 24 stay."""
     rng, joints, limbs = np.random.default_rng(0), len(BODY_25), np.array(BODY_25.limbs)
     people = [
         (view, rng.uniform(0, 1000, (joints, 2)), 0.2 + 0.6 * (n < 2)) for view in range(3) for n in range(82)
