@@ -61,7 +61,7 @@ class Scan:
         return np.where(enough & (count > 0), cost / np.maximum(count, 1), np.nan)
 
 
-@kernel
+@kernel("f3 f3 i1 f1 i1 i0 i1 f0 i0 f1 f1")
 def _scan(
     normal: Array,
     rays: Array,

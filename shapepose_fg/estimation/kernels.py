@@ -76,7 +76,7 @@ def _eigen(A, values, vectors):
                 vectors[b, a], vectors[b, a + 1] = vectors[b, a + 1], vectors[b, a]
 
 
-@kernel
+@kernel("f4 f2 f4 f3 f0 f0 f0 f3")
 def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, points):
     """Fill in `points` (N, J, 3) that are NaN where two views see them and agree (`linearisation.triangulate`)."""
     weight, x = np.empty(xy.shape[2]), np.empty(3)
@@ -96,7 +96,7 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
                 points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
 
 
-@kernel
+@kernel("f3 f4 f2 f4 f3 f0 f0 f0 b0 i0 f0 b3 f4 f4 f3 f3 f2")
 def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
     inlier, residual, information, gradient, target, sigma_m,
@@ -279,7 +279,7 @@ def _marginals(H, Z, M, G, S, covariance):
                 covariance[t, a, b] = S[a, b]
 
 
-@kernel
+@kernel("f3 i1 f4 f4 f3 f4 f4 f3 f3 i0 f0 i0 f0 f4")
 def solve_chains(
     states, joints, diagonal, below, right, cameras, xy, weight, lead, robust, width, steps, tolerance, covariance
 ):

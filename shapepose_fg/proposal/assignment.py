@@ -22,7 +22,7 @@ def match_best_first(left: Index, right: Index, score: Array) -> Index:
     return order[: _pick(order, left, right, *taken)]
 
 
-@kernel
+@kernel("i1 i1 i1 b1 b1")
 def _pick(order: Index, left: Index, right: Index, taken_left: Mask, taken_right: Mask) -> int:
     """Move the edges whose ends are free, in `order`, to its front; returns their number."""
     count = 0

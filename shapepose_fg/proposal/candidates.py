@@ -192,7 +192,7 @@ def _meeting(detections: Detections, rig: Rig, normalised: Array, config: Candid
     return pairs[:count, 0], pairs[:count, 1]
 
 
-@kernel
+@kernel("i1 i1 i1 f2 f1 f2 f0 f0 i2")
 def _pair_up(order, stop, view, rays, lengths, origins, gap_m, least_sine, pairs):
     """Fill in `pairs`, as far as there is room; `order` (D,) is by joint, and each one's stops at `stop` (D,).
 
@@ -243,7 +243,7 @@ def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
     return seed
 
 
-@kernel
+@kernel("i1 i1 i1 f2 i1 f0 i1")
 def _pick_seeds(order, along, place, xyz, joint, radius_m, seed):
     """Fill in `seed` (M,). Points are picked in `order`; `along` are those of a joint by their first coordinate,
     and `place` where each one is there, so that only those beside it are looked at.

@@ -29,6 +29,7 @@ serves both. A detector is 2 to 3 cm off."""
 class Sight(NamedTuple):
     """A frame as kernels take it: V cameras, D detections, and the limbs of J joints."""
 
+    kinds = "f3 f1 f2 i1 i1 f2 f1 i1 f1 i1 i1 f1 i1 i1"
     cameras: Array
     """(V, 3, 4) K [R | t] of each view."""
     focal: Array
@@ -157,7 +158,7 @@ def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight
 def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
     """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin."""
     joint, other = np.nonzero(skeleton.adjacency)
-    return np.searchsorted(joint, np.arange(len(skeleton) + 1)), other
+    return np.searchsorted(joint, np.arange(len(skeleton) + 1)), np.ascontiguousarray(other)
 
 
 @cache
@@ -167,7 +168,7 @@ def limbs_of(skeleton: Skeleton) -> Index:
     return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
 
 
-@kernel
+@kernel("f3 f2 i1", Sight, "i1 i1 i1 i1 f1")
 def find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m):
     """Fill in what `nearby` returns, as far as there is room; returns how much there is.
 
@@ -208,7 +209,7 @@ def find_near(places, reach_m, people, sight, first, begins, person, detection, 
     return count
 
 
-@kernel
+@kernel("i1 i1 i3", Sight, "f1 i1")
 def tie(person, detection, own, sight, mean, neighbours):
     """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
     of_joint, of_view, begin, other, value = sight.of_joint, sight.of_view, sight.begin, sight.other, sight.value
@@ -227,7 +228,7 @@ def tie(person, detection, own, sight, mean, neighbours):
         mean[e], neighbours[e] = total, there
 
 
-@kernel
+@kernel("i1 i1 i1 f1 b1 f0 i3 i1", Sight, "f1 f1 b1 f1 i1 i1 i3")
 def claim(
     first, person, detection, nearness, lost, sure, own, world, sight, tied, score, likely, key, queue, taken,
     chosen,
@@ -278,7 +279,7 @@ def claim(
                     chosen[a, j, v], taken[d] = d, a
 
 
-@kernel
+@kernel("i1 i1 i1 f1 f1 i3")
 def share(first, person, detection, distance_m, tied, chosen):
     """`Nearby.share`: the nearest of each person's detections of a joint and view."""
     views = chosen.shape[2]

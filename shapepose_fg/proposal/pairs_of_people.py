@@ -91,7 +91,7 @@ def _different(places: Array, weight: Array) -> Index:
     return stays[: _sieve(np.ascontiguousarray(places), order, stays)]
 
 
-@kernel
+@kernel("f3 i1 i1")
 def _sieve(places, order, stays):
     """Fill in who `stays`, of all in `order`, as far as there is room; returns how many do."""
     count, least = 0, _SAME_M * _SAME_M

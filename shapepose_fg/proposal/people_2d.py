@@ -44,7 +44,7 @@ def group_people(found: Detections) -> list[Index]:
     return np.split(order, stop[: groups - 1]) if count > 0 else []
 
 
-@kernel
+@kernel("i2 i1 i1 i1 i1 b2 i1 i1")
 def _group(pairs, joint, group, after, last, has, order, stop):
     """`group_people`: its groups one after the other into `order` (N,), their ends into `stop`; their number.
 

@@ -72,7 +72,7 @@ def _spans(skeleton: Skeleton, longest_m: tuple[float, ...]) -> tuple[Index, Arr
         length = np.minimum(length, length[:, [over]] + length[over])
     near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
     first, second = near.T
-    return near, np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
+    return np.ascontiguousarray(near), np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
     return places, gap_m
 
 
-@kernel
+@kernel("i3 f2 f1 f2 f1 f3 f3")
 def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
     """Fill in places and gaps of `triangulated`; `weight` (V,) is room to work in."""
     people, joints, views = chosen.shape
@@ -232,7 +232,7 @@ def connected(places: Array, frame: Frame) -> Index:
     return part
 
 
-@kernel
+@kernel("f3 i2 f1 i2")
 def _connect(places, pairs, most, part):
     """Give joints that hang together the least number `part` (H, J) of them."""
     for h in range(len(places)):

@@ -133,7 +133,7 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     return Structure(points, xy, miss_px, depth, size, weight, slope)
 
 
-@kernel
+@kernel("f4 f3 f3 f3 f2 i0 f3 f3 f3 f3 f3")
 def _triangulate(
     xy: Array,
     prior: Array,

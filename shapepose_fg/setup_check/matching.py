@@ -81,9 +81,17 @@ def _of_frame(found: Detections, frame: int, skeleton: Skeleton) -> Sightings:
         xy[person, place[found.joint[rows]]] = found.xy[rows]
         confidence[person, place[found.joint[rows]]] = found.confidence[rows]
     view = np.array([found.view[rows[0]] for rows in groups], dtype=np.intp)
-    return Sightings(np.full(len(groups), frame, dtype=np.intp), view, xy, confidence)
+    if len(groups) > _MOST_IN_A_PICTURE:
+        surest = np.lexsort((-confidence.sum(axis=1), view))
+        place_in_view = np.arange(len(view)) - np.searchsorted(view[surest], view[surest])
+        keep = np.sort(surest[place_in_view < _MOST_IN_A_PICTURE])
+        view, xy, confidence = view[keep], xy[keep], confidence[keep]
+    return Sightings(np.full(len(view), frame, dtype=np.intp), view, xy, confidence)
 
 
+_MOST_IN_A_PICTURE = 24
+"""People of a picture that are compared with others', the surest: chance meetings, and the time that they take,
+grow with the square of how many there are."""
 GATE = 0.15
 """Two sightings whose joints miss each other by more than this part of the person's size are not one person: a
 detector errs by 3 cm of 170, and a calibration that is worth naming by three times that (docs/setup_checks.md)."""
@@ -259,7 +267,7 @@ def least_of_each(key: Index, value: Array) -> Index:
     return best[best >= 0]
 
 
-@kernel
+@kernel("i1 f1 i1")
 def _least_of_each(key: Index, value: Array, best: Index) -> None:
     """The row with the least `value` of each `key` into `best`, which is -1 everywhere."""
     for row in range(len(key)):
@@ -276,7 +284,7 @@ def miss_px(points: Array, xy: Array, sighting: Index, K: Array, cTw: Array) -> 
     return miss
 
 
-@kernel
+@kernel("f3 f3 i1 f2 f2")
 def _miss_px(points: Array, xy: Array, sighting: Index, M: Array, miss: Array) -> None:
     """`miss_px` into `miss` (N, J), with M (3, 4) the camera's K [R t]."""
     for n in range(len(miss)):
@@ -298,7 +306,7 @@ def median_of(values: Array, valid: Mask) -> Array:
     return median
 
 
-@kernel
+@kernel("f2 f1")
 def _medians(rows: Array, median: Array) -> None:
     """The median of each of the `rows` (N, J), without its NaN, by insertion; `rows` are used up."""
     for n in range(len(rows)):

@@ -25,6 +25,7 @@ MIN_IN_A_VIEW = 9
 class Trust(NamedTuple):
     """How far detections are trusted, as kernels take it (`ObservationConfig`)."""
 
+    kinds = "f1 f0 f0 f0 f0 i0 f0"
     scatter: Array
     """(J,) what sigma is multiplied with for each joint."""
     sigma_m: float
@@ -66,7 +67,7 @@ def measured(
     return JointStates(mean, covariance), kept, evident
 
 
-@kernel
+@kernel("f3 f4 b2 i3 f1", Sight, Trust, Bones, "b1")
 def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, evident):
     """Update `mean` (A, J, S) and `covariance` (A, J, S, S), take out of `candidate` what does not fit, fill in
     `evident` (A,).

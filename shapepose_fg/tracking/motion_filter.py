@@ -73,14 +73,15 @@ class JointStates:
 class Bones(NamedTuple):
     """A skeleton of J joints, and how people are made, as kernels take them."""
 
+    kinds = "b1 i1 i1 i1 f1"
     core: Mask
     """(J,) the core joints."""
     order: Index
     """(J,) all joints, parents first."""
     parents: Index
     """(J,) -1 for the root."""
-    hips: tuple[int, int]
-    """Right and left."""
+    hips: Index
+    """(2,) right and left."""
     longest_m: Array
     """(J,) the longest distance of a joint to its parent, metres; the root's counts nothing."""
 
@@ -89,7 +90,9 @@ class Bones(NamedTuple):
         """A detector's."""
         core, order = np.zeros(len(skeleton), dtype=bool), np.concatenate(skeleton.tree_levels).astype(np.intp)
         core[list(skeleton.core)] = True
-        return cls(core, order, np.array(skeleton.parents), skeleton.hips, np.array(longest_m, dtype=float))
+        return cls(
+            core, order, np.array(skeleton.parents), np.array(skeleton.hips), np.array(longest_m, dtype=float)
+        )
 
 
 def predicted(
@@ -129,12 +132,12 @@ def _across(P):
     return np.sqrt(pairs / (P[0, 0] + P[1, 1] + P[2, 2]))
 
 
-@kernel
+@kernel("f3 f4 f2 f2 f1 f0", Bones, "f2 f3 f4 b2")
 def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after, covariance_after, lost):
     """F m and F P F^T + q Q of all joints, with F and Q (n, n) for each axis; `room` (2, S) is for work."""
     people, joints, size = mean.shape
     half, moving, core, order, parents = room[0], room[1], bones.core, bones.order, bones.parents
-    right, left = bones.hips
+    right, left = bones.hips[0], bones.hips[1]
     for a in range(people):
         # What nothing is known of stands still: it must not drift along a ray.
         certain, vx, vy, vz = 1 / TRUSTED_M**2, 0.0, 0.0, 0.0

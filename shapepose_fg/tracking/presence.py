@@ -86,7 +86,7 @@ def weighed(
     return weight, price
 
 
-@kernel
+@kernel("i3 f3 b2 i1", Sight, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
 def _weigh(
     candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight, price
 ):  # fmt: skip
@@ -317,7 +317,7 @@ class Account:
         return Chosen(hypothesis, start, stop, evidence[:count])
 
 
-@kernel
+@kernel("w3 s3 i1 w1 s1")
 def _holders(place, weight, begin, who, what):
     """Fill in `Account.holders` of places and weights (H, T, K); `begin` (D + 2,) has its first entry twice."""
     people, frames, places = place.shape
@@ -331,7 +331,7 @@ def _holders(place, weight, begin, who, what):
                     begin[d + 1] += 1
 
 
-@kernel
+@kernel("f2 w3 i1 w1 s1 f1 b1 i2 f0 i0 i0 f0 b1 b1 i2 f1 i2 f1")
 def _in_turn(
     gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free, changed, segment,
     value, chosen, evidence,
@@ -378,7 +378,7 @@ def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
                     changed[who[n]] = True
 
 
-@kernel
+@kernel("f1 f0 i0 i0 i0 i1")
 def _best_segment(gains, appears, begins, ends, person, segment):
     """The segment of `gains` (T,) with the greatest sum, which is returned; `segment` (3,) is who, start and stop.
 

@@ -49,6 +49,7 @@ class Predicted:
 class Scored(NamedTuple):
     """What speaks for each of N detections being people's, by joint and view, then by world, then by person."""
 
+    kinds = "i1 i1 i1 f1 f1 b1"
     first: Index
     """(J V + 1,) where those of each joint and view begin."""
     person: Index
@@ -123,7 +124,7 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
     return chosen[0], Scored(begins, person[:count], detection[:count], *ends)
 
 
-@kernel
+@kernel("f3 f2 b2 i1 i1", Sight, Scored, "f3 i1 i1 i1 f2 b1 i4")
 def _assign(
     places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought, both
 ):  # fmt: skip
@@ -168,7 +169,7 @@ def _assign(
     return count
 
 
-@kernel
+@kernel("i1 i1 i1 f1 i0 f1 f1 f1 f1")
 def _marginals(first, person, detection, weight, rounds, of_person, of_detection, unclaimed, probable):
     """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view; zeros by person and detection
     and ones (N,) to begin with.

@@ -106,7 +106,7 @@ class Sight:
         return inputs
 
 
-@kernel
+@kernel("s2 f0 f2 f4 f2")
 def moved(change, size, betas, local, transl):
     """Move B bodies, in place, by `size` times a `change` (B, 145): betas in tens, the first two columns of 22
     rotations, made orthogonal again (Gram-Schmidt; parallel ones: NaN), and the place. Rotations as six numbers:

@@ -66,7 +66,7 @@ def _positive(a, b, c, d, e, f):
     return a > 0 and a * d - b * b > 0 and a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d) > 0
 
 
-@kernel
+@kernel("f4 f0 f4 f2 b2 b1")
 def _weighed(information, v, found, variance, full, valid):
     """Fill in, for B rows of targets with `information` L (B, K, 3, 3): (L^-1 + v I)^-1, `found`, the mean
     `variance` (B, K) over the axes where a target is `full`, else infinite; and which rows are not `valid` (B,).

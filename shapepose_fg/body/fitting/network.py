@@ -104,7 +104,7 @@ def _applied(
     return y
 
 
-@kernel
+@kernel("s2 s2 s1 s2")
 def _layer(x, weight, bias, y):
     """Fill y with x weightᵀ + bias, in blocks that stay in the fastest memory."""
     (B, count), outputs = x.shape, len(weight)
@@ -128,7 +128,7 @@ def _layer(x, weight, bias, y):
                 y[i, q], y[j, q], y[k, q], y[m, q] = e, f, g, h
 
 
-@kernel
+@kernel("s2 s1 s1 s2")
 def _normalised(x, weight, bias, y):
     """Fill y with the layer normalisation of x."""
     B, count = x.shape
@@ -152,7 +152,7 @@ _BELOW = tuple(np.float32(value) for value in (
     -1.42647390514189e-02))  # fmt: skip
 
 
-@kernel
+@kernel("s1")
 def _gelu(x):
     """Replace each x by x (1 + erf(x / sqrt(2))) / 2, erf by a quotient of polynomials that is right to 2e-7."""
     for i in range(len(x)):

@@ -8,6 +8,7 @@ torques on the terms (`Limbs`) of that bone and of those below it.
 
 import math
 
+from shapepose_fg.body.kernels.rows import Limbs, Linear, Own, Priors, Rows, Work
 from shapepose_fg.core.compiled import kernel, part
 
 REACH_M = 0.1
@@ -272,7 +273,7 @@ def _normal(priors, rows, b, asked, H, w):
                 row[at + 2] += t0 * J[0, j + 2] + t1 * J[1, j + 2] + t2 * J[2, j + 2]
 
 
-@kernel
+@kernel(Limbs, Priors, "f2", Rows, "f1 i2", Linear, Work)
 def linearised(limbs, priors, free, rows, scale, asked, linear, w):
     """The energy of B rows around `free` (B, P), the robust kernel of each having this `scale` (B,); systems are
     for the points `asked` (B, N).
@@ -319,7 +320,7 @@ def linearised(limbs, priors, free, rows, scale, asked, linear, w):
             _normal(priors, rows, b, asked[b], linear.system[b], w)
 
 
-@kernel
+@kernel(Limbs, "f4 f2 f2 f3 f4", Work)
 def placed(limbs, local, betas, place, xyz, jacobian, w):
     """Points `xyz` (B, K, 3) of bodies with rotations `local` (B, 24, 3, 3), and their `jacobian` (B, K, 3, P) or
     (0, K, 3, P). Rotations turn in the tangents of the scratch arrays `w`.
@@ -341,7 +342,7 @@ def placed(limbs, local, betas, place, xyz, jacobian, w):
                         jacobian[b, k, x, w.column[k, i]] = w.J[k, x, i]
 
 
-@kernel
+@kernel(Limbs, Own, "f2 f4 f2 f3 f4 f0 f1 s2", Work)
 def seen(limbs, own, betas, local, place, target, information, kernel_scale, steepness, inputs, w):
     """Fill the network's `inputs` (B, 574) with what is seen of B bodies, `betas` (B, 10), `local` (B, 24, 3, 3)
     rotations and `place` (B, 3), with targets (B, N, 3) of this `information` (B, N, 3, 3). Slopes, of the robust

@@ -10,6 +10,7 @@ from shapepose_fg.core.arrays import Array, Index
 class Limbs(NamedTuple):
     """K points as sums over bones; L terms, those of a point next to each other, parents first."""
 
+    kinds = "i1 i1 i1 f1 f2 f3 f2 f1 f2 f1 i1 i1"
     first: Index
     """(K + 1,) where the terms of each point begin."""
     bone: Index
@@ -39,6 +40,7 @@ class Limbs(NamedTuple):
 class Own(NamedTuple):
     """How K points, which a detector sees, belong to the body and to targets."""
 
+    kinds = "i1 f2 i1"
     target: Index
     """(K,) which target is of the point; -1: none."""
     offset: Array
@@ -50,6 +52,7 @@ class Own(NamedTuple):
 class Priors(NamedTuple):
     """The pose prior: A of the 69 angles are unknowns, the rest are where it expects them."""
 
+    kinds = "f1 f2 i1 f2 f1"
     mean: Array
     """(A,) rad."""
     precision: Array
@@ -65,6 +68,7 @@ class Priors(NamedTuple):
 class Rows(NamedTuple):
     """What B rows are fitted to, and what holds them."""
 
+    kinds = "f3 f4 f2 f1 f2"
     xyz: Array
     """(B, K, 3) targets, metres."""
     information: Array
@@ -80,6 +84,7 @@ class Rows(NamedTuple):
 class Linear(NamedTuple):
     """The energy of B rows around their unknowns; written over."""
 
+    kinds = "f1 f3 f2 f2 f3"
     energy: Array
     """(B,) in squared standard deviations."""
     xyz: Array
@@ -108,6 +113,7 @@ class Linear(NamedTuple):
 class Work(NamedTuple):
     """Scratch arrays of one row."""
 
+    kinds = "f3 f3 f3 f3 f1 f1 f1 f2 f2 f1 f1 f3 i2 i1 f1 f1 f1"
     local: Array
     """(24, 3, 3) rotations relative to the parent."""
     tangent: Array

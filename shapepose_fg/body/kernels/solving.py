@@ -82,14 +82,14 @@ def _products(Y, first, count, n, out):
             out[i, j] = out[j, i] = total
 
 
-@kernel
+@kernel("f3")
 def reduce_systems(system):
     """Reduce B whole systems (B, M, P)."""
     for b in range(len(system)):
         _reduced(system[b], system.shape[2], _FIRST, system.shape[1])
 
 
-@kernel
+@kernel("f3 f1 f2 f1")
 def solved(system, damping, step, promised):
     """Reduce the Hessians of B systems, their diagonals `damping` (B,) times larger, and their gradients; the
     `step` (B, P), and by how much it would lower the energy, `promised` (B,), NaN where H is not positive
@@ -121,7 +121,7 @@ def _with_sag(C, at):
         C[x, x] += sag * sag
 
 
-@kernel
+@kernel("f3 f4 f3")
 def known(system, covariance, shape):
     """From B systems with reduced Hessians: the `covariance` (B, N, 3, 3) of their joints (Laplace), m², as
     `_with_sag` has it, and that of the betas, `shape` (B, 10, 10). The rest of the systems is reduced.
@@ -136,7 +136,7 @@ def known(system, covariance, shape):
         _products(H, P + 1 + 3 * K, shape.shape[1], P, shape[b])
 
 
-@kernel
+@kernel("f3 f3 f2 f3 f2 f0 f3 f2")
 def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
     """Eliminate the rows of a chain one after the other; N of the unknowns of each are left without the betas.
 
@@ -223,7 +223,7 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
                 front[i, j] = 0.0
 
 
-@kernel
+@kernel("f3 f1 f2")
 def put_back(kept, coefficients, step):
     """The `step` (T, N) of the rows that `eliminated` left, the right-hand sides taken `coefficients` (11,)
     times.

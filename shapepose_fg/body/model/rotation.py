@@ -46,7 +46,7 @@ def log_so3(R: Array) -> Array:
     return found
 
 
-@kernel
+@kernel("f2 f3")
 def _exp(vectors, R):
     """Fill R (N, 3, 3) from axis-angle vectors (N, 3)."""
     for n in range(len(R)):
@@ -65,7 +65,7 @@ def _exp(vectors, R):
         R[n, 1, 2], R[n, 2, 1] = second * y * z - first * x, second * y * z + first * x
 
 
-@kernel
+@kernel("f3 f2")
 def _log(R, vectors):
     """Fill axis-angle vectors (N, 3) from R (N, 3, 3)."""
     for n in range(len(R)):

@@ -155,7 +155,7 @@ class NumberStream:
         return last
 
 
-@kernel
+@kernel("u1 f1 f1")
 def _plain_numbers(text: NDArray[np.uint8], powers: Array, values: Array) -> int:
     """Fill in the numbers of a `text`, each a sign, up to 15 digits and a point, as the nearest doubles: a whole
     number and a power of ten, both exact, are divided. Returns how many; -1 where one is written otherwise.
