@@ -29,14 +29,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 _OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": {"contract", "reassoc"}, "no_cfunc_wrapper": True}
-_NUMBERS = {
-    "f": numba.float64,
-    "i": numba.intp,
-    "b": numba.boolean,
-    "s": numba.float32,
-    "w": numba.int32,
-    "u": numba.uint8,
-}
+_NUMBERS = {"f": numba.float64, "i": numba.intp, "b": numba.boolean}
+_NUMBERS |= {"s": numba.float32, "w": numba.int32, "u": numba.uint8}
 
 KERNELS: dict[str, Any] = {}
 """All kernels of what is imported, by `module.name`."""
@@ -46,8 +40,8 @@ def kernel(*kinds: str | type) -> Callable[[F], F]:
     """The function, compiled for arguments of these `kinds`. Sums may be taken in another order, NaN and infinity
     are kept.
 
-    A letter is the type of numbers (f float64, i intp, b bool, s float32, w int32, u uint8) and a digit how many axes the
-    array has, 0 for a number: "f2 i1 f0". A NamedTuple class has `kinds` of its own.
+    A letter is the type of numbers (f float64, i intp, b bool, s float32, w int32, u uint8) and a digit how many
+    axes the array has, 0 for a number: "f2 i1 f0". A NamedTuple class has `kinds` of its own.
     """
 
     def compiled(function: F) -> F:
