@@ -137,10 +137,7 @@ class CameraOptions:
 
         if self.calibration is None:
             raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
-        match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", self.image_size or "")
-        if self.image_size is not None and match is None:
-            raise InputError(f"--image-size {self.image_size}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
-        size = None if match is None else (int(match[1]), int(match[2]))
+        size = picture_size(self.image_size)
         up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
         return read_rig(self.calibration, up=up, unit=unit, image_size=size)
 
@@ -187,6 +184,16 @@ class TakeOptions(ResultOptions):
         """How it is read, as keywords."""
         persons, frames = tuple(self.person) if self.person else None, result_frames(self.frames)
         return super().how() | {"seen_only": self.seen_only, "frames": frames, "persons": persons}
+
+
+def picture_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WIDTHxHEIGHT`; None where it is left out."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
 
 
 def check_fps(fps: float | None) -> None:

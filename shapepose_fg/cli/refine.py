@@ -1,57 +1,21 @@
 """The command `refine-calibration`: better cameras from the people of a recording."""
 
 import json
-import shlex
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from shapepose_fg.cli.options import (
-    REQUIRED,
-    RESULT,
-    TIME,
-    DetectionOptions,
-    check_fps,
-    frame_range,
-    frames_option,
-    grouped,
-    json_option,
-    option,
-)
+from shapepose_fg.cli.options import REQUIRED, RESULT, DetectionOptions, grouped, json_option, option
+from shapepose_fg.cli.rate import RateOptions, next_command
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
-    from shapepose_fg.core.camera import Rig
-    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
-
-
-@dataclass(frozen=True, kw_only=True)
-class RateOptions:
-    """When frames were taken, and which are used."""
-
-    fps: float | None = option(TIME, "Frames a second; 30 where nothing says it.")
-    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
-    frames: str | None = frames_option()
-
-    def times(self, detections: Path, rig: "Rig", count: int) -> "FrameTimes":
-        """Of a recording of `count` frames."""
-        from shapepose_fg.core.frame_times import FrameTimes
-        from shapepose_fg.io.timestamps import read_timestamps
-
-        if self.fps is not None and self.timestamps is not None:
-            raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
-        check_fps(self.fps)
-        beside = detections / "times.csv"
-        file = self.timestamps or (beside if self.fps is None and beside.is_file() else None)
-        if file is not None:
-            return read_timestamps(file, rig, count)
-        return FrameTimes.assumed(count) if self.fps is None else FrameTimes.from_fps(self.fps, count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +71,7 @@ def refine_calibration(
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)))
         note(*recording.notes)
-        span = frame_range(rate.frames, len(recording), recording.first)
+        span = rate.span(len(recording), recording.first)
         times = rate.times(seen.detections, rig, len(recording))
         reference = None if may.reference is None else rig.names.index(may.reference)
         with progress("refining", "rounds") as done:
@@ -120,21 +84,9 @@ def refine_calibration(
     else:
         _show(found, may)
         print(f"{output}: {form}")
-        print(next_command(seen, rate, output, seen.detections, form == "our own rig file"))
-
-
-def next_command(seen: DetectionOptions, rate: RateOptions, cameras: Path, detections: Path, whole: bool) -> str:
-    """How to go on, as a line to copy; `whole`: the file of the cameras says unit, axis and size itself."""
-    said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
-    options: dict[str, object] = {
-        "--calibration": cameras,
-        "--detections": detections,
-        "--skeleton": seen.skeleton,
-    }
-    options |= {} if whole else said
-    options |= {"--fps": rate.fps, "--timestamps": rate.timestamps, "--frames": rate.frames, "--output": "results"}
-    words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
-    return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+        said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
+        said = {} if form == "our own rig file" else said  # which says all of it
+        print(next_command(output, seen.detections, seen.skeleton, rate, said))
 
 
 def _show(found: "Refinement", may: FreedomOptions) -> None:

@@ -5,7 +5,7 @@ import math
 import shlex
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import typer
 
@@ -20,6 +20,7 @@ from shapepose_fg.cli.options import (
     json_option,
     option,
 )
+from shapepose_fg.cli.rate import RateOptions, next_command
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
@@ -84,10 +85,9 @@ def synchronise(
             f"of videos: shapepose-fg detect {shlex.join(words)}, and --fps, --calibration and the rest as before"
         )
     if output is not None and not as_json:
-        options = {"--calibration": seen.calibration, "--detections": output / "detection", "--up": seen.up}
-        options |= {"--unit": seen.unit, "--image-size": seen.image_size, "--output": output / "results"}
-        line = [word for name, value in options.items() if value is not None for word in (name, str(value))]
-        print(f"next: {shlex.join(['shapepose-fg', 'reconstruct', *line])}")
+        said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
+        cameras = cast(Path, seen.calibration)
+        print(next_command(cameras, output / "detection", None, RateOptions(), said, output / "results"))
 
 
 def _show(found: "Synchronised", rig: "Rig") -> None:
