@@ -49,11 +49,12 @@ LEVELS = (
     "viz.report",
     "evaluation",
     "cli.options",
+    "cli.rate",
     "cli.pictures",
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command cli.refine cli.synchronise",
+    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.calibrate",
     "cli.main",
     "__main__",
 )
