@@ -73,7 +73,7 @@ class _Together:
         self.possible = int(np.minimum((rows[0] >= 0).sum(axis=0), (rows[1] >= 0).sum(axis=0)).sum())
         self.rays = (np.ascontiguousarray(one.rays), np.ascontiguousarray(other.rays))
         self.size = (one.size, other.size)
-        self.alike = tuple(_at_once(each) for each in rows)
+        self.alike = _at_once(rows[0]), _at_once(rows[1])
 
     def misses(self, E: Array) -> Array:
         """(H, K) by how much tracks miss each other under essential matrices (H, 3, 3), parts of people's size."""
@@ -133,8 +133,11 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
         if both.sum() < _LEAST_TRY:
             continue
         size = float(np.sqrt(np.median(one.size[rows[0]]) * np.median(other.size[rows[1]])))
-        flat = [np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y)]
-        E, _ = cv2.findEssentialMat(*flat, np.eye(3), cv2.RANSAC, 0.999, _RANSAC * size, _SAMPLES)
+        flat_x, flat_y = (np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y))
+        agree = _RANSAC * size
+        E, _ = cv2.findEssentialMat(
+            flat_x, flat_y, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=agree, maxIters=_SAMPLES
+        )
         if E is not None and E.shape[0] >= 3:
             found += [np.asarray(each, dtype=np.float64) for each in E.reshape(-1, 3, 3)]
     return np.stack(found) if found else np.zeros((0, 3, 3))
