@@ -78,10 +78,12 @@ def adjust(
     dilution: float,
     scale: float = 1.0,
     reference: int | None = None,
+    scaled: bool = False,
 ) -> Adjusted:
     """The cameras from `start` on, `given` beforehand to within `freedom`, adjusted to `people`.
 
-    The camera `reference` keeps its pose; without one the rig stays where it is as a whole.
+    The camera `reference` keeps its pose; without one the rig stays where it is as a whole, and `scaled` says that
+    its size is nothing that the covariance is of.
 
     `dilution` is how many of the errors of a detection, of joints and of frames, are one error: the priors are
     weighed up by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies
@@ -130,7 +132,7 @@ def adjust(
     moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
     placed = replace(people, points=moved)
     information = _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
-    covariance = _covariance(information, rig, freedom.sigmas, reference)
+    covariance = _covariance(information, rig, freedom.sigmas, reference, scaled)
     return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))
 
 
@@ -204,8 +206,8 @@ def _information(
     return to.T @ information @ to
 
 
-def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | None) -> Array:
-    """(V, Q, V, Q) of the cameras' parameters, without what the rig may move as a whole."""
+def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | None, scaled: bool) -> Array:
+    """(V, Q, V, Q) of the cameras' parameters, without what the rig may move, or grow, as a whole."""
     V = len(rig)
     prior = np.tile(sigmas, (V, 1))
     if reference is not None:
@@ -214,9 +216,14 @@ def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | No
     weight = 1 / prior.ravel()[used] ** 2
     inner = np.linalg.inv(information[np.ix_(used, used)] + np.diag(weight))
     if reference is None:
-        whole = np.zeros((V, Q, 6))
-        whole[:, :6] = [gtsam.Pose3(camera.wTc).inverse().AdjointMap() for camera in rig.cameras]
-        G = whole.reshape(V * Q, 6)[used]
+        whole = np.zeros((V, Q, 7 if scaled else 6))
+        whole[:, :6, :6] = [gtsam.Pose3(camera.wTc).inverse().AdjointMap() for camera in rig.cameras]
+        if scaled:
+            away = rig.centres - rig.centres.mean(axis=0)
+            whole[:, 3:6, 6] = [
+                camera.wTc[:3, :3].T @ each for camera, each in zip(rig.cameras, away, strict=True)
+            ]
+        G = whole.reshape(V * Q, -1)[used]
         inner = inner - G @ np.linalg.solve(G.T @ (weight[:, None] * G), G.T)
     covariance = np.zeros((V * Q, V * Q))
     covariance[np.ix_(used, used)] = inner

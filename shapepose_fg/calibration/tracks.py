@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
-from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, rays_of
+from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, median_of, rays_of
 
 _SAME = 0.08
 """A person's joints move by less than this part of their size from frame to frame, in the median."""
@@ -96,8 +96,7 @@ def _followed(seen: Sightings) -> list[Index]:
             last = np.array([each[-1] for each in open_])
             away = np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1) / seen.size_px[rows][:, None]
             both = np.isfinite(away)
-            middle = np.nanmedian(np.where(both.any(axis=-1, keepdims=True), away, 9.0), axis=-1)
-            cost = np.where(both.sum(axis=-1) >= MIN_JOINTS, np.minimum(middle, 1.0), 1.0)
+            cost = np.where(both.sum(axis=-1) >= MIN_JOINTS, np.minimum(median_of(away, both), 1.0), 1.0)
             for one, other in zip(*linear_sum_assignment(cost), strict=True):
                 if cost[one, other] < _SAME:
                     open_[one].append(int(rows[other]))

@@ -10,6 +10,7 @@ from typing import Any, cast
 import typer
 
 from shapepose_fg.cli.batch.command import batch
+from shapepose_fg.cli.calibrate import calibrate
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.export import export
 from shapepose_fg.cli.live import live
@@ -51,7 +52,7 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
 for _panel, _commands in {
-    _RECORDING: (detect, check_calibration, refine_calibration, synchronise, reconstruct, live, batch),
+    _RECORDING: (detect, calibrate, check_calibration, refine_calibration, synchronise, reconstruct, live, batch),
     _RESULT: (report, overlay, view, export),
     _TRY: (train_fitter,),
 }.items():

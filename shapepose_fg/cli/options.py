@@ -141,10 +141,7 @@ class CameraOptions:
 
         if self.calibration is None:
             raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
-        match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", self.image_size or "")
-        if self.image_size is not None and match is None:
-            raise InputError(f"--image-size {self.image_size}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
-        size = None if match is None else (int(match[1]), int(match[2]))
+        size = picture_size(self.image_size)
         up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
         return read_rig(self.calibration, up=up, unit=unit, image_size=size)
 
@@ -180,16 +177,40 @@ class TimeOptions:
     fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
     timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
 
-    def read(self, seen: DetectionOptions, rig: "Rig", kept: Path) -> "tuple[DetectionTable, FrameTimes | None]":
+    def read(
+        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path
+    ) -> "tuple[DetectionTable, FrameTimes | None]":
         """The recording, and the times of its frames where something says them (`read_recording`); what is odd is
         said.
         """
         from shapepose_fg.io.recording import read_recording
 
         check_fps(self.fps)
-        recording, times = read_recording(seen.detections, rig, seen.skeleton, kept, self.fps, self.timestamps)
+        recording, times = read_recording(detections, rig, skeleton, kept, self.fps, self.timestamps)
         note(*recording.notes)
         return recording, times
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateOptions(TimeOptions):
+    """When frames were taken, and which are used."""
+
+    frames: str | None = frames_option()
+
+    def part(
+        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path
+    ) -> "tuple[DetectionTable, FrameTimes, range]":
+        """The recording, its times, 30 frames a second where nothing says them, and the frames that are used."""
+        from shapepose_fg.core.frame_times import FrameTimes
+
+        recording, times = self.read(detections, skeleton, rig, kept)
+        count = len(recording)
+        span = frame_range(self.frames, count, recording.first)
+        return recording, FrameTimes.assumed(count) if times is None else times, span
+
+    def given(self) -> dict[str, object]:
+        """The same options for the next command."""
+        return {"--fps": self.fps, "--timestamps": self.timestamps, "--frames": self.frames}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +246,16 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
     """How to go on, as a line to copy: `reconstruct` with those options that are given."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def picture_size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of `WIDTHxHEIGHT`; None where it is left out."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", text)
+    if match is None:
+        raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
+    return int(match[1]), int(match[2])
 
 
 def check_fps(fps: float | None) -> None:

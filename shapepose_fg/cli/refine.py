@@ -10,9 +10,7 @@ from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
     DetectionOptions,
-    TimeOptions,
-    frame_range,
-    frames_option,
+    RateOptions,
     grouped,
     json_option,
     next_reconstruct,
@@ -26,13 +24,6 @@ if TYPE_CHECKING:
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
-
-
-@dataclass(frozen=True, kw_only=True)
-class RateOptions(TimeOptions):
-    """When frames were taken, and which are used."""
-
-    frames: str | None = frames_option()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +53,6 @@ def refine_calibration(
     """
     from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.refinement import refine
-    from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import write_like
 
     if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
@@ -85,9 +75,7 @@ def refine_calibration(
         0.02 if may.lens else 0.0,
     )
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, times = rate.read(seen, rig, Path(folder))
-        times = FrameTimes.assumed(len(recording)) if times is None else times
-        span = frame_range(rate.frames, len(recording), recording.first)
+        recording, times, span = rate.part(seen.detections, seen.skeleton, rig, Path(folder))
         reference = None if may.reference is None else rig.names.index(may.reference)
         with progress("refining", "rounds") as done:
             found = refine(recording, rig, times, span, freedom, reference, done)
@@ -103,8 +91,7 @@ def refine_calibration(
         said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
         options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
         options |= {} if form == "our own rig file" else said
-        options |= {"--fps": rate.fps, "--timestamps": rate.timestamps, "--frames": rate.frames}
-        print(next_reconstruct(options | {"--output": "results"}))
+        print(next_reconstruct(options | rate.given() | {"--output": "results"}))
 
 
 def _show(found: "Refinement", may: FreedomOptions) -> None:

@@ -37,7 +37,7 @@ def check_calibration(
 
     rig = seen.still_rig("check-calibration")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, _ = rate.read(seen, rig, Path(folder))
+        recording, _ = rate.read(seen.detections, seen.skeleton, rig, Path(folder))
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
         if pictures.videos is None and (used := seen.detections / FOOTAGE).is_file():
             sizes = detected_sizes(used, rig)

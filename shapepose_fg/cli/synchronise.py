@@ -78,14 +78,11 @@ def synchronise(
             f"of videos: shapepose-fg detect {shlex.join(words)}, and --fps, --calibration and the rest as before"
         )
         if output is not None:
-            options = {
-                "--calibration": seen.calibration,
-                "--detections": seen.detections,
-                "--skeleton": seen.skeleton,
-            }
-            options |= {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
+            options = {"--calibration": seen.calibration, "--detections": seen.detections}
+            options |= {"--skeleton": seen.skeleton, "--up": seen.up, "--unit": seen.unit}
+            options |= {"--image-size": seen.image_size, "--timestamps": output, "--output": "results"}
             print(f"{output}: times of {len(recording)} frames")
-            print(next_reconstruct(options | {"--timestamps": output, "--output": "results"}))
+            print(next_reconstruct(options))
 
 
 def _show(found: "Synchronised", rig: "Rig") -> None:

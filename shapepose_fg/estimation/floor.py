@@ -65,10 +65,10 @@ class Floor:
         return cls(normal=np.array(values["normal"]), **rest)
 
 
-def find_floor(points: Array, look: Index, up: Array) -> Floor | str:
+def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD) -> Floor | str:
     """The floor under `points` (N, 3), the lowest of feet that stand; else in words why there is none.
 
-    `look` (N,) numbers what is seen as one. A robust plane, level but for `TILT_RAD`, starts at the height where
+    `look` (N,) numbers what is seen as one. A robust plane, level but for `tilt_rad`, starts at the height where
     most looks agree.
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
@@ -82,7 +82,7 @@ def find_floor(points: Array, look: Index, up: Array) -> Floor | str:
     middle = np.average(points, axis=0, weights=weight * (np.abs(height - start) <= NEAR_M))
     across = np.linalg.svd(up[None])[2][1:]
     design = np.concatenate([np.ones((len(points), 1)), (points - middle) @ across.T], axis=1)
-    prior = np.diag([0.0, *np.full(2, (SCALE_M / TILT_RAD) ** 2)])
+    prior = np.diag([0.0, *np.full(2, (SCALE_M / tilt_rad) ** 2)])
     found = np.array([start, 0.0, 0.0])
     for _ in range(20):
         kept = weight * np.maximum(1 - ((height - design @ found) / (4.685 * SCALE_M)) ** 2, 0.0) ** 2  # Tukey

@@ -56,7 +56,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live",
+    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live cli.calibrate",
     "cli.main",
     "__main__",
 )

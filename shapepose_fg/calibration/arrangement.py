@@ -1,0 +1,107 @@
+"""Cameras as poses of pairs of them say: the spanning tree that most pairs agree with, then all pairs together."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from factors.noise import gaussian, robust_kernel
+from shapepose_fg.calibration.relative import Relative
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.setup_check.fit import difference
+
+_TREES = 100
+"""Spanning trees that are looked at: the best, and others drawn by how well pairs fit."""
+_AGREE_DEG = 8.0
+"""Pairs' poses are off by 0.3 to 4 degrees where they are right, in simulated recordings and on Shelf."""
+_LEAST, _LENGTH = np.radians(0.3), 0.1
+"""How far a pair's turn and direction may be off at the least, one sigma; and its length, as a part of it."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """How one camera stands to another, in metres if people have the stature that they are taken to have."""
+
+    bTa: Array
+    """(4, 4) the second camera's frame from the first's."""
+    score: float
+    """How well what both saw fits (`Relative.score`)."""
+    covariance: Array
+    """(6, 6) of bTa, as GTSAM's poses change: in the first camera's frame."""
+
+    @classmethod
+    def of(cls, pair: Relative, metres: float) -> "Edge":
+        """Of a pair whose cameras are `metres` apart."""
+        bTa = np.eye(4)
+        bTa[:3, :3], bTa[:3, 3] = pair.R, metres * pair.t
+        way = pair.t / np.linalg.norm(pair.t)
+        covariance = pair.covariance + _LEAST**2 * np.diag(np.r_[1.0, 1, 1, 0, 0, 0])
+        covariance[3:, 3:] += _LEAST**2 * (np.eye(3) - np.outer(way, way)) + _LENGTH**2 * np.outer(way, way)
+        to = np.kron(np.diag([1.0, metres]), pair.R.T)
+        return cls(bTa, pair.score, to @ covariance @ to.T)
+
+
+def arranged(edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
+    """(V, 4, 4) poses in the frame of the first camera, for `edges` that connect all."""
+    rng, best, most = np.random.default_rng(0), np.zeros((0,)), -np.inf
+    for trial in range(_TREES):
+        luck = rng.gumbel(size=len(edges)) if trial > 0 else np.zeros(len(edges))
+        order = sorted(
+            zip(edges, luck.tolist(), strict=True), key=lambda each: -edges[each[0]].score - 0.15 * each[1]
+        )
+        poses = _tree([pair for pair, _ in order], edges, views)
+        if (agree := agreement(poses, edges)) > most:
+            best, most = poses, agree
+    return _together(best, edges)
+
+
+def agreement(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> float:
+    """How well poses (V, 4, 4) are those of all pairs: the sum of the scores of pairs that agree."""
+    return float(sum(edge.score * _alike(poses, *pair, edge) for pair, edge in edges.items()))
+
+
+def _alike(poses: Array, a: int, b: int, edge: Edge) -> float:
+    """1 where a pair stands as its edge says, 0 where far from it."""
+    bTa = np.linalg.solve(poses[b], poses[a])
+    turn, _ = difference(bTa[:3], edge.bTa[:3])
+    ways = [each[:3, 3] / np.linalg.norm(each[:3, 3]) for each in (bTa, edge.bTa)]
+    way = np.degrees(np.arccos(np.clip(ways[0] @ ways[1], -1.0, 1.0)))
+    return float(np.exp(-0.5 * (turn**2 + way**2) / _AGREE_DEG**2))
+
+
+def _tree(order: list[tuple[int, int]], edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
+    """Poses along the edges that come first in `order` and close no ring."""
+    poses, found = np.tile(np.eye(4), (views, 1, 1)), {0}
+    while len(found) < views:
+        a, b = next(pair for pair in order if (pair[0] in found) != (pair[1] in found))
+        if a in found:
+            poses[b] = poses[a] @ np.linalg.inv(edges[a, b].bTa)
+        else:
+            poses[a] = poses[b] @ edges[a, b].bTa
+        found |= {a, b}
+    return poses
+
+
+def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
+    """The poses that fit all pairs best, by a graph of poses; pairs that are wrong give way (Cauchy)."""
+    graph, values, kernel = gtsam.NonlinearFactorGraph(), gtsam.Values(), robust_kernel("cauchy")
+    for view, pose in enumerate(poses):
+        values.insert(X(view), gtsam.Pose3(pose))
+    for (a, b), edge in edges.items():
+        noise = gaussian((edge.covariance + edge.covariance.T) / 2, kernel)
+        graph.add(gtsam.BetweenFactorPose3(X(b), X(a), gtsam.Pose3(edge.bTa), noise))
+    graph.addPriorPose3(X(0), gtsam.Pose3(poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.stack([found.atPose3(X(view)).matrix() for view in range(len(poses))])
+
+
+def parts(pairs: Mapping[tuple[int, int], object], views: int) -> list[list[int]]:
+    """The cameras that are connected by `pairs`, part by part, the largest first."""
+    part = list(range(views))
+    for a, b in pairs:
+        old, new = part[b], part[a]
+        part = [new if each == old else each for each in part]
+    found = [[view for view in range(views) if part[view] == name] for name in dict.fromkeys(part)]
+    return sorted(found, key=len, reverse=True)

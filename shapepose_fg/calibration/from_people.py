@@ -1,0 +1,289 @@
+"""Where cameras of known lenses stand, from people who walk about, and nothing else.
+
+Two cameras at a time (`relative`), all together (`arrangement`), then who is whom and where everything is in turns
+(`adjustment`), and at last metres, up and the floor (`levelling`). What people do not determine is refused.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.calibration.adjustment import FOCAL, MOVE, TURN, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.arrangement import Edge, arranged, parts
+from shapepose_fg.calibration.levelling import World, levelled, scale_of, scaled
+from shapepose_fg.calibration.people import Footage, People, missed_px
+from shapepose_fg.calibration.refinement import dilution
+from shapepose_fg.calibration.relative import Relative, relative
+from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.setup_check.matching import Sightings
+
+_BURST_S, _BURSTS = 10.0, 6
+"""People are followed for so long, at so many places of the recording."""
+_FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
+"""Frames of the first rounds; how many rounds there are of these, of all frames, and of each half of them."""
+_STILL_DEG = 0.03
+"""Cameras that turn by less from round to round have settled."""
+_LEAST_SEEN = 50
+"""People, one per frame, whom a camera must see at the least."""
+_LEAST_SCORE, _LEAST_S = 0.15, 3.0
+"""Pairs of cameras that fit worse, or have fewer person-seconds in common, say nothing of each other."""
+_LEAST_PEOPLE = 10
+"""People, one per frame, by whom cameras are adjusted at the least."""
+_MOST_SIGMA_DEG, _MOST_APART_DEG = 0.7, 2.0
+"""A turn that is known worse than the first, or differs by more between halves of the recording, is not known."""
+_FREE = Freedom(turn_deg=20.0, move_m=1.0)
+_FILM = (
+    "film a minute of two or more people who walk through all that the cameras see, near and far, not on one line"
+)
+
+
+class Undetermined(ValueError):
+    """People do not determine the cameras: a sentence each that says which, why, and the cure."""
+
+    def __init__(self, problems: tuple[str, ...], found: "Calibrated | None" = None):
+        super().__init__("; ".join(problems))
+        self.problems, self.found = problems, found
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """Cameras that were found, and how well they are known."""
+
+    adjusted: Adjusted
+    """The cameras, people's places and covariances, in metres; z is up, the floor at 0."""
+    world: World
+    """Its scale, up and floor."""
+    apart_deg: Array
+    """(V,) by how much the turns of halves of the recording differ, each found without the other."""
+    apart_m: Array
+    """(V,) the same of the places."""
+    held_out_px: float
+    """Median distance of a joint from where the other cameras put it, on halves that were not used."""
+    counts: Index
+    """(V,) people, one per frame, by whom each camera was placed."""
+    explained: Array
+    """(V,) which part of the people that each saw another camera saw too."""
+    notes: tuple[str, ...] = field(default=())
+    """What is weak, a sentence each."""
+
+    @property
+    def rig(self) -> Rig:
+        """The cameras."""
+        return self.adjusted.rig
+
+    def as_dict(self) -> dict[str, Any]:
+        """All figures, as plain values."""
+        sigmas = {"turn_deg": np.degrees(self.adjusted.sigma(TURN)), "move_mm": 1e3 * self.adjusted.sigma(MOVE)}
+        sigmas |= {"focal_percent": 100 * self.adjusted.sigma(FOCAL)}
+        cameras = [
+            {
+                "camera": camera.name,
+                "people": int(self.counts[view]),
+                "shared": round(float(self.explained[view]), 3),
+                "centre_m": np.round(camera.centre, 4).tolist(),
+                "focal_px": round(float(camera.K[0, 0]), 2),
+                **{f"sigma_{name}": round(float(each[view]), 4) for name, each in sigmas.items()},
+                "halves_turn_deg": round(float(self.apart_deg[view]), 3),
+                "halves_move_mm": round(1e3 * float(self.apart_m[view]), 1),
+            }
+            for view, camera in enumerate(self.rig.cameras)
+        ]
+        floor = self.world.floor
+        about = {"held_out_px": round(self.held_out_px, 3), "sigma_scale": round(self.world.sigma_scale, 4)}
+        about |= {"people_at_once": self.world.persons, "upright": round(self.world.upright, 3)}
+        return {"cameras": cameras, **about, "floor_found": floor is not None, "notes": list(self.notes)}
+
+
+def calibrate(
+    detections: DetectionSequence,
+    rig: Rig,
+    times: FrameTimes,
+    frames: range,
+    focal: float = 0.0,
+    stature_m: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Calibrated:
+    """Where the cameras of `rig` stand, whose poses are not looked at, by the people whom `detections` show.
+
+    `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The people's median stature is
+    `stature_m`, or that of adults. Undetermined where cameras share too little, or motion does not tell.
+    """
+    views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
+    done = 0
+
+    def told(more: int = 1) -> None:
+        nonlocal done
+        done += more
+        progress(done, total)
+
+    pairs = _pairs(detections, rig, times, frames, told)
+    if len(connected := parts(pairs, views)) > 1:
+        raise Undetermined(tuple(_apart(rig, connected)))
+    edges = {pair: _edge(each, detections.skeleton, stature_m) for pair, each in pairs.items()}
+    now = _posed(rig, arranged(edges, views))
+    footage, freedom = Footage.of(detections, rig, times, frames), replace(_FREE, focal=focal)
+    taken = np.unique(footage.sightings.frame)
+    how = _How(rig, times, freedom, detections.skeleton, stature_m, told)
+    few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
+    adjusted = how.settled(footage, how.settled(few, now, _ROUGH).rig, _ROUNDS)
+    halves, missed = list[Rig](), list[Array]()
+    for used, left in (both := np.array_split(taken, 2)), both[::-1]:
+        half = how.settled(footage.at(used), adjusted.rig, _HALF_ROUNDS).rig
+        away = missed_px(footage.at(left).people(half), half)
+        halves.append(half)
+        missed.append(away[np.isfinite(away)])
+    new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, stature_m is not None)
+    return _judged(replace(adjusted, rig=new), world, halves, np.concatenate(missed), footage)
+
+
+def _pairs(
+    detections: DetectionSequence, rig: Rig, times: FrameTimes, frames: range, told: Callable[[], None]
+) -> dict[tuple[int, int], Relative]:
+    """How cameras stand to each other, of pairs that tell."""
+    taken = times.frame_s[frames.start : frames.stop]
+    lasts = float(taken[-1] - taken[0])
+    fps = (len(taken) - 1) / max(lasts, 1e-6)
+    after = taken[:, None] - taken[0] - np.linspace(0.0, max(lasts - _BURST_S, 0.0), _BURSTS)
+    wanted = frames.start + np.flatnonzero(((after >= 0) & (after <= _BURST_S)).any(axis=1))
+    sightings = Sightings.of(detections, wanted.tolist())
+    problems = [
+        f"camera {name}: it sees {count} people, one per frame, {_LEAST_SEEN} are the least; {_FILM}"
+        for view, name in enumerate(rig.names)
+        if (count := int((sightings.view == view).sum())) < _LEAST_SEEN
+    ]
+    if problems:
+        raise Undetermined(tuple(problems))
+    still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
+    tracks = [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
+    found = dict[tuple[int, int], Relative]()
+    for a, b in combinations(range(len(rig)), 2):
+        each = relative(tracks[a], tracks[b], fps)
+        told()
+        if each is not None and each.score >= _LEAST_SCORE and each.seconds >= _LEAST_S:
+            found[a, b] = each
+    return found
+
+
+def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
+    """Which cameras share too little with the others, in words."""
+    names = [" ".join(rig.names[view] for view in part) for part in connected]
+    return [
+        f"camera{'s' if len(part) > 1 else ''} {name}: too few people are seen at the same moments by"
+        f" {'them' if len(part) > 1 else 'it'} and by {names[0]}, or cameras are not synchronised; {_FILM}, where"
+        " views overlap"
+        for name, part in zip(names[1:], connected[1:], strict=True)
+    ]
+
+
+def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
+    people = People(
+        np.zeros(len(pair.points), np.intp), pair.points[..., None, :2], pair.points[..., :1], pair.points
+    )
+    metres = scale_of(people, skeleton, stature_m)
+    return Edge.of(pair, metres if np.isfinite(metres) else 3.0)
+
+
+def _posed(rig: Rig, poses: Array) -> Rig:
+    """The rig with its cameras at `poses` (V, 4, 4)."""
+    return replace(
+        rig, cameras=tuple(replace(each, wTc=wTc) for each, wTc in zip(rig.cameras, poses, strict=True))
+    )
+
+
+@dataclass(frozen=True)
+class _How:
+    """What rounds of adjusting have in common."""
+
+    given: Rig
+    times: FrameTimes
+    freedom: Freedom
+    skeleton: Skeleton
+    stature_m: float | None
+    told: Callable[[int], None]
+
+    def settled(self, footage: Footage, now: Rig, rounds: int) -> Adjusted:
+        """Cameras from `now` on, in turns with who is whom, in metres."""
+        adjusted: Adjusted | None = None
+        for step in range(rounds):
+            people = footage.people(now)
+            if len(people) < _LEAST_PEOPLE or not people.seen.any():
+                raise Undetermined(
+                    (f"only {len(people)} people are seen by two cameras at once, 10 are the least; {_FILM}",)
+                )
+            given = _posed(self.given, np.stack([camera.wTc for camera in now.cameras]))
+            spread = dilution(self.times.frame_s[np.unique(people.frame)])
+            adjusted = adjust(given, now, people, self.freedom, spread, misfit(people, now), scaled=True)
+            factor = scale_of(adjusted.people, self.skeleton, self.stature_m)
+            if not np.isfinite(factor):
+                raise Undetermined(
+                    (f"nobody's arms and legs are seen by two cameras: there is no scale; {_FILM}",)
+                )
+            before, now = now, scaled(adjusted.rig, factor)
+            adjusted = _grown(replace(adjusted, rig=now), factor)
+            still = _apart_by(before, now)[0].max() < _STILL_DEG
+            self.told(rounds - step if still else 1)
+            if still:
+                break
+        assert adjusted is not None
+        return adjusted
+
+
+def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
+    """People and covariances in another unit."""
+    unit = np.ones(adjusted.covariance.shape[1])
+    unit[MOVE] = factor
+    covariance = adjusted.covariance * unit[:, None, None] * unit
+    return replace(
+        adjusted, covariance=covariance, people=replace(adjusted.people, points=factor * adjusted.people.points)
+    )
+
+
+def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, footage: Footage) -> Calibrated:
+    """The result, or what is wrong with it."""
+    rig, people = adjusted.rig, adjusted.people
+    apart_deg, apart_m = _apart_by(*halves)
+    counts = people.seen.any(axis=1).sum(axis=0)
+    seen = np.bincount(footage.sightings.view, minlength=len(rig))
+    held = float(np.median(missed)) if len(missed) > 0 else np.nan
+    found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1))
+    sigma = np.degrees(adjusted.sigma(TURN))
+    problems = list[str]()
+    for view, name in enumerate(rig.names):
+        if counts[view] < _LEAST_PEOPLE:
+            problems.append(
+                f"camera {name}: it sees {counts[view]} people whom another camera sees, too few; {_FILM}"
+            )
+        elif sigma[view] > _MOST_SIGMA_DEG:
+            problems.append(
+                f"camera {name}: the people's motion does not determine which way it looks, to"
+                f" {sigma[view]:.1f} degrees only; {_FILM}"
+            )
+        elif apart_deg[view] > _MOST_APART_DEG:
+            problems.append(
+                f"camera {name}: the two halves of the recording place it {apart_deg[view]:.1f} degrees apart;"
+                f" {_FILM}"
+            )
+    if problems:
+        raise Undetermined(tuple(problems), found)
+    return found
+
+
+def _apart_by(one: Rig, other: Rig) -> tuple[Array, Array]:
+    """(V,) degrees and metres between the cameras of two rigs, the one laid on the other by a similarity."""
+    near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
+    a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
+    size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)
+    U, _, Vt = np.linalg.svd(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    grown = float(np.linalg.norm(b) / max(np.linalg.norm(a), 1e-9))
+    turned = np.einsum("ij,vjk,vik->v", R, near, far)  # the traces of far' R near
+    turns = np.degrees(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
+    return turns, np.linalg.norm(grown * a @ R.T - b, axis=1)

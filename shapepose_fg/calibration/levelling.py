@@ -1,0 +1,99 @@
+"""A rig without a world gets one: metres from people's stature, up from who stands, the floor at 0."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shapepose_fg.calibration.people import People
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.floor import Floor, find_floor
+from shapepose_fg.setup_check.diagnosis import build_of
+
+ADULT_M = 1.70
+"""Mean stature of adults, of the body model as of the world's women and men."""
+_BONES = 0.932
+"""Stature as `build_of` has it, over stature: joints as detectors mark them lie inside anatomy's landmarks. Of the
+body model's mean person; its spread over persons is 2 %."""
+_PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
+"""One sigma of the scale, as parts of it: what a person's bones vary by among adults, and among people of a known
+stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
+_LEAN_RAD = np.radians(3.0)
+"""How far people's mean trunk leans: from it the floor is sought."""
+_ANKLE_M = 0.10
+"""Ankles of who stands are so far above the floor."""
+
+
+@dataclass(frozen=True)
+class World:
+    """How a rig was laid on the floor."""
+
+    sigma_scale: float
+    """Of the scale, as a part of it, one sigma."""
+    persons: int
+    """People, as many as were seen at a time."""
+    floor: Floor | None
+    """What ankles say, in the frame before; None where they stand on nothing level."""
+    upright: float
+    """How alike people stand: the length of their trunks' mean direction, 1 at the most."""
+
+
+def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
+    """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if
+    nobody's bones are seen.
+    """
+    return float(_BONES * (stature_m or ADULT_M) / build_of(people.points, skeleton).stature)
+
+
+def scaled(rig: Rig, factor: float) -> Rig:
+    """The rig with all distances `factor` times as large."""
+    cameras = []
+    for camera in rig.cameras:
+        wTc = camera.wTc.copy()
+        wTc[:3, 3] *= factor
+        cameras.append(replace(camera, wTc=wTc))
+    return replace(rig, cameras=tuple(cameras))
+
+
+def sigma_of_scale(persons: int, known: bool) -> float:
+    """One sigma of the scale, a part of it, from the bones of so many people, their stature `known` or not."""
+    return float(np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON))
+
+
+def levelled(rig: Rig, people: People, skeleton: Skeleton, known: bool) -> tuple[Rig, World]:
+    """The rig with z up, the floor at 0, people in the middle, and y away from the first camera."""
+    build = build_of(people.points, skeleton)
+    upright = float(np.linalg.norm(build.up))
+    up = build.up / upright if upright > 0 else -rig.cameras[0].wTc[:3, 1]
+    names = [skeleton.joints[joint] for joint in skeleton.core]
+    feet = [n for n, name in enumerate(names) if name.endswith("Ankle")]
+    # Of two views alone one in fifty is 10 cm under the floor, where nobody stands.
+    sure = (people.seen[:, feet].sum(axis=-1) >= min(3, len(rig))).all(axis=1)
+    ankles = people.points[sure][:, feet]
+    floor: Floor | None = None
+    for _ in range(2):
+        height = ankles @ up
+        low = ankles[np.arange(len(ankles)), height.argmin(axis=1)] if height.size > 0 else np.zeros((0, 3))
+        found = find_floor(low, np.arange(len(low)), up, _LEAN_RAD)
+        floor = found if isinstance(found, Floor) else None
+        up = floor.normal if floor is not None else up
+    at = np.nanmedian(people.points.reshape(-1, 3), axis=0)
+    if floor is not None:
+        bottom = floor.height_m - _ANKLE_M
+    else:
+        bottom = float(np.median(low @ up)) - _ANKLE_M if len(low) > 0 else float(at @ up) - 1.0
+    right = rig.cameras[0].wTc[:3, 0]
+    right = right - (right @ up) * up
+    x = right / np.linalg.norm(right)
+    R = np.stack([x, np.cross(up, x), up])
+    move = -R @ at
+    move[2] = -bottom
+    cameras = []
+    for camera in rig.cameras:
+        wTc = camera.wTc.copy()
+        wTc[:3] = R @ wTc[:3]
+        wTc[:3, 3] += move
+        cameras.append(replace(camera, wTc=wTc))
+    _, counts = np.unique(people.frame, return_counts=True)
+    persons = int(np.percentile(counts, 90)) if len(counts) > 0 else 0
+    return Rig(tuple(cameras), "z"), World(sigma_of_scale(persons, known), persons, floor, upright)

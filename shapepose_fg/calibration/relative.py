@@ -1,0 +1,291 @@
+"""How two cameras stand to each other, from tracks of people whose identity in the other picture is unknown.
+
+Any track of one camera may be the person of any track of the other at the same time: each such pair gives an
+essential matrix, and what most tracks agree with, over all frames, is taken (RANSAC over tracks; Nistér 2004 for
+five joints in one track).
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.compiled import kernel
+from shapepose_fg.setup_check.matching import MIN_JOINTS
+
+_LOOK_S = 0.2
+"""Between frames that are compared: people's joints move by more than a detector errs."""
+_MOST_LOOKS = 80
+"""Frames of a recording by which guesses are scored."""
+_MOST_TRIED = 30
+"""Pairs of tracks from which poses are guessed; those longest in common."""
+_JOINTS_A_TRY = 240
+_LEAST_TRY = 60
+"""Joints of a pair of tracks from which a pose is guessed, at most and at least."""
+_RANSAC = 0.02
+"""Joints that miss by less than this part of a person's size agree: a detector errs by 3 cm of 170."""
+_GATE = 0.06
+"""Tracks whose joints miss by more, in the mean, are not one person."""
+_CLIP = 0.15
+"""A joint misses by no more: that of somebody else."""
+_SAMPLES = 60
+"""Sets of five joints that are tried of each; of a person's joints two thirds agree, in simulated recordings."""
+_FINALISTS = 6
+"""Guesses that are refined."""
+_STEPS = 8
+_DILUTION = 25.0
+"""So many errors of joints are one: those of a person at one moment, and of moments that are near each other."""
+
+
+@dataclass(frozen=True)
+class Relative:
+    """Where one camera stands as seen from another: x_b = R x_a + t."""
+
+    R: Array
+    """(3, 3) rotation."""
+    t: Array
+    """(3,) of length one."""
+    score: float
+    """How much of what both saw at a time is matched, and how well: 1 if all is without error, 0 if nothing."""
+    seconds: float
+    """Person-seconds that are matched."""
+    covariance: Array
+    """(6, 6) of a small turn w before R, rad, and of a change of t, which has none along t."""
+    points: Array
+    """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN where not seen by both."""
+
+
+class _Together:
+    """What two cameras saw at the same moments: N pairs of rows, K pairs of tracks."""
+
+    def __init__(self, one: Tracks, other: Tracks, looks: Index) -> None:
+        rows = [_rows(each, looks) for each in (one, other)]
+        both = (rows[0][:, None] >= 0) & (rows[1][None] >= 0)
+        a, b, look = np.nonzero(both)
+        self.rows = np.stack([rows[0][a, look], rows[1][b, look]], axis=1)
+        self.tracks, self.pair = np.unique(np.stack([a, b], axis=1), axis=0, return_inverse=True)
+        self.pair = self.pair.reshape(-1)
+        self.count = np.bincount(self.pair, minlength=len(self.tracks))
+        self.possible = int(np.minimum((rows[0] >= 0).sum(axis=0), (rows[1] >= 0).sum(axis=0)).sum())
+        self.rays = (np.ascontiguousarray(one.rays), np.ascontiguousarray(other.rays))
+        self.size = (one.size, other.size)
+        self.alike = _at_once(rows[0]), _at_once(rows[1])
+
+    def misses(self, E: Array) -> Array:
+        """(H, K) by how much tracks miss each other under essential matrices (H, 3, 3), parts of people's size."""
+        total, count = (np.zeros((len(E), len(self.tracks))) for _ in range(2))
+        _misses(*self.rays, *self.size, self.rows, self.pair, np.ascontiguousarray(E), total, count)
+        enough = count >= 0.5 * self.count
+        return np.where(enough & (count > 0), total / np.maximum(count, 1), _CLIP)
+
+    def chosen(self, miss: Array) -> tuple[Mask, float]:
+        """Which pairs of tracks (K,) are one person each, the best first, and what that is worth."""
+        worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
+        order = np.argsort(-worth, kind="stable")
+        kept = np.zeros(len(miss), dtype=np.bool_)
+        _choose(order[worth[order] > 0], self.tracks, *self.alike, kept)
+        return kept, float(worth[kept].sum() / max(self.possible, 1))
+
+    def joints(self, kept: Mask) -> tuple[Array, Array, Array]:
+        """Rays (N, J, 3) of both cameras of the pairs of tracks that are `kept`, and sizes (N,)."""
+        rows = self.rows[kept[self.pair]]
+        a, b = (rays[rows[:, n]] for n, rays in enumerate(self.rays))
+        return a, b, np.sqrt(self.size[0][rows[:, 0]] * self.size[1][rows[:, 1]])
+
+
+def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
+    """How the camera of `other` stands to that of `one`, whose rays are in their own frames; None where too few
+    people are seen by both at a time, or nothing agrees.
+    """
+    frames = np.intersect1d(one.frame, other.frame)
+    if len(frames) == 0:
+        return None
+    looks = np.unique((frames // max(1, round(_LOOK_S * fps))) * max(1, round(_LOOK_S * fps)))
+    looks = looks[np.unique(np.linspace(0, len(looks) - 1, _MOST_LOOKS).astype(np.intp))]
+    seen = _Together(one, other, looks)
+    guesses = _guesses(one, other, seen)
+    if len(guesses) == 0:
+        return None
+    scores = np.array([seen.chosen(miss)[1] for miss in seen.misses(guesses)])
+    found: Relative | None = None
+    for E in guesses[np.argsort(-scores, kind="stable")[:_FINALISTS]]:
+        each = _settled(E, seen, fps, looks)
+        if each is not None and (found is None or each.score > found.score):
+            found = each
+    return found
+
+
+def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
+    """(H, 3, 3) essential matrices, each from a pair of tracks."""
+    found = list[Array]()
+    for pair in np.argsort(-seen.count, kind="stable")[:_MOST_TRIED].tolist():
+        a, b = seen.tracks[pair].tolist()
+        begin = max(one.frame[one.first[a]], other.frame[other.first[b]])
+        end = min(one.lasts[a], other.lasts[b])
+        frames = np.unique(np.linspace(begin, end, _JOINTS_A_TRY // one.rays.shape[1]).astype(np.intp))
+        rows = [each.first[k] + frames - each.frame[each.first[k]] for each, k in ((one, a), (other, b))]
+        x, y = one.rays[rows[0]], other.rays[rows[1]]
+        both = np.isfinite(x[..., 0]) & np.isfinite(y[..., 0]) & (x[..., 2] > 0.1) & (y[..., 2] > 0.1)
+        if both.sum() < _LEAST_TRY:
+            continue
+        size = float(np.sqrt(np.median(one.size[rows[0]]) * np.median(other.size[rows[1]])))
+        flat_x, flat_y = (np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y))
+        agree = _RANSAC * size
+        E, _ = cv2.findEssentialMat(
+            flat_x, flat_y, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=agree, maxIters=_SAMPLES
+        )
+        if E is not None and E.shape[0] >= 3:
+            found += [np.asarray(each, dtype=np.float64) for each in E.reshape(-1, 3, 3)]
+    return np.stack(found) if found else np.zeros((0, 3, 3))
+
+
+def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | None:
+    """The pose of a guess, refined by all tracks that agree with it, in turns."""
+    kept, score = seen.chosen(seen.misses(E[None])[0])
+    best: Relative | None = None
+    for _ in range(4):
+        if kept.sum() == 0:
+            return best
+        a, b, size = seen.joints(kept)
+        pose = _in_front(E, a, b) if best is None else (best.R, best.t)
+        R, t, covariance = refined_pose(*pose, a, b, size)
+        E = cross(t) @ R
+        new, score = seen.chosen(seen.misses(E[None])[0])
+        if best is not None and score <= best.score:
+            return best
+        points, ahead = _meeting(R, t, a, b)
+        share = float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
+        step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else _LOOK_S
+        best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, covariance, points)
+        kept = new
+    return best
+
+
+def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
+    """Of the four poses that an essential matrix allows, that with most joints in front of both cameras."""
+    one, two, t = (np.asarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(E))
+    ways = [(R, sign * t[:, 0]) for R, sign in product((one, two), (1.0, -1.0))]
+    return max(ways, key=lambda way: int(_meeting(*way, a, b)[1].sum()))
+
+
+def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
+    """Where rays (N, J, 3) of two cameras meet, in the frame of the first, and which in front of both."""
+    back, centre = b @ R, -R.T @ t
+    cosine, along_a, along_b = (a * back).sum(axis=-1), a @ centre, back @ centre
+    sine2 = np.maximum(1 - cosine**2, 1e-6)
+    s, u = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    return (s[..., None] * a + centre + u[..., None] * back) / 2, (s > 0) & (u > 0)
+
+
+def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array, Array]:
+    """The pose by which rays a, b (N, J, 3) of people of `size` (N,) rad are nearest to planes (Sampson, Cauchy),
+    and its covariance as `Relative` has it.
+    """
+    known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
+    size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
+    to, H, usual = np.zeros((5, 6)), np.eye(5), 1.0
+    for _ in range(_STEPS):
+        E, turned = cross(t) @ R, a @ R.T
+        Ea, Eb = a @ E.T, b @ E
+        # Sampson's distance, of an angle on both sides, as a part of people's size.
+        scale = size * np.sqrt((Ea**2).sum(axis=1) + (Eb**2).sum(axis=1))
+        r = (b * Ea).sum(axis=1) / scale
+        # b . [t] (w x R a) = (b x t) . (w x R a) = w . (R a x (b x t)); b . (dt x R a) = dt . (R a x b)
+        J = np.concatenate([_crossed(turned, b @ cross(t)), _crossed(turned, b)], axis=1) / scale[:, None]
+        to = np.zeros((5, 6))
+        to[:3, :3], to[3:, 3:] = np.eye(3), np.linalg.svd(t[None])[2][1:]
+        J, usual = J @ to.T, max(_RANSAC / 2, float(np.median(np.abs(r))))
+        weight = 1 / (1 + (r / usual) ** 2)
+        H = J.T @ (weight[:, None] * J)
+        H += 1e-9 * np.trace(H) * np.eye(5)
+        step = -np.linalg.solve(H, J.T @ (weight * r))
+        step = to.T @ step * min(1.0, 0.3 / max(float(np.linalg.norm(step)), 1e-12))
+        R, t = exp_so3(step[None, :3])[0] @ R, t + step[3:]
+        t = t / np.linalg.norm(t)
+        if np.linalg.norm(step) < 1e-6:
+            break
+    return R, t, to.T @ np.linalg.inv(H) @ to * _DILUTION * usual**2
+
+
+def cross(t: Array) -> Array:
+    """(3, 3) matrix of the cross product with `t`."""
+    return np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
+
+
+def _crossed(a: Array, b: Array) -> Array:
+    """(N, 3) cross products; np.cross takes ten times as long."""
+    return np.stack([a[:, i] * b[:, k] - a[:, k] * b[:, i] for i, k in ((1, 2), (2, 0), (0, 1))], axis=1)
+
+
+def _rows(tracks: Tracks, looks: Index) -> Index:
+    """(K, F) the row of each track at each frame that is looked at, -1 where it is not there."""
+    begins = tracks.frame[tracks.first]
+    there = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
+    return np.where(there, tracks.first[:, None] + looks - begins[:, None], -1)
+
+
+def _at_once(rows: Index) -> Mask:
+    """(K, K) which tracks are there at the same time, another person each."""
+    there = (rows >= 0).astype(np.float64)
+    return np.asarray(there @ there.T > 0)
+
+
+@kernel("f3 f3 f1 f1 i2 i1 f3 f2 f2")
+def _misses(
+    a: Array,
+    b: Array,
+    size_a: Array,
+    size_b: Array,
+    rows: Index,
+    pair: Index,
+    E: Array,
+    total: Array,
+    count: Array,
+) -> None:
+    """Sums into `total` (H, K) the mean misses of joints of pairs of rows (N, 2), their number into `count`."""
+    plane, back = np.empty(3), np.empty(3)
+    for h in range(len(E)):
+        for n in range(len(rows)):
+            one, other = rows[n, 0], rows[n, 1]
+            miss, seen = 0.0, 0
+            for j in range(a.shape[1]):
+                if a[one, j, 0] != a[one, j, 0] or b[other, j, 0] != b[other, j, 0]:  # NaN
+                    continue
+                square, other_square, dot = 0.0, 0.0, 0.0
+                for i in range(3):
+                    plane[i], back[i] = 0.0, 0.0
+                    for k in range(3):
+                        plane[i] += E[h, i, k] * a[one, j, k]
+                        back[i] += E[h, k, i] * b[other, j, k]
+                    square += plane[i] ** 2
+                    other_square += back[i] ** 2
+                    dot += plane[i] * b[other, j, i]
+                away = max(
+                    abs(dot) / (np.sqrt(square) * size_b[other] + 1e-12),
+                    abs(dot) / (np.sqrt(other_square) * size_a[one] + 1e-12),
+                )
+                miss += min(away, _CLIP)
+                seen += 1
+            if seen >= MIN_JOINTS:
+                total[h, pair[n]] += miss / seen
+                count[h, pair[n]] += 1
+
+
+@kernel("i1 i2 b2 b2 b1")
+def _choose(order: Index, tracks: Index, same_a: Mask, same_b: Mask, kept: Mask) -> None:
+    """Marks in `kept` (K,) pairs of tracks in `order`, none that gives a track two people at once."""
+    for n in range(len(order)):
+        a, b = tracks[order[n], 0], tracks[order[n], 1]
+        free = True
+        for m in range(n):
+            other = order[m]
+            if kept[other]:
+                c, d = tracks[other, 0], tracks[other, 1]
+                if (a == c and same_b[b, d]) or (b == d and same_a[a, c]):
+                    free = False
+                    break
+        kept[order[n]] = free

@@ -1,0 +1,128 @@
+"""The command `calibrate`: where cameras stand, from people who walk about."""
+
+import json
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from shapepose_fg.cli.options import (
+    INPUT,
+    REQUIRED,
+    RESULT,
+    RateOptions,
+    grouped,
+    json_option,
+    next_reconstruct,
+    option,
+    picture_size,
+)
+from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.core.errors import InputError
+
+if TYPE_CHECKING:
+    from shapepose_fg.calibration.from_people import Calibrated
+    from shapepose_fg.core.camera import Rig
+
+_CAMERAS = "What is known"
+_FILE_OFF, _GUESS_OFF = 0.02, 0.1
+"""How far focal lengths of a calibration, and of a field of view, may be off, one sigma, as parts of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensOptions:
+    """What a 2D detector saw, and the lenses it saw it through."""
+
+    detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
+    skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
+    calibration: Path | None = option(INPUT, "File of the lenses; its poses, if any, are not used.")
+    field_of_view: list[str] | None = option(
+        INPUT, "Without one: degrees from left to right; of one camera, or several: CAMERA=DEGREES.", metavar="DEG"
+    )
+    image_size: str | None = option(INPUT, "Size of pictures where no file says it.", metavar="WxH")
+
+    def rig(self) -> "Rig":
+        """The cameras, at no place yet; InputError where nothing says how they see."""
+        from shapepose_fg.io.calibration import read_rig
+        from shapepose_fg.io.lenses import lenses_of
+
+        if (self.calibration is None) == (self.field_of_view is None):
+            raise InputError("--calibration or --field-of-view: one of them must say how wide the cameras see")
+        size = picture_size(self.image_size)
+        if self.calibration is not None:
+            rig = read_rig(self.calibration, up="z", unit="m", image_size=size)
+        else:
+            rig = lenses_of(self.detections, self.field_of_view or [], size)
+        if len(rig) < 2:
+            raise InputError(f"{self.detections}: at least 2 cameras are needed, got {len(rig)}")
+        return rig
+
+
+@grouped
+def calibrate(
+    seen: LensOptions,
+    rate: RateOptions,
+    focal: bool = option(
+        _CAMERAS, "Refine focal lengths: by 2 % of a calibration, 10 % of a field of view.", False
+    ),
+    stature: float | None = option(
+        _CAMERAS, "People's median stature in metres; without it that of adults, 1.70."
+    ),
+    output: Path = option(RESULT, "File for the cameras, our own JSON.", REQUIRED),
+    as_json: bool = json_option(),
+) -> None:
+    """Find where cameras stand by the people whom they see; lenses must be known, or guessed.
+
+    Film a minute: cameras still and synchronised, each sharing part of its picture with another; two or more
+    people who walk through all views, near and far, arms raised at times, not on one line. Exit code 1 where
+    that does not determine the cameras; nothing is written then.
+    """
+    from shapepose_fg.calibration.from_people import Undetermined, calibrate
+    from shapepose_fg.io.calibration import write_rig
+
+    if stature is not None and not 0.5 <= stature <= 2.5:
+        raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
+    off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
+    rig = seen.rig()
+    with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
+        recording, times, span = rate.part(seen.detections, seen.skeleton, rig, Path(folder))
+        try:
+            with progress("calibrating", "steps") as done:
+                found = calibrate(recording, rig, times, span, off, stature, done)
+        except Undetermined as error:
+            note(*error.problems)
+            raise typer.Exit(1) from None
+    note(*found.notes)
+    write_rig(found.rig, output)
+    if as_json:
+        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+    else:
+        _show(found, focal, stature)
+        print(f"{output}: our own rig file")
+        options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
+        print(next_reconstruct(options | rate.given() | {"--output": "results"}))
+
+
+def _show(found: "Calibrated", focal: bool, stature: float | None) -> None:
+    """The cameras, and how surely they are known."""
+    heads = ["people", "shared", "x y z, m", "turn ± °", "place ± mm", "halves, °"] + ["focal, px"] * focal
+    rows = []
+    for each in found.as_dict()["cameras"]:
+        place = " ".join(f"{value:.2f}" for value in each["centre_m"])
+        figures = [str(each["people"]), f"{each['shared']:.0%}", place, f"{each['sigma_turn_deg']:.2f}"]
+        figures += [f"{each['sigma_move_mm']:.0f}", f"{each['halves_turn_deg']:.2f}"]
+        figures += [f"{each['focal_px']:.0f} ± {each['sigma_focal_percent']:.1f} %"] * focal
+        rows.append((each["camera"], *figures))
+    caption = (
+        "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too;"
+        " halves: how far apart the two halves of the recording place it"
+    )
+    show(table(("camera", *heads), rows, caption=caption))
+    whose = f"people of {stature:g} m" if stature is not None else "adults of 1.70 m in the median"
+    world = found.world
+    print(f"scale: {whose}, {world.persons} at once: ± {100 * world.sigma_scale:.1f} %, one sigma")
+    level = "from feet on the floor" if world.floor is not None else "from bodies alone, no level floor was found"
+    print(f"up: z, {level}; the floor is at 0")
+    print(f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px")
