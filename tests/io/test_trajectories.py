@@ -38,6 +38,7 @@ def test_columns_in_any_order_with_covariances(tmp_path):
     np.testing.assert_allclose(found.wTb[0, :3, 3], [5, 6, 7])
     expected = np.diag([1e-4, 1e-4, 4e-4, 0.01, 0.02, 0.03])
     expected[0, 5] = expected[5, 0] = 1e-3
+    assert found.covariance is not None
     np.testing.assert_allclose(found.covariance, np.stack([expected] * 2))
 
 
@@ -87,6 +88,7 @@ def test_a_rig_file_and_its_trajectories_come_back(tmp_path, rig):
     (was,), (now,) = rig.trajectories, back.trajectories
     assert now.refined and now.drift == was.drift
     np.testing.assert_allclose(now.wTb, was.wTb, atol=1e-12)
+    assert now.covariance is not None and was.covariance is not None
     np.testing.assert_allclose(now.covariance, was.covariance, rtol=1e-12)
     time_s = np.full(4, 0.15)
     np.testing.assert_allclose(back.at(time_s).cTw, rig.at(time_s).cTw, atol=1e-12)

@@ -240,6 +240,6 @@ def test_pictures_outside_the_trajectory_are_not_used(drifted):
     )
     people = reconstruct(drifted.recording, rig, times=TIMES, frames=range(36, 44))
     assert people.observations is not None
-    used = people.observations.used.any(axis=1)
+    used = np.asarray(people.observations.used.any(axis=1))
     assert used[people.frame < 40].all() and not used[people.frame >= 40][:, 2:].any()
     assert used[people.frame >= 40][:, :2].all()
