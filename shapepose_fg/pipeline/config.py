@@ -48,12 +48,21 @@ class WindowConfig(Settings):
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
     frames. Windows of other lengths move joints by under 2 mm in the median (tests/pipeline/test_windows.py)."""
+    keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
+    """People are followed and solved in frames at most so far apart (keyframes), and carried by motion through
+    those between, whose detections are not used; 0: in every frame. Errors of detectors last longer than a frame,
+    so that little is lost."""
     again_over_time: RepeatsOrNone = 8
     """How often detections are reassociated around a draft of a window, at the most: it ends when hardly any
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
     again_alone: RepeatsOrNone = 5
     """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
     (`LEAST_PROBABILITY`): who goes leaves detections to others, so the least sure goes first. Fewer are faster."""
+
+    @property
+    def shared_s(self) -> float:
+        """How far windows reach into each other, seconds: to the next keyframe at least."""
+        return max(self.overlap_s, self.keyframe_s)
 
 
 @dataclass(frozen=True)
@@ -139,6 +148,11 @@ class PipelineConfig(Settings):
             offsets=OffsetConfig(source="none"),
             temporal=False,
         )
+
+    @classmethod
+    def fast(cls) -> "PipelineConfig":
+        """Keyframes, by the second and not by the frame."""
+        return cls(windows=WindowConfig(keyframe_s=0.12), batch_frames=288)
 
     def _rules(self, kind: type[Rules]) -> Rules:
         """The constants of a step, ours or the paper's."""

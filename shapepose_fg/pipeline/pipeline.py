@@ -161,10 +161,11 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
                 if config.motion.floor:
                     floor = result.floor(model, rig.up_vector)
                 known = SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
+                keyframe_s = config.windows.keyframe_s
                 ground = floor if isinstance(floor, Floor) else None
                 bodies = fit_everybody(
                     result.rows_of,
-                    lambda number, rows: replace(result.person(number, rows), floor=ground),
+                    lambda number, rows: replace(result.person(number, rows), floor=ground, keyframe_s=keyframe_s),
                     lambda jobs: pool.map(_fit_person, jobs),
                     kept,
                     known,
