@@ -47,13 +47,21 @@ class Preset(StrEnum):
         """All of them."""
         from shapepose_fg.pipeline.config import PipelineConfig
 
-        made = {Preset.ACCURATE: PipelineConfig, Preset.FAST: PipelineConfig.fast, Preset.PAPER: PipelineConfig.paper}
+        made = {
+            Preset.ACCURATE: PipelineConfig,
+            Preset.FAST: PipelineConfig.fast,
+            Preset.PAPER: PipelineConfig.paper,
+        }
         return made[self]()
 
 
 def preset_option(default: Preset | None) -> Any:
     """Which of them."""
-    return option(RESULT, "accurate (default); fast: in every third frame or so, and motion between; paper: as the paper has it.", default)
+    return option(
+        RESULT,
+        "accurate (default); fast: in every third frame or so, and motion between; paper: as the paper has it.",
+        default,
+    )
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:

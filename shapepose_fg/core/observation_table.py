@@ -171,7 +171,9 @@ class ObservationTable(Table):
     def unseen(self, frame: Whole) -> "ObservationTable":
         """Rows of the same people in other frames, `frame` (N,), in which no view saw anything."""
         nothing = {name: np.full_like(getattr(self, name), np.nan) for name in ("xy", "residual_px")}
-        nothing |= {name: np.zeros_like(getattr(self, name)) for name in "confidence gate probability lead_s".split()}
+        nothing |= {
+            name: np.zeros_like(getattr(self, name)) for name in "confidence gate probability lead_s".split()
+        }
         return replace(self, **nothing, frame=frame, candidate=np.full_like(self.candidate, -1))
 
     @property

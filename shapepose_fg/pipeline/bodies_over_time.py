@@ -225,8 +225,8 @@ def with_bodies_over_time(
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
-    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Nothing of this returns into the joints or their
-    covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
+    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Nothing of this returns into the joints or
+    their covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
     """
     if len(people) == 0:
         return people

@@ -36,6 +36,9 @@ class PeopleConfig(Settings):
     min_new_joints: Count = 4
     """Core joints (trunk, arms, legs) that two views must see for a new person over time: less where furniture
     hides people. Frame by frame three are enough: evidence decides there."""
+    search_s: Seconds = 0.1
+    """New people over time are sought so often among what those who are followed leave, and followed back from
+    there. More is faster."""
     patience_s: Seconds = 0.5
     """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
     later is recognised by `stitching`."""
@@ -151,8 +154,13 @@ class PipelineConfig(Settings):
 
     @classmethod
     def fast(cls) -> "PipelineConfig":
-        """Keyframes, by the second and not by the frame."""
-        return cls(windows=WindowConfig(keyframe_s=0.12), batch_frames=288)
+        """In keyframes only, eight to ten a second: half the time or less (docs/evaluation.md, "Presets")."""
+        return cls(
+            people=PeopleConfig(search_s=0.35),
+            windows=WindowConfig(keyframe_s=0.12),
+            offsets=OffsetConfig(frames=10),
+            batch_frames=288,
+        )
 
     def _rules(self, kind: type[Rules]) -> Rules:
         """The constants of a step, ours or the paper's."""
@@ -177,7 +185,8 @@ class PipelineConfig(Settings):
     @property
     def tracking(self) -> TrackingConfig:
         """People over time: how they are followed from frame to frame."""
-        return TrackingConfig(min_new_joints=self.people.min_new_joints, patience_s=self.people.patience_s)
+        own = self.people
+        return TrackingConfig(own.min_new_joints, own.patience_s, own.search_s)
 
     @property
     def window_graph(self) -> WindowGraphConfig:

@@ -12,6 +12,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.frame_times import segments
+from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_model import MotionModel
 
@@ -45,8 +46,8 @@ def with_rows_between(
 ) -> Reconstruction:
     """The `rows` of keyframes, and of everybody who is in two that follow each other a row in each frame between.
 
-    `frame` (F,) are frames that follow each other, at `time_s` (F,) seconds, of which `key` (F,) are keyframes. New
-    rows have no detections and no body; `motion` carries their joints. Sorted by frame and person.
+    `frame` (F,) are frames that follow each other, at `time_s` (F,) seconds, of which `key` (F,) are keyframes.
+    New rows have no detections and no body; `motion` carries their joints. Sorted by frame and person.
     """
     keys = np.flatnonzero(key)
     order = np.lexsort((rows.frame, rows.person))
@@ -56,9 +57,37 @@ def with_rows_between(
     pair = np.repeat(after, count)
     at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
     if len(at) == 0:
-        return rows.rows(np.lexsort((rows.person, rows.frame)))
+        return rows
     between = _carried(rows.rows(order[pair]), rows.rows(order[pair + 1]), frame[at], time_s[at], motion)
     every = Reconstruction.concatenate([rows, between])
+    return every.rows(np.lexsort((every.person, every.frame)))
+
+
+def looked_at(rows: Reconstruction) -> Mask:
+    """(N,) rows with a detection in any view, or before the first or after the last such row of their person."""
+    table = rows.observations
+    seen = np.ones(len(rows), dtype=bool) if table is None else (table.gate != Gate.NOT_SEEN).any(axis=(1, 2))
+    order = np.lexsort((rows.frame, rows.person))
+    inside = np.zeros(len(rows), dtype=bool)
+    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        inside[mine] = (np.cumsum(seen[mine]) > 0) & (np.cumsum(seen[mine][::-1])[::-1] > 0)
+    return seen | ~inside
+
+
+def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionModel) -> Reconstruction:
+    """The `solved` rows, and between them, carried anew, those that `rows` have of the same people besides."""
+    width = int(rows.frame.max(initial=0)) + 1
+    order = np.lexsort((solved.frame, solved.person))
+    known, asked = (each.person * width + each.frame for each in (solved.rows(order), rows))
+    new = np.flatnonzero(~np.isin(asked, known))
+    after = np.searchsorted(known, asked[new])
+    first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
+    ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
+    first, second, new = first[ours], second[ours], new[ours]
+    if len(new) == 0:
+        return solved
+    between = _carried(solved.rows(first), solved.rows(second), rows.frame[new], rows.time_s[new], motion)
+    every = Reconstruction.concatenate([solved, between])
     return every.rows(np.lexsort((every.person, every.frame)))
 
 
@@ -144,8 +173,8 @@ def bodies_between(
 
 
 def _quaternions(vectors: Array) -> Array:
-    """(B, K, 4) of rotation vectors (B, K, 3), radians; of the two that are the same rotation the one nearer to that
-    of the row before.
+    """(B, K, 4) of rotation vectors (B, K, 3), radians; of the two that are one rotation the one nearer to that of
+    the row before.
     """
     half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
     found = np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vectors], axis=-1)
