@@ -98,10 +98,8 @@ def main() -> None:
 def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int) -> dict[str, list[Spent]]:
     """The command in each tree, alternately, `rounds` times after a warm-up; a preset in this one only."""
     spent: dict[str, list[Spent]] = {name: [] for name in trees}
-    own = dict.fromkeys(trees, list(options))
-    if "--preset" in options:
-        at = options.index("--preset")
-        own |= dict.fromkeys(trees.keys() - {"here"}, [*options[:at], *options[at + 2 :]])
+    at = options.index("--preset") if "--preset" in options else len(options)
+    own = {name: [*options[:at], *(options[at:] if name == "here" else options[at + 2 :])] for name in trees}
     for name in trees:
         short = [] if "--frames" in options else ["--frames", "0:8"]
         spend(trees[name], [*own[name], *short], work / "results")
