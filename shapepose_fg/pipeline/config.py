@@ -38,7 +38,8 @@ class PeopleConfig(Settings):
     hides people. Frame by frame three are enough: evidence decides there."""
     search_s: Seconds = 0.1
     """New people over time are sought so often among what those who are followed leave, and followed back from
-    there. More is faster."""
+    there; and every 0.33 s, or half as often as that, among all detections. More is faster, and finds fewer of
+    those who are hardly seen."""
     patience_s: Seconds = 0.5
     """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
     later is recognised by `stitching`."""

@@ -48,7 +48,7 @@ class TrackingConfig(Settings):
     patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
     search_s: Seconds = 0.1
-    """New people are sought so often."""
+    """New people are sought so often (`worlds.follow_worlds`)."""
 
 
 @dataclass(frozen=True)

@@ -161,7 +161,8 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
-    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / _KEY_S)))
+    apart_s = max(_KEY_S, 2 * tracker.config.search_s)
+    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / apart_s)))
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
     return [back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
