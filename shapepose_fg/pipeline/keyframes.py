@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
@@ -92,7 +92,7 @@ def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionM
 
 
 def _carried(
-    before: Reconstruction, after: Reconstruction, frame: Index, time_s: Array, motion: MotionModel
+    before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
 ) -> Reconstruction:
     """N rows at `time_s` (N,) of the people whose rows `before` and `after` are of the keyframes around it."""
     lasts_s = (after.time_s - before.time_s)[:, None, None]
@@ -162,14 +162,17 @@ def bodies_between(
 
     def between(values: Array) -> Array:
         slopes = np.gradient(values, known_s, axis=0) if len(values) > 1 else np.zeros_like(values)
-        lifted = (each.reshape(-1, *[1] * (values.ndim - 1)) for each in (share, lasts_s))
-        return cubic(*lifted, (values[first], values[second]), (slopes[first], slopes[second]))[0]
+        at, lasts = (each.reshape(-1, *[1] * (values.ndim - 1)) for each in (share, lasts_s))
+        return cubic(at, lasts, (values[first], values[second]), (slopes[first], slopes[second]))[0]
 
     turned = _rotation_vectors(between(_quaternions(np.concatenate([orient[:, None], pose], axis=1))))
-    found = tuple(np.zeros((len(time_s), *each.shape[1:])) for each in bodies)
-    for into, values in zip(found, (betas[first], turned[:, 0], turned[:, 1:], between(transl)), strict=True):
-        into[fine] = values
-    return fine, found
+
+    def filled(values: Array) -> Array:
+        every = np.zeros((len(time_s), *values.shape[1:]))
+        every[fine] = values
+        return every
+
+    return fine, (filled(betas[first]), filled(turned[:, 0]), filled(turned[:, 1:]), filled(between(transl)))
 
 
 def _quaternions(vectors: Array) -> Array:
