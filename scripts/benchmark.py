@@ -45,8 +45,11 @@ CASES = {
     "crowd": ("crowd", ()),
     "long": ("long", ()),
     "long, two processes": ("long", ("--workers", "2")),
+    "recording, fast": ("short", ("--preset", "fast")),
+    "crowd, fast": ("crowd", ("--preset", "fast")),
+    "recording, paper": ("short", ("--preset", "paper")),
 }
-"""Which recording, and options beside those of all."""
+"""Which recording, and options beside those of all; a preset is of this checkout, the commit runs its default."""
 _LONG = 3000
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
@@ -93,14 +96,16 @@ def main() -> None:
 
 
 def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int) -> dict[str, list[Spent]]:
-    """The command in each tree, alternately, `rounds` times after a warm-up."""
+    """The command in each tree, alternately, `rounds` times after a warm-up; a preset in this one only."""
     spent: dict[str, list[Spent]] = {name: [] for name in trees}
+    at = options.index("--preset") if "--preset" in options else len(options)
+    own = {name: [*options[:at], *(options[at:] if name == "here" else options[at + 2 :])] for name in trees}
     for name in trees:
         short = [] if "--frames" in options else ["--frames", "0:8"]
-        spend(trees[name], [*options, *short], work / "results")
+        spend(trees[name], [*own[name], *short], work / "results")
     for _ in range(rounds):
         for name in trees:
-            spent[name].append(spend(trees[name], options, work / "results"))
+            spent[name].append(spend(trees[name], own[name], work / "results"))
     return spent
 
 

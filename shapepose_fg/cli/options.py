@@ -44,18 +44,28 @@ class Preset(StrEnum):
     """Settings that hang together."""
 
     ACCURATE = "accurate"
+    FAST = "fast"
     PAPER = "paper"
 
     def settings(self) -> "PipelineConfig":
         """All of them."""
         from shapepose_fg.pipeline.config import PipelineConfig
 
-        return PipelineConfig.paper() if self is Preset.PAPER else PipelineConfig()
+        made = {
+            Preset.ACCURATE: PipelineConfig,
+            Preset.FAST: PipelineConfig.fast,
+            Preset.PAPER: PipelineConfig.paper,
+        }
+        return made[self]()
 
 
 def preset_option(default: Preset | None) -> Any:
     """Which of them."""
-    return option(RESULT, "accurate (default), or paper: the method as the paper has it.", default)
+    return option(
+        RESULT,
+        "accurate (default); fast: in every third frame or so, and motion between; paper: as the paper has it.",
+        default,
+    )
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:

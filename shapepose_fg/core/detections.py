@@ -126,6 +126,8 @@ class Input:
     """What the detector saw."""
     rig: Rig
     """Where the cameras were."""
+    key: bool = True
+    """Whether people are sought in it; those between keyframes are empty (`pipeline/keyframes.py`)."""
 
 
 class DetectionSequence(Protocol):

@@ -1,7 +1,7 @@
 """What each row of a result was solved from: per joint and view the detection, its residual, and its gate."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
@@ -170,6 +170,14 @@ class ObservationTable(Table):
             time_s=time_s[:, None] + self.lead_s,
             probability=np.where(seen, self.probability, 1.0).astype(np.float64),
         )
+
+    def unseen(self, frame: Whole) -> "ObservationTable":
+        """Rows of the same people in other frames, `frame` (N,), in which no view saw anything."""
+        nothing = {name: np.full_like(getattr(self, name), np.nan) for name in ("xy", "residual_px")}
+        nothing |= {
+            name: np.zeros_like(getattr(self, name)) for name in "confidence gate probability lead_s".split()
+        }
+        return replace(self, **nothing, frame=frame, candidate=np.full_like(self.candidate, -1))
 
     @property
     def used(self) -> Mask:

@@ -20,7 +20,7 @@ from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import APPEARS_S, LEAST_S, own_evidence, weighed
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.worlds import BIRTHS_S, PLACED_M
+from shapepose_fg.tracking.worlds import PLACED_M
 
 ON_TRIAL = -1
 """The identity of who has too little evidence yet."""
@@ -137,7 +137,7 @@ class Filter:
         now = replace(before, tracks=replace(tracks, time_s=time_s))
         now, candidate = self._weighed(now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S))
         now, candidate = self._without_ended(now, candidate)
-        if not abs(time_s - now.sought_s) < BIRTHS_S:
+        if not abs(time_s - now.sought_s) < self.tracker.config.search_s:
             now, candidate = self._with_newcomers(now, candidate, given)
         return self._with_names(now), candidate
 

@@ -19,6 +19,7 @@ from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import ANEW, InMemory, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.pipeline.keyframes import bodies_between, spaced
 
 SEGMENT_ROWS = 4000
 """Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
@@ -49,6 +50,8 @@ class Person:
     shape only."""
     floor: Floor | None = None
     """What bodies do not sink into, where it was found."""
+    keyframe_s: float = 0.0
+    """Bodies are fitted to rows at most so far apart, and turned evenly between them; 0: to every row."""
 
     @classmethod
     def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
@@ -63,14 +66,21 @@ class Person:
         """The bodies as arrays: `ok` (N,) which rows have one, `betas` to `transl` as in `Reconstruction`; and the
         shape that they share, `mean` (1, 10) and `information` (1, 10, 10) by what all rows say of it.
         """
-        group = np.full(len(self.time_s), self.number)
-        found = fitter.fit_sequence(self.targets, group, self.time_s, self.shapes, fixed_shapes=self.fixed_shapes)
-        fit = found.fit if self.kept is None else found.fit.rows(np.arange(self.kept.start, self.kept.stop))
+        rows = np.flatnonzero(spaced(self.time_s, self.keyframe_s))
+        targets, time_s, group = self.targets.rows(rows), self.time_s[rows], np.full(len(rows), self.number)
+        found = fitter.fit_sequence(targets, group, time_s, self.shapes, fixed_shapes=self.fixed_shapes)
+        kept = range(len(self.time_s)) if self.kept is None else self.kept
+        first, last = np.searchsorted(rows, kept.start, side="right") - 1, np.searchsorted(rows, kept.stop - 1)
+        around = np.arange(first, last + 1) if len(kept) > 0 else np.arange(0)
+        fit = found.fit.rows(around)
         bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
         if self.floor is not None and fitter.model is not None:
             bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
+        ok = fit.ok
+        if len(rows) < len(self.time_s):
+            ok, bodies = bodies_between(ok, bodies, time_s[around], self.time_s[kept.start : kept.stop])
         shape = {"mean": found.shapes.mean, "information": found.shapes.information}
-        return {"ok": fit.ok, **dict(zip(BODY, bodies, strict=True)), **shape}
+        return {"ok": ok, **dict(zip(BODY, bodies, strict=True)), **shape}
 
 
 _BODIES = {name: column for name, column in columns_of(Reconstruction).items() if name in BODY} | {
@@ -207,12 +217,16 @@ def _spread(count: int, most: int, length: int) -> list[range]:
 
 
 def with_bodies_over_time(
-    people: Reconstruction, fitter: BodyFitter, known: SubjectShapes | None = None, floor: Floor | None = None
+    people: Reconstruction,
+    fitter: BodyFitter,
+    known: SubjectShapes | None = None,
+    floor: Floor | None = None,
+    keyframe_s: float = 0.0,
 ) -> Reconstruction:
     """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
 
-    `known`: see `fit_everybody`. Bodies stay above the `floor`. Nothing of this returns into the joints or their
-    covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
+    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Nothing of this returns into the joints or
+    their covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
     """
     if len(people) == 0:
         return people
@@ -227,7 +241,7 @@ def with_bodies_over_time(
     def person(number: int, parts: Sequence[range]) -> Person:
         mine = np.flatnonzero(people.person == number)[np.concatenate(parts)]
         one = Person.of(number, people.joints[mine], people.covariance[mine], people.time_s[mine])
-        return replace(one, floor=floor)
+        return replace(one, floor=floor, keyframe_s=keyframe_s)
 
     bodies = fit_everybody(
         dict(zip(numbers.tolist(), counts.tolist(), strict=True)),

@@ -36,6 +36,10 @@ class PeopleConfig(Settings):
     min_new_joints: Count = 4
     """Core joints (trunk, arms, legs) that two views must see for a new person over time: less where furniture
     hides people. Frame by frame three are enough: evidence decides there."""
+    search_s: Seconds = 0.1
+    """New people over time are sought so often among what those who are followed leave, and followed back from
+    there; and every 0.33 s, or half as often as that, among all detections. More is faster, and finds fewer of
+    those who are hardly seen."""
     patience_s: Seconds = 0.5
     """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
     later is recognised by `stitching`."""
@@ -48,12 +52,21 @@ class WindowConfig(Settings):
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
     """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
     frames. Windows of other lengths move joints by under 2 mm in the median (tests/pipeline/test_windows.py)."""
+    keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
+    """People are followed and solved in frames at most so far apart (keyframes), and carried by motion through
+    those between, whose detections are not used; 0: in every frame. Errors of detectors last longer than a frame,
+    so that little is lost."""
     again_over_time: RepeatsOrNone = 8
     """How often detections are reassociated around a draft of a window, at the most: it ends when hardly any
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
     again_alone: RepeatsOrNone = 5
     """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
     (`LEAST_PROBABILITY`): who goes leaves detections to others, so the least sure goes first. Fewer are faster."""
+
+    @property
+    def shared_s(self) -> float:
+        """How far windows reach into each other, seconds: to the next keyframe at least."""
+        return max(self.overlap_s, self.keyframe_s)
 
 
 @dataclass(frozen=True)
@@ -140,6 +153,16 @@ class PipelineConfig(Settings):
             temporal=False,
         )
 
+    @classmethod
+    def fast(cls) -> "PipelineConfig":
+        """In keyframes only, eight to ten a second: half the time or less (docs/evaluation.md, "Presets")."""
+        return cls(
+            people=PeopleConfig(search_s=0.35),
+            windows=WindowConfig(keyframe_s=0.12),
+            offsets=OffsetConfig(frames=10),
+            batch_frames=288,
+        )
+
     def _rules(self, kind: type[Rules]) -> Rules:
         """The constants of a step, ours or the paper's."""
         return kind.paper() if self.method == "paper" else kind()
@@ -163,7 +186,8 @@ class PipelineConfig(Settings):
     @property
     def tracking(self) -> TrackingConfig:
         """People over time: how they are followed from frame to frame."""
-        return TrackingConfig(min_new_joints=self.people.min_new_joints, patience_s=self.people.patience_s)
+        own = self.people
+        return TrackingConfig(own.min_new_joints, own.patience_s, own.search_s)
 
     @property
     def window_graph(self) -> WindowGraphConfig:

@@ -5,11 +5,14 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+
 from shapepose_fg.body.fitting.fitter import BodyFitter, check_fitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
@@ -25,6 +28,7 @@ from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.keyframes import keyframes
 from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
 from shapepose_fg.pipeline.offsets import kept_offsets
 from shapepose_fg.pipeline.runs.assembly import Assembly
@@ -139,6 +143,13 @@ class Task:
         times.check(count, len(self.rig))
         return frames, times, list(check_cuts(self.cuts, count))
 
+    def keyframes(self) -> Index:
+        """(K,) the frames in which people are sought: all but where they are followed in some only."""
+        frames, times, cuts = self.whole()
+        apart_s = self.config.windows.keyframe_s if self.config.temporal else 0.0
+        chosen = keyframes(times.frame_s, frames, cuts, apart_s)
+        return frames.start + np.flatnonzero(chosen[frames.start : frames.stop])
+
 
 def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None = None) -> Assembly:
     """`reconstruct` whose windows leave memory for `kept` as they are solved, and whose result is made of them.
@@ -168,7 +179,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     parts = Parts(kept)
     parts.check(skeleton.joints, rig.names, frames, times.frame_s)
     done = parts.notes().frames
-    windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, book)
+    windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, task.keyframes(), book)
     with execution.pool(setup, len(frames)) as pool:
         beginning = book.torn_off()
         nobody = setup.engine(book).tracker.nobody()
@@ -190,10 +201,11 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
                 if config.motion.floor:
                     floor = result.floor(model, rig.up_vector)
                 known = SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
+                keyframe_s = config.windows.keyframe_s
                 ground = floor if isinstance(floor, Floor) else None
                 bodies = fit_everybody(
                     result.rows_of,
-                    lambda number, rows: replace(result.person(number, rows), floor=ground),
+                    lambda number, rows: replace(result.person(number, rows), floor=ground, keyframe_s=keyframe_s),
                     lambda jobs: pool.map(_fit_person, jobs),
                     kept,
                     known,

@@ -1,7 +1,7 @@
 """All steps from frames to rows, made of the settings: what every process that takes part needs."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,16 +11,17 @@ from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.reconstruction import Status
+from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.keyframes import with_rows_between
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.solve_window import Assigning, solve_window
 from shapepose_fg.pipeline.windows import Engine, Span
@@ -60,7 +61,8 @@ class Setup:
 
     def solve(self, span: Span) -> Part:
         """One window, in whatever process: the rows of its own frames, by frame and person, and notes on them."""
-        given = [frame for frame, _ in span.decided]
+        every = [frame for frame, _ in span.decided]
+        given = [frame for frame in every if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
         windows = self.config.windows
         rounds = windows.again_alone if span.alone else windows.again_over_time
@@ -75,20 +77,17 @@ class Setup:
         doubted = {frame.frame: frame.rig.doubted for frame in given if len(frame.rig.doubted) > 0}
         if len(doubted) > 0:
             solution = replace(solution, status=_doubted(solution, doubted))
-        own = {frame.frame: frame.detections for frame in given[span.start : span.stop]}
+        own = {frame.frame for frame in every[span.start : span.stop]}
         found = solution.observations
         left = Counter(rows.frame.tolist()) - Counter(found.frame.tolist())
         by_person = np.lexsort((found.track, found.frame))
+        whole = solution
         solution = solution.rows(by_person[np.isin(found.frame[by_person], list(own))])
         rows = solution.observations
         if not self.config.temporal:  # a person is a number within the frame
             number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
             problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
             solution = replace(solution, observations=replace(rows, track=number), problems=problems)
-        place = np.full(rows.candidate.shape, -1, dtype=np.int32)
-        for frame in np.unique(rows.frame).tolist():
-            of_frame = rows.frame == frame
-            place[of_frame] = np.append(own[frame].place, -1)[rows.candidate[of_frame]]
         notes = Notes(len(own), Counter(solution.seconds), problems=list(solution.problems))
         if dropped := sorted(frame for frame in left.elements() if frame in own):
             notes.dropped[_FALSE_POSITIVE] = dropped
@@ -99,7 +98,23 @@ class Setup:
                 notes.evidence[track] = [float(evidence.sum()), len(evidence)]
         else:
             notes.probable = Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
-        return Part(solution.result(place, self.rig, self.skeleton.joints), notes)
+        if len(given) == len(every):
+            return Part(self._result(solution, given), notes)
+        frame, time_s = np.array([each.frame for each in every]), np.array([each.time_s.mean() for each in every])
+        key = np.array([each.key for each in every])
+        motion = MotionModel.load(self.skeleton.joints, self.config.motion)
+        carried = with_rows_between(self._result(whole, given), frame, time_s, key, motion)
+        return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
+
+    def _result(self, solution: WindowSolution, given: Sequence[Input]) -> Reconstruction:
+        """The rows of a solution, which detections they are made of by their places in `given`."""
+        frame, candidate = solution.observations.frame, solution.observations.candidate
+        detections = {each.frame: each.detections for each in given}
+        place = np.full(candidate.shape, -1, dtype=np.int32)
+        for number in np.unique(frame).tolist():
+            of_frame = frame == number
+            place[of_frame] = np.append(detections[number].place, -1)[candidate[of_frame]]
+        return solution.result(place, self.rig, self.skeleton.joints)
 
     def engine(self, book: Notebook) -> Engine:
         """Follows people; what it has to say goes into `book`."""

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Input
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
@@ -37,6 +37,8 @@ class SolvedWindows:
     """The frames that are wanted."""
     cuts: Sequence[int]
     """First frames of what follows a cut."""
+    keyframes: Index
+    """The frames in which people are sought, rising."""
     book: Notebook
     """Where this process takes its notes."""
     _rigs: dict[tuple[tuple[int, ...], ...], Rig] = field(default_factory=dict, init=False)
@@ -48,7 +50,9 @@ class SolvedWindows:
         return self.times.of_views(len(self.setup.rig))
 
     def read(self, frame: int) -> Input:
-        """What the cameras give of a frame."""
+        """What the cameras give of a frame; nothing between keyframes."""
+        if not _among(frame, self.keyframes):
+            return Input(frame, self._time_s[frame], Detections.empty(), self.setup.rig, key=False)
         with self.book.stage("read"):
             thinned = self.detections.is_thinned(frame)
             self.book.thin("detections", thinned, frame)
@@ -131,6 +135,12 @@ class SolvedWindows:
                     notes.add(found.notes)
                     behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
                 yield Part(rows.rows(np.lexsort((rows.person, rows.frame))), notes, behind)
+
+
+def _among(frame: int, frames: Index) -> bool:
+    """Whether a frame is one of those, which rise."""
+    at = int(np.searchsorted(frames, frame))
+    return at < len(frames) and frames[at] == frame
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
+from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.calibration import read_rig
@@ -24,6 +25,7 @@ from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
@@ -68,15 +70,19 @@ def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
     Detections stay with whom they were given; gates are decided anew. ValueError where `rows` do not say what
     they were solved from.
     """
-    parts = []
+    parts, keyframe_s = [], solver.config.windows.keyframe_s
+    motion = MotionModel.load(tuple(rows.joint_names.tolist()), solver.config.motion)
     for own, part, solution in _solved(rows, solver, None):
         assert part.observations is not None
         solved = solution.result(part.observations.candidate, solver.rig, part.joint_names.tolist())
-        parts.append(solved.rows(_inside(part.frame, own)))
+        if keyframe_s > 0:
+            solved = with_rows_like(solved, rows.rows(_rows_of(rows, own, own, 0.0)), motion)
+        parts.append(solved.rows(_inside(solved.frame, own)))
     solved = replace(Reconstruction.concatenate(parts), run=rows.run) if parts else rows
     if solver.fitter.model is None or not solver.config.temporal:
         return solved
-    return with_bodies_over_time(solved, solver.fitter, floor=Floor.from_dict(rows.run.get("floor")))
+    floor = Floor.from_dict(rows.run.get("floor"))
+    return with_bodies_over_time(solved, solver.fitter, floor=floor, keyframe_s=keyframe_s)
 
 
 def window_solutions(
@@ -105,7 +111,9 @@ def _solved(
     config, rig = solver.config, solver.rig
     settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
     for own, segment in _windows(rows, config):
-        part = rows.rows(_rows_of(rows, own, segment, config.windows.overlap_s))
+        part = rows.rows(_rows_of(rows, own, segment, config.windows.shared_s))
+        if config.windows.keyframe_s > 0:
+            part = part.rows(looked_at(part))
         assert part.observations is not None
         # From the views: the joints as they are may be somebody else's.
         observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)

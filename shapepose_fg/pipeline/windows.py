@@ -110,7 +110,7 @@ class Engine:
         return (len(decided), len(decided)) if last and len(decided) > before else None
 
     def _overlap(self, decided: Sequence[Decided], at: int, direction: int) -> int:
-        """The frame `overlap_s` before or after the border at `at`."""
+        """The frame `shared_s` before or after the border at `at`."""
         times = np.array([frame.time_s.mean() for frame, _ in decided])
-        near = near_border(times, times[min(at, len(times) - 1)], self.config.windows.overlap_s)
+        near = near_border(times, times[min(at, len(times) - 1)], self.config.windows.shared_s)
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1

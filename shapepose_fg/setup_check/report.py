@@ -267,7 +267,7 @@ class ResultCheck:
 
 
 def result_check(
-    report: SetupReport, people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: range
+    report: SetupReport, people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
 ) -> ResultCheck:
     """The check of a set-up with what the reconstruction adds to it."""
     uses = tuple(camera_use(people, detections, rig, frames))
@@ -284,7 +284,9 @@ def result_check(
     return ResultCheck(report, uses, tuple(warnings))
 
 
-def camera_use(people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: range) -> list[CameraUse]:
+def camera_use(
+    people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
+) -> list[CameraUse]:
     """One entry for each camera; without observations in the result, an empty list."""
     table = people.observations
     if table is None:

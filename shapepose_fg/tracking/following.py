@@ -65,34 +65,41 @@ def follow(
 ) -> tuple[FollowState, list[Decided]]:
     """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
     pending = (*state.pending, new)
-    full, lasts_s = len(pending) > MOST_FRAMES, float(new.time_s.mean() - pending[0].time_s.mean())
+    keys = [frame for frame in pending if frame.key]
+    if not new.key or len(keys) < 2:
+        return replace(state, pending=pending), []
+    full, lasts_s = len(pending) > MOST_FRAMES, float(new.time_s.mean() - keys[0].time_s.mean())
     if not full and lasts_s < BLOCK_S + config.look_ahead_s:
         return replace(state, pending=pending), []
-    times = times_of(pending)
+    times = times_of(keys)
     ends_s = times[-1] - config.look_ahead_s if full else times[0] + BLOCK_S - 1e-6
-    own = max(int(np.searchsorted(times, ends_s)), len(pending) // 2 if full else 1)
-    return _decide(tracker, replace(state, pending=pending), min(own, len(pending) - 1))
+    own = max(int(np.searchsorted(times, ends_s)), len(keys) // 2 if full else 1)
+    return _decide(tracker, replace(state, pending=pending), min(own, len(keys) - 1))
 
 
 def finish(tracker: Tracker, state: FollowState) -> tuple[FollowState, list[Decided]]:
     """The rows of all frames that are still open: the recording ends here, or is cut."""
-    return _decide(tracker, state, len(state.pending)) if len(state.pending) > 0 else (state, [])
+    keys = sum(frame.key for frame in state.pending)
+    return _decide(tracker, state, keys) if keys > 0 else (state, [])
 
 
 def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState, list[Decided]]:
-    """Rows of the first `own` frames that are pending."""
-    frames = state.pending
+    """Rows of the first `own` keyframes that are pending; and none, for now, of the frames between."""
+    keys = [n for n, frame in enumerate(state.pending) if frame.key]
+    frames, until = [state.pending[n] for n in keys], [*keys, len(state.pending)][own]
     found, chosen = explained(tracker, frames, state.people, own - 1)
     rest = found.account.left_over(chosen)
     for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
         tracker.drop(_UNLIKELY, [frame.frame for frame in frames[start : min(stop, own)]])
     chosen = _with_detections(found, chosen, first=len(state.people) == 0, last=own == len(frames))
     identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
-    decided = [(frame, _rows(frame, t, found, chosen, identity)) for t, frame in enumerate(frames[:own])]
+    rows = {keys[t]: _rows(frame, t, found, chosen, identity) for t, frame in enumerate(frames[:own])}
+    nobody = next(iter(rows.values())).rows(slice(0, 0))
+    decided = [(frame, rows.get(n, nobody)) for n, frame in enumerate(state.pending[:until])]
     last = chosen.during(own - 1) & (identity >= 0)
     who = chosen.hypothesis[last]
     people = people_at(frames[own - 1], identity[last], found.joints.rows(who))
-    return FollowState(people, next_id, frames[own:]), decided
+    return FollowState(people, next_id, state.pending[until:]), decided
 
 
 def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:

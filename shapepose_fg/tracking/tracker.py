@@ -47,6 +47,8 @@ class TrackingConfig(Settings):
     """Core joints that two views must see, by detections that no track has, for a new person."""
     patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
+    search_s: Seconds = 0.1
+    """New people are sought so often (`worlds.follow_worlds`)."""
 
 
 @dataclass(frozen=True)

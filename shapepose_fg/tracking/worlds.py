@@ -26,9 +26,8 @@ Array = NDArray[np.float64]
 _KEY_S = 0.33
 """People are sought among all detections so often, seconds: in some frame everybody is seen well. With 0.67 crowds
 before three cameras at 10 to 20 frames a second lose half as many rows more (seven seeds, simulated)."""
-BIRTHS_S = 0.1
-"""New people are sought so often among what a world's people leave: who is found later is followed back.
-Seconds."""
+_TWINS_S = 0.1
+"""So often it is looked whether two worlds have become one, seconds."""
 _RESTART_S = 1.3
 """Whoever was chosen is followed again from a frame in each so many seconds."""
 _ROUNDS = 2
@@ -162,7 +161,8 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
-    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / _KEY_S)))
+    apart_s = max(_KEY_S, 2 * tracker.config.search_s)
+    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / apart_s)))
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
     return [back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
@@ -246,7 +246,7 @@ def _follow(
             begins.setdefault(seed.frame, []).append((own, seed.candidate))
         elif len(own) > 0:
             tracks = own
-    sought_s = -np.inf
+    looked_s = sought_s = -np.inf
     for t in range(len(frames)) if forwards else range(len(frames) - 1, -1, -1):
         frame = frames[t]
         time_s, candidate = float(frame.time_s.mean()), np.zeros((0, *log.shape), dtype=np.intp)
@@ -259,15 +259,18 @@ def _follow(
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
             tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
-        if abs(time_s - sought_s) < BIRTHS_S:
+        if abs(time_s - looked_s) < _TWINS_S:
             continue
-        sought_s = time_s
+        looked_s = time_s
         gone, same = _twins(tracks, candidate, births)
         if len(gone) > 0:
             log.twins.append((slice(t + 1, None) if forwards else slice(0, t), tracks.ids[gone], tracks.ids[same]))
             births = {world: since for world, since in births.items() if world not in tracks.world[gone]}
             rest = np.setdiff1d(np.arange(len(tracks)), gone)
             tracks, candidate = tracks.rows(rest), candidate[rest]
+        if abs(time_s - sought_s) < tracker.config.search_s:
+            continue
+        sought_s = time_s
         for world in [world for world, since in births.items() if (since <= t if forwards else since >= t)]:
             here = tracks.world == world
             places, theirs = _newcomers(tracker, tracks.rows(here), candidate[here], frame)

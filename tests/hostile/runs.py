@@ -150,7 +150,9 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
         setup = Setup(own.rig, own.detections.skeleton, own.config, own.fitter)
         pictures = WithoutRepeats(own.detections, len(own.rig))
         detections = ThinnedFrames(pictures, len(own.rig), own.config.candidates)
-        windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, Notebook())
+        windows = SolvedWindows(
+            setup, detections, pictures, times, frames, cuts, np.arange(len(times)), Notebook()
+        )
         nobody = setup.engine(Notebook()).tracker.nobody()
 
         def result() -> Reconstruction:

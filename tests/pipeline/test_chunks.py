@@ -23,7 +23,7 @@ from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
-from shapepose_fg.tracking.tracker import BodyScale, Tracks
+from shapepose_fg.tracking.tracker import BodyScale, TrackingConfig, Tracks
 from tests.marks import slow
 
 CONFIG = PipelineConfig(
@@ -202,6 +202,7 @@ class NobodyIsThere:
 
     skeleton = BODY_25
     scale = BodyScale(np.ones(25), np.ones(25))
+    config = TrackingConfig()
 
     def nobody(self) -> Tracks:
         """Tracks of no people."""

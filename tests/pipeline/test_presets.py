@@ -51,7 +51,10 @@ def seen(rig, people, confidence=0.8) -> Observations:
     return Observations(xy, np.full(xy.shape[:3], confidence), people.copy())
 
 
-@pytest.mark.parametrize(("name", "settings"), [("paper", PAPER), ("accurate", PipelineConfig())])
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("paper", PAPER), ("accurate", PipelineConfig()), ("fast", PipelineConfig.fast())],
+)
 def test_presets_read_back(name, settings, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["config", "--preset", name])

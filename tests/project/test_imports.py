@@ -34,7 +34,7 @@ LEVELS = (
     "proposal",
     "estimation",
     "tracking",
-    "pipeline.solve_window",
+    "pipeline.solve_window pipeline.keyframes",
     "pipeline.config pipeline.cluster pipeline.bodies_over_time",
     "pipeline.windows",
     "pipeline.runs",

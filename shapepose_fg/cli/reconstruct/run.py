@@ -211,7 +211,12 @@ class _Run:
 
     def _finished(self, kept: InFolder) -> Ended:
         """The reconstruction, its files, and what is said of it."""
-        asked, output, rig, frames = self.known.request, self.known.output, self.task.rig, self.task.whole()[0]
+        asked, output, rig, frames = (
+            self.known.request,
+            self.known.output,
+            self.task.rig,
+            self.task.keyframes().tolist(),
+        )
         file, inputs = asked.shapes, dict(self.inputs)
         known = None
         if file is not None:
@@ -263,7 +268,9 @@ class _Run:
         if checked is not None:
             show_check(checked)
         count = len(result.rows_of) if self.task.config.temporal else None
-        return Ended(len(frames), len(result), count, () if checked is None else tuple(checked.warnings))
+        return Ended(
+            len(self.task.whole()[0]), len(result), count, () if checked is None else tuple(checked.warnings)
+        )
 
     def _written(self, result: Assembly, people: Reconstruction, rig: Rig, every: int) -> list[str]:
         """Report and files for other programs are left; what there is now."""

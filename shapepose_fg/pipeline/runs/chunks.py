@@ -69,12 +69,12 @@ def _until(stop: int, segment: range, first: int, time_s: Array, config: Pipelin
     `Engine` compares means over the cameras' times, which round differently: a frame more or less, twice.
     """
     beyond = stop + config.batch_frames // 2 + 1
-    while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.overlap_s:
+    while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.shared_s:
         beyond += 1
     if beyond >= segment.stop:
         return segment.stop
     newest = beyond
-    ahead_s = BLOCK_S + config.following.look_ahead_s
+    ahead_s = BLOCK_S + config.following.look_ahead_s + config.windows.keyframe_s
     while newest < segment.stop and time_s[newest] - time_s[beyond] < ahead_s:
         newest += 1
     newest += 2

@@ -1,0 +1,195 @@
+"""Keyframes: the frames in which people are followed and solved; and their rows in the frames between.
+
+Between two keyframes a joint moves as the model of motion has it where nothing is measured: given places and
+velocities at both ends the mean of white noise on acceleration is a cubic. Errors of detectors last longer than
+keyframes are apart, so that the covariance is that of the ends, and of the motion that nobody looked at.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.frame_times import segments
+from shapepose_fg.core.observation_table import Gate
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
+from shapepose_fg.estimation.motion_model import MotionModel
+
+_ROUNDING_S = 1e-6
+
+
+def spaced(time_s: Array, apart_s: float) -> Mask:
+    """(T,) of rising times the first, the last, and as few between as are `apart_s` apart at the most."""
+    chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
+    reached = np.searchsorted(time_s, time_s + apart_s + _ROUNDING_S, side="right") - 1
+    while at < last:
+        chosen[at] = True
+        at = max(int(reached[at]), at + 1)
+    chosen[last:] = True
+    return chosen
+
+
+def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float) -> Mask:
+    """(T,) which frames of a recording at times (T,) are keyframes: of the wanted `frames` as few as are `apart_s`
+    apart at the most, from cut to cut; all where that is 0.
+    """
+    chosen = np.ones(len(time_s), dtype=bool)
+    for segment in segments(frames, cuts) if apart_s > 0 else ():
+        own = slice(segment.start, segment.stop)
+        chosen[own] = spaced(time_s[own], apart_s)
+    return chosen
+
+
+def with_rows_between(
+    rows: Reconstruction, frame: Index, time_s: Array, key: Mask, motion: MotionModel
+) -> Reconstruction:
+    """The `rows` of keyframes, and of everybody who is in two that follow each other a row in each frame between.
+
+    `frame` (F,) are frames that follow each other, at `time_s` (F,) seconds, of which `key` (F,) are keyframes.
+    New rows have no detections and no body; `motion` carries their joints. Sorted by frame and person.
+    """
+    keys = np.flatnonzero(key)
+    order = np.lexsort((rows.frame, rows.person))
+    number = np.searchsorted(frame[keys], rows.frame[order])
+    after = np.flatnonzero((np.diff(number) == 1) & (np.diff(rows.person[order]) == 0))
+    count = np.diff(keys)[number[after]] - 1
+    pair = np.repeat(after, count)
+    at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
+    if len(at) == 0:
+        return rows
+    between = _carried(rows.rows(order[pair]), rows.rows(order[pair + 1]), frame[at], time_s[at], motion)
+    every = Reconstruction.concatenate([rows, between])
+    return every.rows(np.lexsort((every.person, every.frame)))
+
+
+def looked_at(rows: Reconstruction) -> Mask:
+    """(N,) rows with a detection in any view, or before the first or after the last such row of their person."""
+    table = rows.observations
+    seen = np.ones(len(rows), dtype=bool) if table is None else (table.gate != Gate.NOT_SEEN).any(axis=(1, 2))
+    order = np.lexsort((rows.frame, rows.person))
+    inside = np.zeros(len(rows), dtype=bool)
+    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        inside[mine] = (np.cumsum(seen[mine]) > 0) & (np.cumsum(seen[mine][::-1])[::-1] > 0)
+    return seen | ~inside
+
+
+def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionModel) -> Reconstruction:
+    """The `solved` rows, and between them, carried anew, those that `rows` have of the same people besides."""
+    width = int(rows.frame.max(initial=0)) + 1
+    order = np.lexsort((solved.frame, solved.person))
+    known, asked = (each.person * width + each.frame for each in (solved.rows(order), rows))
+    new = np.flatnonzero(~np.isin(asked, known))
+    after = np.searchsorted(known, asked[new])
+    first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
+    ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
+    first, second, new = first[ours], second[ours], new[ours]
+    if len(new) == 0:
+        return solved
+    between = _carried(solved.rows(first), solved.rows(second), rows.frame[new], rows.time_s[new], motion)
+    every = Reconstruction.concatenate([solved, between])
+    return every.rows(np.lexsort((every.person, every.frame)))
+
+
+def _carried(
+    before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
+) -> Reconstruction:
+    """N rows at `time_s` (N,) of the people whose rows `before` and `after` are of the keyframes around it."""
+    lasts_s = (after.time_s - before.time_s)[:, None, None]
+    share = (time_s - before.time_s)[:, None, None] / lasts_s
+    chord = (after.joints - before.joints) / lasts_s
+    speeds = [np.where(np.isfinite(each.velocity), each.velocity, chord) for each in (before, after)]
+    joints, velocity = cubic(share, lasts_s, (before.joints, after.joints), (speeds[0], speeds[1]))
+
+    # Of white noise on acceleration with both ends known.
+    density = motion.psd_still + motion.psd_speed * np.nan_to_num(np.square(chord).sum(axis=-1))
+    inside, length = (share * (1 - share))[..., 0], lasts_s[..., 0]
+    of_place, of_speed = density * (length * inside) ** 3 / 3, density * length * inside * (1 - 3 * inside)
+
+    def spread(name: str, unseen: Array) -> Array:
+        ends = getattr(before, name), getattr(after, name)
+        return (1 - share[..., None]) * ends[0] + share[..., None] * ends[1] + unseen[..., None, None] * np.eye(3)
+
+    # Where the first end is as it should be the second one says what is wrong; bodies come later.
+    fine = np.isin(before.status, (Status.OK, Status.BODY_UNDETERMINED))
+    status = np.where(fine, after.status, before.status)
+    placed = np.isfinite(joints).all(axis=-1)
+    columns = {
+        "frame": frame,
+        "time_s": time_s,
+        "joints": joints,
+        "covariance": spread("covariance", of_place),
+        "velocity": velocity,
+        "velocity_covariance": spread("velocity_covariance", of_speed),
+        "known": np.where(placed, Known.MOTION, Known.UNKNOWN).astype(np.uint8),
+        "confidence": np.zeros_like(before.confidence),
+        "status": np.where(status == Status.OK, Status.BODY_UNDETERMINED, status),
+        "observations": None if before.observations is None else before.observations.unseen(frame),
+    }
+    return replace(before, **columns, **{name: np.full_like(getattr(before, name), np.nan) for name in BODY})
+
+
+def cubic(
+    share: Array, lasts_s: Array, places: tuple[Array, Array], speeds: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Place and velocity (...) at a `share` (...) of the `lasts_s` (...) seconds between two `places` (...), where
+    the velocities are `speeds` (...).
+    """
+    way, s = places[1] - places[0], share
+    first, second = (lasts_s * each - way for each in speeds)
+    place = places[0] + s * way + s * (1 - s) * ((1 - s) * first - s * second)
+    return place, (way + (1 - s) * (1 - 3 * s) * first - s * (2 - 3 * s) * second) / lasts_s
+
+
+def bodies_between(
+    ok: Mask, bodies: Sequence[Array], key_s: Array, time_s: Array
+) -> tuple[Mask, tuple[Array, Array, Array, Array]]:
+    """Bodies at times `time_s` (N,) within those, rising, of given ones `key_s` (B,); and which there are, (N,).
+
+    `bodies` are shapes (B, 10), rotations of the root (B, 3) and of the other joints (B, 23, 3), translations
+    (B, 3); those that are not `ok` (B,) count nothing. Translations and rotations, as quaternions, are cubics with
+    the slopes that their neighbours have.
+    """
+    after = np.searchsorted(key_s, time_s)
+    before = np.where(key_s[after] == time_s, after, after - 1)
+    fine = ok[before] & ok[after]
+    place = np.cumsum(ok) - 1
+    first, second = place[before[fine]], place[after[fine]]
+    betas, orient, pose, transl = (each[ok] for each in bodies)
+    known_s = key_s[ok]
+    lasts_s = np.where(second > first, known_s[second] - known_s[first], 1.0)
+    share = (time_s[fine] - known_s[first]) / lasts_s
+
+    def between(values: Array) -> Array:
+        slopes = np.gradient(values, known_s, axis=0) if len(values) > 1 else np.zeros_like(values)
+        at, lasts = (each.reshape(-1, *[1] * (values.ndim - 1)) for each in (share, lasts_s))
+        return cubic(at, lasts, (values[first], values[second]), (slopes[first], slopes[second]))[0]
+
+    turned = _rotation_vectors(between(_quaternions(np.concatenate([orient[:, None], pose], axis=1))))
+
+    def filled(values: Array) -> Array:
+        every = np.zeros((len(time_s), *values.shape[1:]))
+        every[fine] = values
+        return every
+
+    return fine, (filled(betas[first]), filled(turned[:, 0]), filled(turned[:, 1:]), filled(between(transl)))
+
+
+def _quaternions(vectors: Array) -> Array:
+    """(B, K, 4) of rotation vectors (B, K, 3), radians; of the two that are one rotation the one nearer to that of
+    the row before.
+    """
+    half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
+    found = np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vectors], axis=-1)
+    sign = np.sign((found[1:] * found[:-1]).sum(axis=-1, keepdims=True))
+    found[1:] *= np.cumprod(np.where(sign < 0, -1.0, 1.0), axis=0)
+    return found
+
+
+def _rotation_vectors(quaternions: Array) -> Array:
+    """(..., 3) radians, at most pi, of quaternions (..., 4) of any length."""
+    w, xyz = quaternions[..., :1], quaternions[..., 1:]
+    xyz = np.where(w < 0, -xyz, xyz)
+    sine = np.linalg.norm(xyz, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, np.abs(w))
+    return xyz * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 0.0)

@@ -1,0 +1,142 @@
+"""Keyframes: which they are, what is said of the frames between, and that a whole run holds what it promises."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from factors import CONSTANT_VELOCITY
+from shapepose_fg.body.model.rotation import exp_so3, log_so3
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
+from shapepose_fg.pipeline.execution import Execution
+from shapepose_fg.pipeline.keyframes import bodies_between, keyframes, spaced, with_rows_between
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.pipeline.solving import Solver, solve_rows
+from shapepose_fg.simulation import built_in_scene, simulate
+
+FAST = PipelineConfig.fast()
+
+
+def test_keyframes_are_as_few_as_time_allows():
+    """At 25 frames a second every third; where one was dropped the step is not too long; each cut begins anew."""
+    time_s = np.arange(11) / 25
+    assert np.flatnonzero(spaced(time_s, 0.12)).tolist() == [0, 3, 6, 9, 10]
+    time_s[5:] += 0.04
+    assert np.flatnonzero(spaced(time_s, 0.12)).tolist() == [0, 3, 5, 8, 10]
+    assert spaced(time_s, 0.0).all()
+    assert np.flatnonzero(spaced(np.arange(4) / 5, 0.12)).tolist() == [0, 1, 2, 3]
+    chosen = keyframes(np.arange(12) / 25, range(1, 11), [6], 0.12)
+    assert np.flatnonzero(chosen).tolist() == [0, 1, 4, 5, 6, 9, 10, 11]  # 0 and 11 are not wanted
+
+
+def moving(joints: np.ndarray, velocity: np.ndarray, time_s: np.ndarray, frame: np.ndarray) -> Reconstruction:
+    """Rows of one person whose joints are known exactly."""
+    N, J = joints.shape[:2]
+    empty = Reconstruction.empty([f"joint {j}" for j in range(J)])
+    rows = {name: np.zeros((N, *getattr(empty, name).shape[1:])) for name in empty.ROWS}
+    rows |= {"joints": joints, "velocity": velocity, "time_s": time_s, "frame": frame}
+    rows |= {"person": np.zeros(N, int), "known": np.full((N, J), Known.SEEN, np.uint8)}
+    rows |= {"status": np.full(N, Status.OK)}
+    return replace(empty, **rows)
+
+
+def test_between_keyframes_is_what_the_model_of_motion_says():
+    """Mean and covariance of a state between two that are known, by conditioning the model's own Gaussian."""
+    rng, frame, time_s = np.random.default_rng(0), np.array([7, 8, 9, 10]), np.array([0.2, 0.24, 0.3, 0.32])
+    ends = rng.normal(size=(2, 2, 1, 3)) * np.array([0.2, 2.0])[:, None, None, None]  # m, m/s
+    rows = moving(ends[0], ends[1], time_s[[0, 3]], frame[[0, 3]])
+    model = replace(MotionModel.load(("RWrist",)), psd_still=np.array([3.0]), psd_speed=np.zeros(1))
+    found = with_rows_between(rows, frame, time_s, np.array([True, False, False, True]), model)
+    assert found.frame.tolist() == frame.tolist()
+    for n in (1, 2):
+        first, second = time_s[n] - time_s[0], time_s[3] - time_s[n]
+        F, Q = (CONSTANT_VELOCITY.transition(dt) for dt in (first, second)), CONSTANT_VELOCITY.noise(first, 3.0)
+        before, after = F
+        start = before @ ends[:, 0, 0]
+        gain = Q @ after.T @ np.linalg.inv(after @ Q @ after.T + CONSTANT_VELOCITY.noise(second, 3.0))
+        mean, left = start + gain @ (ends[:, 1, 0] - after @ start), Q - gain @ after @ Q
+        np.testing.assert_allclose(found.joints[n, 0], mean[0], atol=1e-9)
+        np.testing.assert_allclose(found.velocity[n, 0], mean[1], atol=1e-9)
+        np.testing.assert_allclose(found.covariance[n, 0], left[0, 0] * np.eye(3), rtol=1e-6)
+        np.testing.assert_allclose(found.velocity_covariance[n, 0], left[1, 1] * np.eye(3), rtol=1e-6)
+    assert found.known.tolist() == [[Known.SEEN], [Known.MOTION], [Known.MOTION], [Known.SEEN]]
+
+
+def test_bodies_turn_evenly_between_keyframes():
+    """Once around in 0.8 s, past the angle at which rotation vectors jump; beside a row without a body is none."""
+    key_s, time_s = np.arange(9) * 0.1, np.arange(33) * 0.025
+    axis = np.array([0.6, 0.0, 0.8])
+
+    def bodies(at_s: np.ndarray) -> list[np.ndarray]:
+        turn = log_so3(exp_so3(at_s[:, None] / 0.8 * 2 * np.pi * axis))
+        pose = np.tile(turn[:, None], (1, 23, 1))
+        return [np.zeros((len(at_s), 10)), turn, pose, np.stack([at_s**2, at_s, 0 * at_s], axis=1)]
+
+    ok = np.ones(9, dtype=bool)
+    ok[6] = False
+    fine, found = bodies_between(ok, bodies(key_s), key_s, time_s)
+    assert np.flatnonzero(~fine).tolist() == list(range(21, 28))
+    apart = exp_so3(found[1][fine]).mT @ exp_so3(bodies(time_s[fine])[1])
+    assert np.linalg.norm(log_so3(apart), axis=-1).max() < 0.02  # 45 degrees a keyframe; a straight line: 0.05
+    inside = fine & (time_s > 0.1) & (time_s < 0.5)  # slopes at ends are of one side
+    np.testing.assert_allclose(found[3][inside], bodies(time_s[inside])[3], atol=1e-9)
+    np.testing.assert_allclose(found[2][fine][:, 4], found[1][fine], atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return built_in_scene(people=3, cameras=4, frames=46)
+
+
+@pytest.fixture(scope="module")
+def results(scene):
+    """By default, and fast."""
+    times = FrameTimes.from_fps(scene.fps, len(scene))
+    return [reconstruct(simulate(scene), scene.rig, config, times=times) for config in (PipelineConfig(), FAST)]
+
+
+def test_fast_finds_the_same_people_as_surely(scene, results):
+    """Everybody in every frame, with a body; as near to the truth but for a tenth, and no surer than right."""
+    accurate, fast = results
+    assert len(fast) == len(accurate) == 3 * 46
+    assert (fast.status == Status.OK).all()
+    key = fast.frame % 3 == 0
+    key |= fast.frame == 45
+    assert Known.observed(fast.known[key]).mean() > 0.9
+    assert not Known.observed(fast.known[~key]).any()
+    assert (fast.observations.candidate[~key] == -1).all()
+    errors = [joint_metrics(people, scene.keypoints) for people in results]
+    assert errors[1].f1 > errors[0].f1 - 0.01
+    assert errors[1].mpjpe_mm < 1.1 * errors[0].mpjpe_mm
+    matches = match_people(fast.frame, fast.joints, scene.keypoints)
+    between = ~key[matches.row]
+    error = fast.joints[matches.row] - scene.keypoints[matches.frame, matches.person]
+    inside = covariance_calibration(error[between], fast.covariance[matches.row[between]]).coverage
+    assert inside[0.95] > 0.93
+    assert inside[0.5] < 0.8
+
+
+def test_fast_is_the_same_with_processes(scene, results):
+    again = reconstruct(
+        simulate(scene),
+        scene.rig,
+        FAST,
+        times=FrameTimes.from_fps(scene.fps, len(scene)),
+        execution=Execution(workers=2),
+    )
+    for name in Reconstruction.ROWS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(results[1], name))
+
+
+def test_fast_results_are_solved_anew(scene, results):
+    """The same rows, where they were: what is between keyframes is carried again, and not solved from nothing."""
+    fast = results[1]
+    again = solve_rows(fast, Solver.of(fast, scene.rig))
+    np.testing.assert_array_equal(again.frame, fast.frame)
+    np.testing.assert_array_equal(again.person, fast.person)
+    assert (again.status == Status.OK).all()
+    assert np.nanmedian(np.linalg.norm(again.joints - fast.joints, axis=-1)) < 0.001
+    np.testing.assert_array_equal(again.known == Known.MOTION, fast.known == Known.MOTION)
