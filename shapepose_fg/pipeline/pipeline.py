@@ -69,7 +69,6 @@ def reconstruct(
     shapes: SubjectShapes | None = None,
     fitter: BodyFitter | None = None,
     extra_factors: ExtraFactors | None = None,
-    camera_factors: CameraFactors | None = None,
     execution: Execution | None = None,
 ) -> Reconstruction:
     """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
@@ -78,7 +77,7 @@ def reconstruct(
     without it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut:
     nothing carries over to them, identities least of all. `shapes` are people known from other recordings.
     `fitter` replaces the body fitter, and `extra_factors` adds factors of your own to every person's window.
-    Where cameras move, their trajectories are refined first (`refine_trajectories`), with your `camera_factors`.
+    Where cameras move, their trajectories are refined first, unless `refine_trajectories` has done so.
     `Trusted(detections, check_setup(detections, rig).trust)` leaves out cameras that contradict the others.
     `execution` says what runs it: processes, a cluster, chunks, who is told how far it is.
 
@@ -89,7 +88,7 @@ def reconstruct(
     ValueError where an argument does not fit the recording.
     """
     config = PipelineConfig() if config is None else config
-    task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors, camera_factors)
+    task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     return reconstruct_parts(InMemory(), task, execution).reconstruction(consume=True)
 
 
@@ -232,7 +231,8 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
         pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
         thinned = ThinnedFrames(pictures, len(rig), config.candidates)
         # What it has to say of people is said when they are followed again.
-        windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, Notebook())
+        every = np.arange(frames.start, frames.stop)
+        windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, every, Notebook())
         with book.stage("trajectories"):
             known = refine(windows, task.camera_factors)
         keep(kept, known)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.compiled core.errors core.moved",
-    "core.skeleton core.pieces core.lens core.trajectory",
+    "core.skeleton core.pieces core.assignment core.lens core.trajectory",
     "core.camera",
     "core.drawing",
     "core.storage.files core.bounds",
