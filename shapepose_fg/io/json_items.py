@@ -143,7 +143,7 @@ class _Text:
         line = self._lines + self._left.count("\n", 0, at) + 1
         begin = self._left.rfind("\n", 0, at)
         column = at - begin if begin >= 0 else self._column + at + 1
-        return not_json(self._path, line, column, problem, cut=self._over and not self._left[at:].strip())
+        return not_json(self._path, line, column, problem, rest=self._left[at:] if self._over else None)
 
     def _more(self) -> bool:
         """Read on, as much again as there is; whether there was more. What is decoded is forgotten."""

@@ -16,7 +16,7 @@ from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.tracking.stitching import StitchingConfig
-from shapepose_fg.tracking.tracker import TrackingConfig
+from shapepose_fg.tracking.tracker import SEARCH_S, TrackingConfig
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,6 @@ class PeopleConfig(Settings):
     min_new_joints: Count = 4
     """Core joints (trunk, arms, legs) that two views must see for a new person over time: less where furniture
     hides people. Frame by frame three are enough: evidence decides there."""
-    search_s: Seconds = 0.1
-    """New people over time are sought so often among what those who are followed leave, and followed back from
-    there; and every 0.33 s, or half as often as that, among all detections. More is faster, and finds fewer of
-    those who are hardly seen."""
     patience_s: Seconds = 0.5
     """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
     later is recognised by `stitching`."""
@@ -55,7 +51,7 @@ class WindowConfig(Settings):
     keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
     """People are followed and solved in frames at most so far apart (keyframes), and carried by motion through
     those between, whose detections are not used; 0: in every frame. Errors of detectors last longer than a frame,
-    so that little is lost."""
+    so that little is lost. New people are sought in every third of them, or every 0.1 s where that is longer."""
     again_over_time: RepeatsOrNone = 8
     """How often detections are reassociated around a draft of a window, at the most: it ends when hardly any
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
@@ -157,7 +153,6 @@ class PipelineConfig(Settings):
     def fast(cls) -> "PipelineConfig":
         """In keyframes only, eight to ten a second: half the time or less (docs/evaluation.md, "Presets")."""
         return cls(
-            people=PeopleConfig(search_s=0.35),
             windows=WindowConfig(keyframe_s=0.12),
             offsets=OffsetConfig(frames=10),
             batch_frames=288,
@@ -186,8 +181,8 @@ class PipelineConfig(Settings):
     @property
     def tracking(self) -> TrackingConfig:
         """People over time: how they are followed from frame to frame."""
-        own = self.people
-        return TrackingConfig(own.min_new_joints, own.patience_s, own.search_s)
+        own, every_third_s = self.people, 3 * self.windows.keyframe_s
+        return TrackingConfig(own.min_new_joints, own.patience_s, max(SEARCH_S, every_third_s))
 
     @property
     def window_graph(self) -> WindowGraphConfig:

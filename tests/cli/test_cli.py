@@ -505,7 +505,7 @@ def test_a_reader_that_stops_reading_is_no_error():
 
 
 def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("shapepose_fg.cli.reconstruct.run.read_detections", lambda *_: pytest.fail("it is read"))
+    monkeypatch.setattr("shapepose_fg.cli.reconstruct.run.read_recording", lambda *_: pytest.fail("it is read"))
     (tmp_path / "typo.toml").write_text("batch_frame = 3\n")
     for words, said in (
         (("--config", str(tmp_path / "typo.toml")), "typo.toml: batch_frame"),

@@ -88,7 +88,7 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
     )
     table = read_detections("out", rig)
     assert len(table) == 8 and table.skeleton.name == "COCO_18"
-    times = read_timestamps("out/times.csv", rig, 8)
+    times, _ = read_timestamps("out/times.csv", rig, 8)
     np.testing.assert_allclose(times.frame_s, np.arange(8) / 25, atol=1e-6)
     for t in range(8):
         expected, _ = rig.project(np.array([0.02 * (4 + 2 * t), 0.0, 1.0]))

@@ -81,7 +81,7 @@ def test_joints_are_found_where_each_lens_puts_them(rolled_rig, apart, pictures,
                 mine = found.xy[(found.view == view) & (found.joint == joint)]
                 # Cells are 8 to 9 pixels: a third of one.
                 assert np.linalg.norm(mine - xy[view, joint], axis=1).min(initial=99) < 3, (frame, view, joint)
-    assert read_timestamps(tmp_path / "times.csv", rolled_rig, FRAMES).time_s.tolist() == pytest.approx(
+    assert read_timestamps(tmp_path / "times.csv", rolled_rig, FRAMES)[0].time_s.tolist() == pytest.approx(
         [0, 0.04, 0.08, 0.12, 0.16]
     )
     used = read_used_footage(tmp_path / FOOTAGE)

@@ -208,8 +208,10 @@ def test_bad_text(tmp_path, text, sentence):
 
 
 def test_cut_file_names_its_last_line(tmp_path):
-    text = json.dumps(association(), indent=1)[:300].rstrip()
-    refuses(write(tmp_path, text), f"line {len(text.splitlines())} column", "the file ends too early")
+    whole = json.dumps(association() | {"yes": True, "no": -1.5e-7, "none": None}, indent=1)
+    for end in (*range(290, 310), *range(len(whole) - 50, len(whole) - 1)):
+        text = whole[:end].rstrip()
+        refuses(write(tmp_path, text), f"line {len(text.splitlines())} column", "the file ends too early")
 
 
 def test_missing_file_folder_and_pictures(tmp_path):

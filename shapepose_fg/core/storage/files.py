@@ -24,6 +24,8 @@ _MOST_DEPTH = 64
 _MOST_DOTS = 100
 """Dots in a line of TOML: the parser takes the square of a dotted key's parts."""
 _LONG_NUMBER = re.compile(r"\d{19}")
+_BROKEN_OFF = re.compile(r"(-|\.|[eE][+-]?|tr?u?|fa?l?s?|nu?l?)?\s*")
+"""What is left of a JSON text that ends within a number or a word, or between two values."""
 
 
 def open_regular(path: Path, cure: str = "check the path", most: int | None = None) -> BinaryIO:
@@ -131,7 +133,7 @@ def parse_json(text: str, path: Path) -> Any:
     try:
         value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
     except json.JSONDecodeError as error:
-        raise not_json(path, error.lineno, error.colno, error.msg, cut=error.pos >= len(text.rstrip())) from None
+        raise not_json(path, error.lineno, error.colno, error.msg, rest=text[error.pos :]) from None
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
@@ -144,8 +146,9 @@ def not_text(path: Path, byte: int) -> InputError:
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
 
 
-def not_json(path: Path, line: int, column: int, problem: str, *, cut: bool) -> InputError:
-    """An error about JSON text, at a line and column from 1; `cut` says that the text ends there."""
+def not_json(path: Path, line: int, column: int, problem: str, *, rest: str | None) -> InputError:
+    """An error about JSON text, at a line and column from 1; `rest` is the text from there on, if it is known."""
+    cut = rest is not None and (problem.startswith("Unterminated") or _BROKEN_OFF.fullmatch(rest))
     ends = " (the file ends too early)" if cut else ""
     return InputError(
         f"{path}: line {line} column {column} is not JSON: {problem}{ends};"
