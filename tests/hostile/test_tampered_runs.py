@@ -24,7 +24,8 @@ from tests.hostile import runs
 
 
 @pytest.fixture(scope="module")
-def task() -> Iterator[Task]:
+def task(dance) -> Iterator[Task]:
+    """The task; `dance`, which others share, is made before blocks are short."""
     with runs.short_blocks():
         yield runs.task(frames=36)
 

@@ -52,8 +52,9 @@ CUTS = (24,)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def short_blocks():
-    """So that following stands between two windows in the middle of a stretch, too."""
+def short_blocks(dance):
+    """So that following stands between two windows in the middle of a stretch, too; `dance`, which others share,
+    is made before."""
     before, following.BLOCK_S = following.BLOCK_S, 0.2
     yield
     following.BLOCK_S = before
