@@ -3,8 +3,9 @@
 Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstruction" and "Candidates Association").
 """
 
+import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Interval
@@ -12,8 +13,9 @@ from annotated_types import Interval
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Metres, Settings
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.pieces import project, solved
 
 _ANYWHERE_M = 10.0
 """A gate that no pair of rays in a room fails."""
@@ -108,21 +110,39 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
     The linear system is written in normalised image coordinates and solved for the inhomogeneous point. Points
     behind a camera, with a reprojection error above `gate_m` or with almost parallel rays are dropped.
     """
-    normalised = rig.normalise(detections.view, detections.xy)
-    first, second = _meeting(detections, rig, normalised, config)
-    xyz = _linear_points(rig, detections.view, normalised, first, second)
-    error_m = np.maximum(
-        _reprojection_error(rig, detections.view[first], normalised[first], xyz),
-        _reprojection_error(rig, detections.view[second], normalised[second], xyz),
-    )
-    keep = error_m < config.gate_m
-    first, second = first[keep], second[keep]
-    return PairPoints(
-        xyz=xyz[keep],
-        joint=detections.joint[first],
-        pair=np.stack([first, second], axis=1),
-        score=np.sqrt(detections.confidence[first] * detections.confidence[second]),
-    )
+    view, joint, *_ = detections.columns
+    by_joint = np.argsort(joint, kind="stable")
+    stop = np.searchsorted(joint[by_joint], joint[by_joint], side="right")
+    xy = rig.normalise(view, detections.xy)
+    P = rig.cTw[view]
+    rows = xy[:, :, None] * P[:, 2:3] - P[:, :2]
+    rays = np.einsum("dji,dj->di", P[:, :, :3], np.concatenate([xy, np.ones((len(view), 1))], axis=1))
+    seen = _Rays(view, xy, rays, np.linalg.norm(rays, axis=1), rows[..., :3].swapaxes(1, 2) @ rows)
+    limits = 2.0 * config.gate_m, float(np.sin(np.deg2rad(config.min_angle_deg))), config.gate_m
+    pair, xyz, count = np.empty((0, 2), dtype=np.intp), np.empty((0, 3)), 4 * len(view)
+    while count > len(pair):
+        pair, xyz = np.empty((count, 2), dtype=np.intp), np.empty((count, 3))
+        count = _triangulate(by_joint, stop, seen, rig.cTw, rig.centres, *limits, pair, xyz)
+    pair = pair[:count]
+    score = np.sqrt(detections.confidence[pair].prod(axis=1))
+    return PairPoints(xyz[:count], detections.joint[pair[:, 0]], pair, score)
+
+
+class _Rays(NamedTuple):
+    """Detections as triangulation takes them."""
+
+    of_view: Index
+    """(D,) index of the camera."""
+    xy: Array
+    """(D, 2) normalised image coordinates."""
+    ray: Array
+    """(D, 3) the way of the ray, in the world."""
+    length: Array
+    """(D,) of the ray."""
+    normal: Array
+    """(D, 3, 4) B^T (B, c), where (B, c) are the view's two rows of A: x P_3 - P_1 and y P_3 - P_2."""
+
+    kinds = "i1 f2 f2 f1 f3"
 
 
 def vote(points: PairPoints, detections: Detections, views: int, config: CandidateConfig) -> Candidates:
@@ -176,61 +196,42 @@ def _support(cluster: Index, detection: Index, detections: Detections) -> Index:
     return np.stack([cluster[first], detection[first]], axis=1)
 
 
-def _meeting(detections: Detections, rig: Rig, normalised: Array, config: CandidateConfig) -> tuple[Index, Index]:
-    """The pairs of detections of a joint in two views whose rays pass each other at less than twice the gate."""
-    view, joint, *_ = detections.columns
-    order = np.argsort(joint, kind="stable")
-    stop = np.searchsorted(joint[order], joint[order], side="right")
-    ahead = np.concatenate([normalised, np.ones((len(view), 1))], axis=1)
-    rays = np.einsum("dji,dj->di", rig.cTw[view, :, :3], ahead)
-    lengths, origins = np.linalg.norm(rays, axis=1), rig.centres[view]
-    pairs, count = np.empty((0, 2), dtype=np.intp), 4 * len(view)
-    while count > len(pairs):
-        pairs = np.empty((count, 2), dtype=np.intp)
-        limits = 2.0 * config.gate_m, float(np.sin(np.deg2rad(config.min_angle_deg)))
-        count = _pair_up(order, stop, view, rays, lengths, origins, *limits, pairs)
-    return pairs[:count, 0], pairs[:count, 1]
-
-
-@kernel("i1 i1 i1 f2 f1 f2 f0 f0 i2")
-def _pair_up(order, stop, view, rays, lengths, origins, gap_m, least_sine, pairs):
-    """Fill in `pairs`, as far as there is room; `order` (D,) is by joint, and each one's stops at `stop` (D,).
-
-    Returns how many there are.
+@kernel("i1 i1", _Rays, "f3 f2 f0 f0 f0 i2 f2")
+def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m, pair, xyz):
+    """Fill in `pair` and `xyz`, as far as there is room; `order` (D,) is by joint, and each one's stops at `stop`
+    (D,). Points are of rays that pass each other at less than `gap_m`. Returns how many there are.
     """
-    count = 0
+    count, x = 0, np.empty(3)
     for n in range(len(order)):
         for m in range(n + 1, stop[n]):
             i, j = order[n], order[m]
-            if view[i] == view[j]:
+            one, other, a, b = rays.of_view[i], rays.of_view[j], rays.ray[i], rays.ray[j]
+            if one == other:
                 continue
-            x = rays[i, 1] * rays[j, 2] - rays[i, 2] * rays[j, 1]
-            y = rays[i, 2] * rays[j, 0] - rays[i, 0] * rays[j, 2]
-            z = rays[i, 0] * rays[j, 1] - rays[i, 1] * rays[j, 0]
-            sine, gap = np.sqrt(x * x + y * y + z * z), x * (origins[j, 0] - origins[i, 0])
-            gap += y * (origins[j, 1] - origins[i, 1]) + z * (origins[j, 2] - origins[i, 2])
-            if abs(gap) < gap_m * sine and sine > least_sine * lengths[i] * lengths[j]:
-                if count < len(pairs):
-                    pairs[count, 0], pairs[count, 1] = i, j
+            across = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+            sine, gap = math.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2), 0.0
+            for axis in range(3):
+                gap += across[axis] * (centres[other, axis] - centres[one, axis])
+            if abs(gap) >= gap_m * sine or sine <= least_sine * rays.length[i] * rays.length[j]:
+                continue
+            A, B = rays.normal[i], rays.normal[j]
+            solved(
+                A[0, 0] + B[0, 0], A[0, 1] + B[0, 1], A[0, 2] + B[0, 2], A[1, 1] + B[1, 1], A[1, 2] + B[1, 2],
+                A[2, 2] + B[2, 2], -A[0, 3] - B[0, 3], -A[1, 3] - B[1, 3], -A[2, 3] - B[2, 3], x,
+            )  # fmt: skip
+            if _off_m(cameras[one], rays.xy[i], x) < gate_m and _off_m(cameras[other], rays.xy[j], x) < gate_m:
+                if count < len(pair):
+                    pair[count, 0], pair[count, 1] = i, j
+                    xyz[count] = x
                 count += 1
     return count
 
 
-def _linear_points(rig: Rig, view: Index, normalised: Array, first: Index, second: Index) -> Array:
-    """Solve A y = 0, two rows x P_3 - P_1 and y P_3 - P_2 a view, for y = (X, 1): (M, 3)."""
-    P = rig.cTw[view]
-    rows = normalised[:, :, None] * P[:, 2:3, :] - P[:, :2, :]
-    A = np.concatenate([rows[first], rows[second]], axis=1)
-    At = A[:, :, :3].transpose(0, 2, 1)
-    return np.asarray(np.linalg.solve(At @ A[:, :, :3], -At @ A[:, :, 3:])[:, :, 0], dtype=np.float64)
-
-
-def _reprojection_error(rig: Rig, view: Index, normalised: Array, xyz: Array) -> Array:
-    """Reprojection error (M,) as a length at the point's depth, metres; infinite behind the camera."""
-    P = rig.cTw[view]
-    camera = np.einsum("mij,mj->mi", P[:, :, :3], xyz) + P[:, :, 3]
-    error = np.hypot(*(camera[:, :2] - normalised * camera[:, 2:]).T)
-    return np.where(camera[:, 2] > 0, error, np.inf).astype(np.float64)
+@part
+def _off_m(camera, xy, x):
+    """The reprojection error as a length at the point's depth, metres; infinite behind the camera."""
+    u, v, depth = project(camera, x)
+    return math.hypot(u - xy[0], v - xy[1]) * depth if depth > 0 else math.inf
 
 
 def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
