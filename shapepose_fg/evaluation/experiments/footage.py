@@ -13,7 +13,7 @@ from shapepose_fg.evaluation.experiments.methods import initial_proposals
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.metrics import People
-from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import ACTORS, ShelfScore, evaluate_shelf, read_shelf_ground_truth
 from shapepose_fg.evaluation.single_person import (
     ANNOTATION,
     ARMS,
@@ -37,7 +37,6 @@ SHELF_COLUMNS = columns(
     ("all limbs", "pooled", 2), ("MPJPE, mm", "mpjpe_mm"), ("recall at 0.2 m, %", "recall", 2),
     ("people found", "found", 0),
 )  # fmt: skip
-LIMB_COLUMNS = columns(*((heading, heading, 0) for heading in ("actor 1", "actor 2", "actor 3", "lost")))
 ZHANG = {
     "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
     "Zhang et al. 2020, without time": (96.34, 92.11, 96.13, 94.86),
@@ -90,14 +89,6 @@ def shelf(scale: Scale) -> Experiment:
             figures = {f"actor_{n}": value for n, value in enumerate(actors, 1)} | {"average": average}
             rows[name] = [Case(name, partial(dict, figures))]
     return Experiment("shelf", rows, SHELF_COLUMNS)
-
-
-def shelf_limbs(scale: Scale) -> Experiment:
-    """How many of each actor's limbs are right, over time."""
-    rows = {}
-    if (folder := scale.recording("shelf")) is not None and not scale.quick:
-        rows = {name: [Case(name, partial(_limb, folder, n))] for n, name in enumerate(LIMB_NAMES)}
-    return Experiment("shelf limbs", rows, LIMB_COLUMNS)
 
 
 def views(scale: Scale) -> Experiment:
@@ -160,13 +151,6 @@ def _scores(folder: Path, name: str) -> Figures:
     shares = {"average": score.pcp_average, "pooled": score.pcp_pooled, "recall": 100 * score.recall}
     actors = {f"actor_{actor + 1}": float(score.pcp[actor]) for actor in ACTORS}
     return actors | shares | {"mpjpe_mm": score.mpjpe_mm, "found": score.people_found}
-
-
-def _limb(folder: Path, limb: int) -> Figures:
-    score = _score(folder, next(iter(_SHELF)))
-    right, count = score.limbs_right[:, limb], score.limbs_all[:, limb]
-    words = {f"actor {actor + 1}": f"{right[actor]} of {count[actor]}" for actor in ACTORS}
-    return words | {"lost": int(count.sum() - right.sum())}
 
 
 def _view(folder: Path, quick: bool, view: int) -> Figures:

@@ -8,7 +8,7 @@ from shapepose_fg.evaluation.experiments.methods import interactions
 from shapepose_fg.evaluation.experiments.scenes import Scale
 
 _EVERY = (
-    *(footage.shelf, footage.shelf_limbs, scenes.in_time, scenes.held_back, scenes.who_is_there),
+    *(footage.shelf, scenes.in_time, scenes.held_back, scenes.who_is_there),
     *(footage.views, footage.single, interactions, scenes.foreign),
 )
 
