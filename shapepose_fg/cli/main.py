@@ -101,15 +101,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 @evaluate.command("shelf")
 @grouped
 def evaluate_shelf_command(
-    results: Path = argument("RESULTS", "Folder of a reconstruction; 4D Association's text; TRC."),
+    results: Path = argument("RESULTS", "Folder of a reconstruction."),
     ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
     as_json: bool = json_option(),
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
-    from shapepose_fg.evaluation.other_results import read_people
-    from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.evaluation.shelf import evaluate_shelf
+    from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 
-    score = evaluate_shelf(read_people(results), read_shelf_ground_truth(ground_truth))
+    score = evaluate_shelf(Reconstruction.load(results), read_shelf_ground_truth(ground_truth))
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:

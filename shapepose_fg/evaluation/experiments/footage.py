@@ -13,7 +13,8 @@ from shapepose_fg.evaluation.experiments.methods import initial_proposals
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.metrics import People
-from shapepose_fg.evaluation.shelf import ACTORS, ShelfScore, evaluate_shelf, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import ACTORS, ShelfScore, evaluate_shelf
+from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 from shapepose_fg.evaluation.single_person import (
     ANNOTATION,
     ARMS,
