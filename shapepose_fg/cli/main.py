@@ -126,10 +126,10 @@ it saw the people are reconstructed, over time."""
 @app.command(rich_help_panel=_TRY)
 @grouped
 def demo(
-    output: Path = option(RESULT, "Folder for the result and the picture.", Path("demo")),
+    output: Path = option(RESULT, "Folder for the result.", Path("demo")),
     report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report"),
 ) -> None:
-    """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
+    """Reconstruct a built-in scene of four people and compare it with the truth."""
     prepare_output(output)
     print(DEMO, flush=True)
     from shapepose_fg.cli.demo import run_demo
