@@ -12,7 +12,7 @@ import scipy.sparse
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
-from shapepose_fg.body.shapes import SubjectShapes, read_body
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.core.camera import Rig
@@ -38,6 +38,7 @@ from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
+from tests.conftest import read_body
 from tests.core import test_reconstruction as results
 from tests.hostile import runs
 from tests.hostile.trying import Prepare
@@ -264,7 +265,7 @@ def _body(pickled: bool) -> Prepare:
 
 def tiny_body(seed: int) -> dict[str, np.ndarray]:
     """A body in SMPL's format with two vertices at each joint and keypoint of the shipped one, and no more."""
-    from shapepose_fg.body.shapes import read_body
+    from tests.conftest import read_body
 
     body, rng = read_body(), np.random.default_rng(seed)
     points = np.concatenate([body.joint_regressor, body.keypoint_regressor]) @ body.template
