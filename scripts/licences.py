@@ -16,7 +16,7 @@ PAGE = ROOT / "docs" / "licences.md"
 EXTRAS = ("detect", "export", "view", "archive", "cluster")
 HEAD = """# Licences of what is installed with it
 
-`pip install shapepose-fg` brings the first table, its extras the second, named as each package's own metadata do.
+`pip install shapepose-fg` brings the first list, its extras the second, named as each package's own metadata do.
 None asks that programs which use it be under its own licence. opencv-python-headless carries FFmpeg's libraries
 (LGPL-2.1) beside its own; they are separate files that may be exchanged.
 
@@ -75,8 +75,10 @@ def page() -> str:
     always, text = needed(()), HEAD
     more = {name: each for name, each in needed(EXTRAS).items() if name not in always}
     for title, rows in (("## Always", always), (f"## With the extras {', '.join(EXTRAS)}", more)):
-        lines = "".join(f"| {name} | {licence(each)} |\n" for name, each in rows.items())
-        text += f"\n{title}\n\n| package | licence |\n|---|---|\n{lines}"
+        under: dict[str, list[str]] = {}
+        for name, each in rows.items():
+            under.setdefault(licence(each), []).append(name)
+        text += f"\n{title}\n\n" + "".join(f"- {each}: {', '.join(under[each])}\n" for each in sorted(under))
     return text
 
 

@@ -11,6 +11,8 @@ import pytest
 from filelock import FileLock
 from numpy.typing import NDArray
 
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
@@ -139,3 +141,8 @@ def crowded(five_cameras, two_people) -> Detections:
                     affinity.append(rng.uniform(0.3, 1.0) if own else rng.uniform(0.0, 0.5))
     confidence = np.where(person >= 0, rng.uniform(0.3, 1.0, len(view)), rng.uniform(0.1, 0.6, len(view)))
     return Detections(view, joint, xy, confidence, np.array(pairs), np.array(affinity))
+
+
+def read_body() -> SmplArrays:
+    """The arrays of the open body."""
+    return BodyModel.default().arrays

@@ -1,15 +1,11 @@
 """Who somebody is, by the shape of the body, and how tall."""
 
-from pathlib import Path
-
 import numpy as np
 
-from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
+from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.shapes import SubjectShapes as SubjectShapes
-
-_OPEN_BODY = Path(__file__).with_name("data") / "open_body.npz"
 
 
 def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -> Index:
@@ -60,8 +56,3 @@ def statures_m(betas: Array, body: SmplArrays) -> Array:
     # No shape within three standard deviations moves a vertex past another that is 10 cm higher.
     ends = np.flatnonzero((up < up.min() + 0.1) | (up > up.max() - 0.1))
     return np.ptp(up[ends] + betas @ body.shapes[ends, 1].T, axis=1)
-
-
-def read_body(file: Path | None = None) -> SmplArrays:
-    """The arrays of a body model's file, by default of the open body that ships; loads no torch."""
-    return read_smpl_file(_OPEN_BODY if file is None else file)

@@ -101,15 +101,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 @evaluate.command("shelf")
 @grouped
 def evaluate_shelf_command(
-    results: Path = argument("RESULTS", "Folder of a reconstruction; 4D Association's text; TRC."),
+    results: Path = argument("RESULTS", "Folder of a reconstruction."),
     ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
     as_json: bool = json_option(),
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
-    from shapepose_fg.evaluation.other_results import read_people
-    from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+    from shapepose_fg.core.reconstruction import Reconstruction
+    from shapepose_fg.evaluation.shelf import evaluate_shelf
+    from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 
-    score = evaluate_shelf(read_people(results), read_shelf_ground_truth(ground_truth))
+    score = evaluate_shelf(Reconstruction.load(results), read_shelf_ground_truth(ground_truth))
     if as_json:
         print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
     else:
@@ -125,10 +126,10 @@ it saw the people are reconstructed, over time."""
 @app.command(rich_help_panel=_TRY)
 @grouped
 def demo(
-    output: Path = option(RESULT, "Folder for the result and the picture.", Path("demo")),
+    output: Path = option(RESULT, "Folder for the result.", Path("demo")),
     report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report"),
 ) -> None:
-    """Reconstruct a built-in scene of four people, compare it with the truth, and draw it."""
+    """Reconstruct a built-in scene of four people and compare it with the truth."""
     prepare_output(output)
     print(DEMO, flush=True)
     from shapepose_fg.cli.demo import run_demo

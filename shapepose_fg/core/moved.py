@@ -14,7 +14,7 @@ _ROOMS = {
     "core.storage": "files kept_arrays output_folder",
     "pipeline": "windows workers cluster solving bodies_over_time runs",
     "cli": "options terminal stopping demo batch",
-    "viz": "rendering overlay report viewer",
+    "viz": "rendering overlay report",
     "io": "export",
     "simulation": "training",
 }

@@ -5,7 +5,6 @@ No precision: not everyone in view is annotated, so a prediction without an anno
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import People, PlainPeople
-from shapepose_fg.evaluation.other_results import SHELF_JOINTS, read_skeleton_text
+from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS
 
 _LIMBS = {
     "left upper arm": ("LShoulder", "LElbow"),
@@ -39,15 +38,6 @@ ACTORS = (0, 1, 2)
 """The scored ids of the annotation: actors 1, 2 and 3."""
 MISSING_JOINT_M, RECALL_M = 0.5, 0.2
 """What a missing joint counts in the choice of a prediction; a joint is recalled when it is at most so far off."""
-
-
-def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
-    """Annotated people from the text format of the 4D Association Graph's Shelf data, in `SHELF_JOINTS`.
-
-    `person` 0, 1, 2 are the actors 1, 2, 3; others are not scored. InputError that names file and line for a
-    missing, malformed or truncated file.
-    """
-    return read_skeleton_text(Path(path), shelf=True)
 
 
 @dataclass(frozen=True)
@@ -166,10 +156,9 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
 def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
     """(G, 15) distances of the joints that annotated people (G, 15, 3) take, metres; NaN where there is none."""
     joints = np.asarray(people.joints, dtype=np.float64)
-    names = tuple(getattr(people, "joint_names", BODY_25.joints))
-    if names not in (SHELF_JOINTS, BODY_25.joints):
+    if tuple(getattr(people, "joint_names", BODY_25.joints)) != BODY_25.joints:
         raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
-    joints = joints if names == SHELF_JOINTS else shelf_joints(joints)
+    joints = shelf_joints(joints)
     person, row = np.nonzero(frame[:, None] == np.asarray(people.frame)[None, :])
     distance = np.linalg.norm(joints[row] - truth[person], axis=2)
     cost = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1)

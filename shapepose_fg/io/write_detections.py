@@ -55,12 +55,10 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         write_atomically(folder / "detection" / f"{camera.name}.txt", content)
 
 
-def write_openpose(
-    recording: DetectionSequence, rig: Rig, folder: str | Path, *, smallest_person: int = SMALLEST_PERSON
-) -> None:
+def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
     """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
 
-    Candidates are grouped by `group_people`; groups of fewer joints than `smallest_person` are false positives,
+    Candidates are grouped by `group_people`; groups of fewer joints than `SMALLEST_PERSON` are false positives,
     which such files leave out. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25
     or there is no frame; InputError where the folder of a camera already holds frames.
     """
@@ -71,7 +69,7 @@ def write_openpose(
         each.mkdir(parents=True, exist_ok=True)
     for frame in range(len(recording)):
         found = recording[frame]
-        people = [members for members in group_people(found) if len(members) >= smallest_person]
+        people = [members for members in group_people(found) if len(members) >= SMALLEST_PERSON]
         for view, (camera, each) in enumerate(zip(rig.cameras, folders, strict=True)):
             listed = []
             for members in people:

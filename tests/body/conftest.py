@@ -8,7 +8,7 @@ import pytest
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
-from shapepose_fg.body.shapes import read_body
+from tests.conftest import read_body
 
 NUM_VERTICES = 60
 

@@ -5,8 +5,9 @@ import pytest
 
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.shapes import SubjectShapes, read_body, recognise, statures_m
+from shapepose_fg.body.shapes import SubjectShapes, recognise, statures_m
 from shapepose_fg.core.errors import InputError
+from tests.conftest import read_body
 
 
 def two_shapes(body: str = "a body") -> SubjectShapes:

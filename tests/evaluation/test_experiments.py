@@ -126,7 +126,7 @@ def test_cases_are_asked_for_by_their_words(script, tmp_path, capsys, monkeypatc
     assert all(script.has_words(name, words) for words in ("crowd", "crowd 3 cameras", "6301 10 hz"))
     assert not any(script.has_words(name, words) for words in ("crossing", "crowd 30 Hz", "630"))
     assert script.has_words("crowd 0:300", "crowd 0") and not script.has_words("salsa 108:408", "crowd 0")
-    (tmp_path / "data" / "pose2sim_single").mkdir(parents=True)
+    (tmp_path / "data" / "cmu_mocap").mkdir(parents=True)
     words = ["--results", str(tmp_path), "--data", str(tmp_path), "--quick", "--seeds", "7"]
     script(*words, "--only", "who is there", "--list", "--cases", "people 7")
     assert "two people 7 2 cameras 30 Hz" in capsys.readouterr().out
@@ -141,14 +141,14 @@ def test_a_folder_without_recordings_is_named(script, tmp_path, capsys):
         script("--data", str(tmp_path / "nowhere"), "--only", "shelf", "--list")
     told = capsys.readouterr().err
     nowhere = tmp_path / "nowhere"
-    assert f"neither {nowhere} nor {nowhere / 'data'} has a folder shelf or pose2sim_single or cmu_mocap" in told
-    (tmp_path / "data" / "pose2sim_single").mkdir(parents=True)
+    assert f"neither {nowhere} nor {nowhere / 'data'} has a folder shelf or cmu_mocap" in told
+    (tmp_path / "data" / "cmu_mocap").mkdir(parents=True)
     for folder in (tmp_path, tmp_path / "data"):
-        script("--data", str(folder), "--only", "single", "--list")
-        assert "single" in capsys.readouterr().out
+        script("--data", str(folder), "--quick", "--only", "time", "--list")
+        assert "time" in capsys.readouterr().out
     with pytest.raises(SystemExit):
-        script("--data", str(tmp_path), "--only", "shelf", "--list")
-    assert f"{tmp_path / 'data'} has no shelf, cmu_mocap" in capsys.readouterr().err
+        script("--data", str(tmp_path), "--quick", "--only", "shelf", "--list")
+    assert f"{tmp_path / 'data'} has no shelf" in capsys.readouterr().err
 
 
 @pytest.mark.slow

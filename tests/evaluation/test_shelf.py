@@ -7,14 +7,8 @@ from rich.console import Console
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import PlainPeople
-from shapepose_fg.evaluation.other_results import SHELF_JOINTS
-from shapepose_fg.evaluation.shelf import (
-    LIMB_NAMES,
-    LIMBS,
-    evaluate_shelf,
-    read_shelf_ground_truth,
-    shelf_joints,
-)
+from shapepose_fg.evaluation.shelf import LIMB_NAMES, LIMBS, evaluate_shelf, shelf_joints
+from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS, read_shelf_ground_truth
 
 UPRIGHT = dict(
     RAnkle=(0.09, 0, 0.1),

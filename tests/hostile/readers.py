@@ -12,7 +12,7 @@ import scipy.sparse
 
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
-from shapepose_fg.body.shapes import SubjectShapes, read_body
+from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
 from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.core.camera import Rig
@@ -21,12 +21,11 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.opening import read_form
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.evaluation.other_results import read_people
+from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.io.export.markers import Markers, opensim_names, trc_text
 from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
@@ -39,6 +38,7 @@ from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
+from tests.conftest import read_body
 from tests.core import test_reconstruction as results
 from tests.hostile import runs
 from tests.hostile.trying import Prepare
@@ -265,7 +265,7 @@ def _body(pickled: bool) -> Prepare:
 
 def tiny_body(seed: int) -> dict[str, np.ndarray]:
     """A body in SMPL's format with two vertices at each joint and keypoint of the shipped one, and no more."""
-    from shapepose_fg.body.shapes import read_body
+    from tests.conftest import read_body
 
     body, rng = read_body(), np.random.default_rng(seed)
     points = np.concatenate([body.joint_regressor, body.keypoint_regressor]) @ body.template
@@ -301,26 +301,16 @@ def _rig(seed: int, cameras: int = 3) -> Rig:
     return ring_of_cameras(cameras, np.random.default_rng(seed))
 
 
-def _people_text(folder: Path, seed: int) -> Read:
-    path, rng = folder / "skel.txt", np.random.default_rng(seed)
-    joints = (15, 17, 19)[seed % 3]
-    lines = [f"{joints}\t2"]
+def _annotation(folder: Path, seed: int) -> Read:
+    path, rng = folder / "gt.txt", np.random.default_rng(seed)
+    lines = ["15\t2"]
     for count in (2, 1):
         lines.append(str(count))
         for person in range(count):
-            rows = np.concatenate([rng.normal(0, 1, (3, joints)), np.ones((1, joints))])
+            rows = np.concatenate([rng.normal(0, 1, (3, 15)), np.ones((1, 15))])
             lines += [str(person), *(" ".join(f"{value:10.6g}" for value in row) for row in rows)]
     path.write_text("\n".join(lines) + "\n")
-    return lambda: read_people(path)
-
-
-def _people_trc(folder: Path, seed: int) -> Read:
-    rng = np.random.default_rng(seed)
-    for person in range(2):
-        markers = Markers(opensim_names(BODY_25.joints), rng.normal(0, 1, (3, 25, 3)), np.zeros((3, 25)))
-        text = trc_text(markers, np.arange(3), np.arange(3) / 25, 25.0, f"P{person}.trc")
-        (folder / f"P{person}.trc").write_text(text)
-    return lambda: read_people(folder)
+    return lambda: read_shelf_ground_truth(path)
 
 
 PARTS: dict[str, tuple[int, dict[str, Any]]] = {
@@ -371,7 +361,6 @@ READERS: dict[str, Prepare] = {
     "body": _body(False),
     "pickled body": _body(True),
     "weights": _weights,
-    "people in 4D Association's text": _people_text,
-    "people in TRC": _people_trc,
+    "Shelf's annotation": _annotation,
 }
 """Every reader, by what it reads."""

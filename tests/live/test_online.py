@@ -191,6 +191,6 @@ def test_processes_of_their_own_settle_the_same_rows(start, dance, played):
         parts.append(live.settled(wait=True))
     settled = rows([*parts, live.finish()])
     assert np.array_equal(settled.frame, played.settled.frame)
-    # In `push` the refined bodies come back in the same frame, from other processes in a later one: a millimetre in
-    # the median, where joints are 15 mm from the truth and another person's half a metre.
+    # In `push` the refined bodies come back in the same frame, from other processes in a later one: a millimetre
+    # in the median, where joints are 15 mm from the truth and another person's half a metre.
     assert np.nanmedian(np.linalg.norm(settled.joints - played.settled.joints, axis=-1)) < 3e-3

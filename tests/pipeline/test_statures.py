@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg import reconstruct
-from shapepose_fg.body.shapes import read_body, statures_m
+from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.simulation.foreign import Proportions, recast
 from shapepose_fg.simulation.scene import Scene
+from tests.conftest import read_body
+from tests.foreign import Proportions, recast
 
 
 def fitted_m(scene: Scene) -> np.ndarray:

@@ -47,7 +47,7 @@ LEVELS = (
     "live",
     "simulation viz.bodies detection2d",
     "viz.overlay setup_check",
-    "viz.viewer calibration",
+    "calibration",
     "io.export",
     "viz.report",
     "evaluation",

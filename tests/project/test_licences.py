@@ -24,7 +24,8 @@ def script():
 
 def test_every_dependency_and_its_licence_is_listed():
     licences = script()
-    rows = dict(re.findall(r"^\| (\S+) \| (.+) \|$", licences.PAGE.read_text(encoding="utf-8"), re.MULTILINE))
+    lines = re.findall(r"^- (.+): (.+)$", licences.PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    rows = {name: licence for licence, names in lines for name in names.split(", ")}
     installed = licences.needed(licences.EXTRAS)  # of those, what is installed here
     assert {"torch", "numpy", "gtsam"} <= installed.keys()
     # Packages that only other systems or other builds of torch need may be missing here.

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.body.shapes import read_body, statures_m
+from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.listing import list_tracks
+from tests.conftest import read_body
 
 
 def walkers(sigma_m: float = 0.01) -> Reconstruction:

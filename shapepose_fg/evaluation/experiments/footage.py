@@ -1,7 +1,7 @@
-"""Real footage: Shelf by its annotation, and by cameras that are left out; Pose2Sim's recording of one man."""
+"""Real footage: Shelf by its annotation, and by cameras that are left out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -13,15 +13,8 @@ from shapepose_fg.evaluation.experiments.methods import initial_proposals
 from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.metrics import People
-from shapepose_fg.evaluation.shelf import ACTORS, LIMB_NAMES, ShelfScore, evaluate_shelf, read_shelf_ground_truth
-from shapepose_fg.evaluation.single_person import (
-    ANNOTATION,
-    ARMS,
-    SINGLE_FPS,
-    man_of,
-    measure_arms,
-    read_annotated_arms,
-)
+from shapepose_fg.evaluation.shelf import ACTORS, ShelfScore, evaluate_shelf
+from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 from shapepose_fg.evaluation.smplify import smpl_only
 from shapepose_fg.evaluation.tracking import body_joints
 from shapepose_fg.io.calibration import read_rig
@@ -37,48 +30,26 @@ SHELF_COLUMNS = columns(
     ("all limbs", "pooled", 2), ("MPJPE, mm", "mpjpe_mm"), ("recall at 0.2 m, %", "recall", 2),
     ("people found", "found", 0),
 )  # fmt: skip
-LIMB_COLUMNS = columns(*((heading, heading, 0) for heading in ("actor 1", "actor 2", "actor 3", "lost")))
 ZHANG = {
     "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
     "Zhang et al. 2020, without time": (96.34, 92.11, 96.13, 94.86),
 }
 """The strongest other method: what its results on these frames and detections score, actors 1 to 3 and Avg."""
-SINGLE_COLUMNS = columns(
-    ("frames with the man", "man_found", 0), ("of", "frames", 0),
-    *((f"{joint}, median error, mm", f"{joint}_mm", 0) for joint in ARMS),
-    ("further than 20 cm, %", "arms_wrong"), ("inside 50 %, %", "arms_inside_50"),
-    ("inside 95 %, %", "arms_inside_95"),
-)  # fmt: skip
-"""The last seven are of elbows and wrists that were annotated by hand."""
 
 
-@dataclass(frozen=True)
-class Footage:
-    """A real recording."""
-
-    rig: Rig
-    """Its cameras."""
-    detections: DetectionTable
-    """Of every frame."""
-    fps: float
-    """Frames a second."""
-
-    def reconstruct(self, config: PipelineConfig | None = None, frames: range | None = None) -> Reconstruction:
-        """Its people; only in `frames`, if given."""
-        times = FrameTimes.from_fps(self.fps, len(self.detections))
-        return reconstruct(self.detections, self.rig, config, frames=frames, times=times)
-
-
-def shelf_footage(folder: Path) -> Footage:
+def shelf_footage(folder: Path) -> tuple[Rig, DetectionTable]:
     """Shelf from its folder in the repository of Zhang et al. 2020. InputError where it is not that."""
     rig = read_rig(folder / "calibration.json")
-    return Footage(rig, read_detections(folder, rig), SHELF_FPS)
+    return rig, read_detections(folder, rig)
 
 
-def single_footage(folder: Path) -> Footage:
-    """Pose2Sim's demo recording, with its detections in OpenPose's format. InputError where it is not that."""
-    rig = read_rig(folder / "rig.json")
-    return Footage(rig, read_detections(folder / "openpose", rig), SINGLE_FPS)
+def _reconstructed(
+    folder: Path, config: PipelineConfig | None = None, frames: range | None = None
+) -> Reconstruction:
+    """Shelf's people; only in `frames`, if given."""
+    rig, detections = shelf_footage(folder)
+    times = FrameTimes.from_fps(SHELF_FPS, len(detections))
+    return reconstruct(detections, rig, config, frames=frames, times=times)
 
 
 def shelf(scale: Scale) -> Experiment:
@@ -92,46 +63,30 @@ def shelf(scale: Scale) -> Experiment:
     return Experiment("shelf", rows, SHELF_COLUMNS)
 
 
-def shelf_limbs(scale: Scale) -> Experiment:
-    """How many of each actor's limbs are right, over time."""
-    rows = {}
-    if (folder := scale.recording("shelf")) is not None and not scale.quick:
-        rows = {name: [Case(name, partial(_limb, folder, n))] for n, name in enumerate(LIMB_NAMES)}
-    return Experiment("shelf limbs", rows, LIMB_COLUMNS)
-
-
 def views(scale: Scale) -> Experiment:
     """Shelf solved without each of its cameras: what it saw against the 95 % regions of the rest."""
     rows = {}
     if (folder := scale.recording("shelf")) is not None:
-        names = shelf_footage(folder).rig.names
+        names = shelf_footage(folder)[0].names
         rows = {name: [Case(name, partial(_view, folder, scale.quick, n))] for n, name in enumerate(names)}
     headings = (("inside the 95 % region, %", "inside"), ("of its candidates", "of", 0))
     return Experiment("views", rows, columns(*headings, ("joints that the others do not place", "unmatched", 0)))
 
 
-def single(scale: Scale) -> Experiment:
-    """Pose2Sim's demo recording, whose truth is a few joints that were annotated by hand."""
-    rows = {}
-    if (folder := scale.recording("pose2sim_single")) is not None:
-        rows = {name: [Case(name, partial(_single, folder, scale.quick, mode))] for name, mode in MODES.items()}
-    return Experiment("single", rows, SINGLE_COLUMNS)
-
-
 @cache
 def _ours(folder: Path, mode: str) -> Reconstruction:
-    return shelf_footage(folder).reconstruct(MODES[mode])
+    return _reconstructed(folder, MODES[mode])
 
 
 def _smpl_only(folder: Path) -> People:
     """SMPL-only of the people and detections of ours frame by frame."""
     people = _ours(folder, "frame by frame")
-    return smpl_only(people, shelf_footage(folder).rig, FRAME_BY_FRAME.observations).people
+    return smpl_only(people, shelf_footage(folder)[0], FRAME_BY_FRAME.observations).people
 
 
 def _stage_one(folder: Path) -> People:
-    recording = shelf_footage(folder)
-    return initial_proposals(recording.detections, recording.rig, FRAME_BY_FRAME)
+    rig, detections = shelf_footage(folder)
+    return initial_proposals(detections, rig, FRAME_BY_FRAME)
 
 
 def _bodies(folder: Path) -> People:
@@ -162,37 +117,14 @@ def _scores(folder: Path, name: str) -> Figures:
     return actors | shares | {"mpjpe_mm": score.mpjpe_mm, "found": score.people_found}
 
 
-def _limb(folder: Path, limb: int) -> Figures:
-    score = _score(folder, next(iter(_SHELF)))
-    right, count = score.limbs_right[:, limb], score.limbs_all[:, limb]
-    words = {f"actor {actor + 1}": f"{right[actor]} of {count[actor]}" for actor in ACTORS}
-    return words | {"lost": int(count.sum() - right.sum())}
-
-
 def _view(folder: Path, quick: bool, view: int) -> Figures:
-    recording, people = shelf_footage(folder), _whole(folder, quick)
-    times = FrameTimes.from_fps(SHELF_FPS, len(recording.detections))
-    solve = partial(reconstruct, frames=_frames(recording, quick), times=times)
-    found = held_out(recording.detections, recording.rig, view, people, solve, OVER_TIME.observations)
+    (rig, detections), people = shelf_footage(folder), _whole(folder, quick)
+    times = FrameTimes.from_fps(SHELF_FPS, len(detections))
+    solve = partial(reconstruct, frames=QUICK if quick else None, times=times)
+    found = held_out(detections, rig, view, people, solve, OVER_TIME.observations)
     return {"inside": 100 * found.inside, "of": len(found.squared), "unmatched": found.unmatched}
 
 
 @cache
 def _whole(folder: Path, quick: bool) -> Reconstruction:
-    recording = shelf_footage(folder)
-    return recording.reconstruct(frames=_frames(recording, quick))
-
-
-def _single(folder: Path, quick: bool, config: PipelineConfig) -> Figures:
-    recording = single_footage(folder)
-    frames = _frames(recording, quick)
-    people = recording.reconstruct(config, frames)
-    his = people.rows(man_of(people, recording.rig))
-    figures = {"man_found": len(his), "frames": len(frames)}
-    if not ANNOTATION.is_file():  # it is not installed
-        return figures
-    return figures | measure_arms(his, read_annotated_arms(ANNOTATION, recording.rig).only(frames)).as_dict()
-
-
-def _frames(footage: Footage, quick: bool) -> range:
-    return range(len(footage.detections))[: len(QUICK) if quick else None]
+    return _reconstructed(folder, frames=QUICK if quick else None)

@@ -7,10 +7,7 @@ from shapepose_fg.evaluation.experiments.experiment import Experiment
 from shapepose_fg.evaluation.experiments.methods import interactions
 from shapepose_fg.evaluation.experiments.scenes import Scale
 
-_EVERY = (
-    *(footage.shelf, footage.shelf_limbs, scenes.in_time, scenes.held_back, scenes.who_is_there),
-    *(footage.views, footage.single, interactions, scenes.foreign),
-)
+_EVERY = (footage.shelf, scenes.in_time, scenes.held_back, scenes.who_is_there, footage.views, interactions)
 
 
 def experiments(scale: Scale) -> Iterator[Experiment]:

@@ -14,9 +14,8 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.tracking import score_tracks
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.simulation import DetectorConfig, Scene, simulate
+from shapepose_fg.simulation import Scene, simulate
 from shapepose_fg.simulation.files import named_scene, truth_of
-from shapepose_fg.simulation.foreign import DETECTOR_S_OWN, PEOPLE, people_of, recast
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, SequenceConfig, Split
 from shapepose_fg.simulation.training.motions import split_of
@@ -26,7 +25,7 @@ SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
     "tune": {"salsa": (0, 564), "crossing": (0, 564), "crowd": (241, 900)},
 }
 """Where the segments of the named sequences without a cut begin; each has 300 frames."""
-RECORDINGS = ("shelf", "pose2sim_single", "cmu_mocap")
+RECORDINGS = ("shelf", "cmu_mocap")
 """Folders of recordings and of recorded motions that experiments are of."""
 QUICK_FRAMES = 4
 """Frames of a scene that a quick run takes."""
@@ -52,10 +51,6 @@ class Segment:
     """What a sequence is made of, in place of the named one's."""
     fps: float | None = None
     """Frames a second; None: the scene's own."""
-    bodies: str | None = None
-    """Whose bodies: one of `simulation.foreign.PEOPLE`. None: those of the body that is fitted."""
-    own_joints: bool = False
-    """Whether the detector's joints lie elsewhere than the body's (`DETECTOR_S_OWN`)."""
     mocap: Path | None = field(default=None, compare=False)
     """The recorded motions; None: where SHAPEPOSE_DATA says."""
 
@@ -66,9 +61,8 @@ class Segment:
 
     @property
     def scene(self) -> Scene:
-        """The people, with the joints that the detector means, and the cameras."""
-        scene = _scene(self)
-        return scene.with_keypoint_offsets(DETECTOR_S_OWN) if self.own_joints else scene
+        """The people and the cameras."""
+        return _scene(self)
 
     @property
     def detections(self) -> DetectionSequence:
@@ -115,10 +109,6 @@ class Scale:
         begins = ((name, start) for name, starts in every for start in starts)
         return tuple(Segment(name, range(n, n + 300), self.split, mocap=self.mocap) for name, n in begins)
 
-    def one_each(self, frames: int) -> tuple[Segment, ...]:
-        """The first so many frames of the first segment of each sequence, for what takes long."""
-        return tuple(each.shorter(frames) for each in self.segments[::2])
-
     def recording(self, name: str) -> Path | None:
         """The folder of one of the `RECORDINGS`; None where there is none."""
         folder = None if self.data is None else self.data / name
@@ -144,14 +134,12 @@ def _scene(segment: Segment) -> Scene:
         fps=segment.fps,
         **own,
     )
-    scene = whole.part(segment.span)
-    return scene if segment.bodies is None else recast(scene, people_of(segment.bodies, scene.people))
+    return whole.part(segment.span)
 
 
 @lru_cache(maxsize=8)
 def _detections(segment: Segment) -> DetectionSequence:
-    offsets = DETECTOR_S_OWN if segment.own_joints else None
-    return simulate(_scene(segment), DetectorConfig(offsets=offsets), segment.seed)
+    return simulate(_scene(segment), seed=segment.seed)
 
 
 OVER_TIME = PipelineConfig()
@@ -167,11 +155,6 @@ COLUMNS = columns(
     ("v 95 %", "velocity_inside_95"), ("ms", "cpu_ms", 0),
 )  # fmt: skip
 """mm, m/s², cm, m/s; `u`: joints unseen for ten frames; ms: the processor's, a frame. Means over segments."""
-FOREIGN_COLUMNS = columns(
-    ("F1, %", "f1"), ("MPJPE, mm", "mpjpe_mm"), ("body: MPJPE, mm", "body_mpjpe_mm"),
-    ("two views: inside 95 %, %", "seen_inside_95"), ("one view", "one_view_inside_95"),
-    ("none", "no_view_inside_95"),
-)  # fmt: skip
 CLASSES = {"seen": "2 views", "one_view": "1", "no_view": "0", "unseen": "0 for ten frames"}
 THERE_COLUMNS = columns(
     ("F1, mean", "f1", 2), ("least", "f1", 2, "least"), ("IDF1, mean", "idf1", 2), ("least", "idf1", 2, "least"),
@@ -185,16 +168,6 @@ THERE_COLUMNS = columns(
         ("log score", f"{name}_log_score", 2), ("joints", f"joints_{name}", 0, "sum"),
     )
 )  # fmt: skip
-
-FOREIGN = {
-    "the body that is fitted": (PEOPLE[0], False),
-    "every bone of its own length, +-5 %": ("own bones", False),
-    "arms 15 % longer": ("long arms", False),
-    "children of 1.2 m": ("children", False),
-    "joints of the detector's own, 18 to 46 mm off": (PEOPLE[0], True),
-    "all of these": ("all of these", True),
-}
-"""Other people than those of the body that is fitted, and whether the detector has joints of its own."""
 HELD_BACK_SEED, HELD_BACK = 1001, {"salsa": 0, "crossing": 108, "crowd": 0}
 """Where the first 300 frames of each without a cut begin."""
 SECONDS, RATES, CAMERAS = 4.0, (10, 15, 20, 30, 60), (2, 3, 4, 6)
@@ -248,19 +221,6 @@ def held_back_segments(mocap: Path) -> list[Segment]:
         Segment(name, range(start, start + 300), seed=HELD_BACK_SEED, made=made[name], mocap=mocap)
         for name, start in HELD_BACK.items()
     ]
-
-
-def foreign(scale: Scale) -> Experiment:
-    """Truths with other bodies than the one that is fitted, and a detector with another skeleton."""
-    rows = {
-        label: [
-            case(f"{label} {each.label}", replace(each, bodies=bodies, own_joints=own_joints))
-            for each in scale.one_each(100)
-        ]
-        for label, (bodies, own_joints) in FOREIGN.items()
-        if not scale.quick or label == "all of these"
-    }
-    return Experiment("foreign", rows, FOREIGN_COLUMNS)
 
 
 def who_is_there(scale: Scale) -> Experiment:

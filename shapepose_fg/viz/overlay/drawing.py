@@ -91,7 +91,6 @@ def draw_bodies(
     vertices: Real,
     faces: Whole,
     colours: Sequence[Colour],
-    opacity: float = _OPACITY,
 ) -> Picture:
     """The surfaces `vertices` (P, Nv, 3), metres, in a colour each, lit from the camera."""
     if len(vertices) == 0:
@@ -107,7 +106,7 @@ def draw_bodies(
     light = 0.35 + 0.65 * np.clip(-(normal @ view.camera.wTc[:3, 2]), 0.0, 1.0)
     own = np.array(colours, dtype=np.float64)[met // len(faces)]
     drawn = picture.copy()
-    drawn[row, column] = ((1 - opacity) * picture[row, column] + opacity * light[:, None] * own).astype(np.uint8)
+    drawn[row, column] = ((1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own).astype(np.uint8)
     return drawn
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapepose_fg.body.shapes import read_body
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.simulation import Scene, built_in_scene
+from tests.conftest import read_body
 
 FRAMES, FPS, FIRST = 24, 25.0, 100
 AWAY = range(108, 116)

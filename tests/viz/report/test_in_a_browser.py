@@ -152,7 +152,7 @@ return at && Array.from(at);"""
 
 @pytest.fixture(scope="module")
 def arrays_kept():
-    from shapepose_fg.body.shapes import read_body
+    from tests.conftest import read_body
 
     arrays = read_body()
     return thinned(arrays.template, arrays.faces, CELL_M)[0]

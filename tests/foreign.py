@@ -1,4 +1,4 @@
-"""The same motions by people whose proportions the fitted model lacks; a detector with joints of its own."""
+"""The same motions by people whose proportions the fitted model lacks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,38 +8,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.performance import Figure
 from shapepose_fg.simulation.scene import Scene
 
-DETECTOR_S_OWN = KeypointOffsets.symmetric(
-    {
-        "LHip": (0.035, 0.03, 0.0),
-        "LShoulder": (0.01, -0.02, -0.01),
-        "Neck": (0.0, -0.03, 0.01),
-        "Nose": (0.0, 0.0, 0.02),
-        "LEar": (0.0, 0.01, -0.02),
-        "LKnee": (0.0, 0.02, 0.01),
-        "LElbow": (-0.015, 0.0, -0.01),
-        "LHeel": (0.0, 0.01, -0.02),
-    }
-)
-"""A detector with hips, shoulders, neck, face, elbows, knees and heels of its own: 18 to 46 mm off."""
-
-PEOPLE = ("the body that is fitted", "own bones", "long arms", "children", "all of these")
-"""Whom `people_of` knows; of the last, every second one is a child."""
-
 _STIFF_M = 0.01
 """A bone's frame is stretched along what joins it to the next joints; farther across than this it is not."""
 _CHILDREN = {bone: [joint for joint in range(24) if SMPL_PARENTS[joint] == bone] for bone in range(24)}
-_LEGS = ("left_knee", "left_ankle", "right_knee", "right_ankle")
-_ARMS = ("left_elbow", "left_wrist", "right_elbow", "right_wrist")
-_CHILD_M = 1.2
-"""Stature of a child of seven (CDC growth charts, 2000: the median is 1.22 m)."""
 
 
 class Proportions(NamedTuple):
@@ -49,43 +26,6 @@ class Proportions(NamedTuple):
     """(24,) factor of the distance of each of SMPL's joints from its parent."""
     girth: Array
     """(24,) factor of the size of each bone's flesh across."""
-
-
-def people_of(kind: str, count: int, seed: int = 0) -> list[Proportions]:
-    """The proportions of `count` people of one kind of `PEOPLE`; ValueError for any other.
-
-    Own bones are longer or shorter by their own share, left and right drawn apart. A child is about seven years
-    old, 1.2 m where the body is the mean adult. The head is a sixth of the stature, that of adults 1 / 7.5 or less
-    (Domljan et al. 2024); the hips are at half the stature, those of this adult at 52 %: children sit higher for
-    their stature (Snyder et al. 1977, UM-HSRI-77-17).
-    """
-    if kind not in PEOPLE:
-        raise ValueError(f"kind must be one of {', '.join(PEOPLE)}; got {kind}")
-    rng, usual = np.random.default_rng([seed, 24]), np.ones(24)
-    bones = [1 + rng.uniform(-0.05, 0.05, 24) for _ in range(count)]
-    arms = _scaled(usual, {joint: 1.15 for joint in _ARMS})
-    adult_m, hip_m = 1.70, 0.893
-    legs = dict.fromkeys(_LEGS, 0.5 * _CHILD_M / hip_m)
-    child = _scaled(np.full(24, 0.685), legs | {"head": 0.8, "neck": 0.69, "left_foot": 0.72, "right_foot": 0.72})
-    slight = _scaled(np.full(24, _CHILD_M / adult_m), {"head": (_CHILD_M / 6) / (adult_m / 7.6)})
-    kinds = [
-        [Proportions(usual, usual)] * count,
-        [Proportions(own, usual) for own in bones],
-        [Proportions(arms, usual)] * count,
-        [Proportions(child, slight)] * count,
-        [
-            Proportions(own * (child if place % 2 else arms), slight if place % 2 else usual)
-            for place, own in enumerate(bones)
-        ],
-    ]
-    return kinds[PEOPLE.index(kind)]
-
-
-def _scaled(factors: Array, own: dict[str, float]) -> Array:
-    """(24,) `factors` with those of some joints replaced."""
-    factors = factors.copy()
-    factors[[SMPL_24.index(joint) for joint in own]] = list(own.values())
-    return factors
 
 
 def reshaped(body: BodyModel, betas: Array, proportions: Sequence[Proportions]) -> tuple[BodyModel, Array]:

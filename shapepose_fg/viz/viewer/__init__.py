@@ -1,1 +1,0 @@
-"""The picture of one frame of a result."""
