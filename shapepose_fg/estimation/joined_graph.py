@@ -23,6 +23,8 @@ from shapepose_fg.estimation.linearisation import ObservationConfig, observation
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.trajectory_graph import dilution
 
+_MAP_S = 15.0
+"""Landmarks hold a map together for as long as a detector's errors last, and longer."""
 PoseKey = Callable[[str, int], int]
 """Key of the `Pose3`, world from carrier, of a trajectory's name in a frame."""
 
@@ -47,7 +49,7 @@ class JoinedPeople:
         """
         self._rig, self._pose_key = rig, pose_key
         self._config = ObservationConfig() if config is None else config
-        self._together, name = dilution(step_s), self._config.robust_kernel
+        self._together, name = dilution(step_s, _MAP_S), self._config.robust_kernel
         scale = np.sqrt(self._together)
         # A lasting error is no outlier: in pixels the kernel is as wide as for the detector's own sigma.
         kernel = robust_kernel(name, None if name is None else DEFAULT_WIDTH_SIGMA[name] / scale)
@@ -60,6 +62,8 @@ class JoinedPeople:
 
         ValueError where observations or times are missing.
         """
+        if len(people) == 0:
+            return
         if people.observations is None or not np.isfinite(people.time_s).all():
             raise ValueError(
                 "people need observations and times: reconstruct over time, and keep observations.npz"

@@ -38,7 +38,7 @@ def views(where: str | None, rig: Rig, skeleton: Skeleton, note: Callable[[str],
     InputError for a line that is none. On a socket `note` is told, and who sent it is cut off.
     """
     if where is not None and where.startswith("tcp:"):
-        yield from _from_socket(_listening(where), rig, skeleton, note)
+        yield from _from_socket(where, rig, skeleton, note)
     elif where is not None and where.endswith(".mcap"):
         yield from read_views(Path(where), rig, skeleton)
     else:
@@ -115,12 +115,10 @@ def _listening(where: str) -> socket.socket:
         ) from None
 
 
-def _from_socket(
-    listening: socket.socket, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]
-) -> Iterator[View]:
-    with ExitStack() as all_of_them, listening, selectors.DefaultSelector() as ready:
+def _from_socket(where: str, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]) -> Iterator[View]:
+    with ExitStack() as all_of_them, _listening(where) as listening, selectors.DefaultSelector() as ready:
         ready.register(listening, selectors.EVENT_READ)
-        heard: dict[socket.socket, bytes] = {}
+        heard, served = dict[socket.socket, bytes](), False
         while True:
             for key, _ in ready.select():
                 if key.fileobj is listening:
@@ -137,15 +135,17 @@ def _from_socket(
                         raise InputError(f"a line is longer than {_LONGEST_LINE} bytes")
                     for line in [*lines, rest] if given == b"" else lines:
                         if line.strip():
-                            yield read_view_line(line.decode(errors="replace"), "socket", rig, skeleton)
+                            view = read_view_line(line.decode(errors="replace"), where, rig, skeleton)
+                            served = True
+                            yield view
                 except (OSError, InputError) as error:
-                    note(f"{key.fd}: {error}; this sender is cut off")
+                    note(f"{error}; who sent it is cut off")
                     given = b""
                 if given == b"":
                     ready.unregister(client)
                     client.close()
                     del heard[client]
-                    if not heard:
+                    if served and not heard:
                         return
 
 

@@ -10,6 +10,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.io.detections.lines import view_of
 from shapepose_fg.io.ros.definitions import definition, type_name
 from shapepose_fg.io.ros.messages import (
@@ -87,7 +88,7 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton) -> Iterator[tuple[str, 
     InputError, one sentence, for a file that is none or holds no such message.
     """
     number = 0
-    with file.open("rb") as stream:
+    with open_regular(file, _CURE) as stream:
         for number, message in enumerate(_detections(stream, file), start=1):
             stamp = message.header.stamp
             people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
