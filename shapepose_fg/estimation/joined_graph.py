@@ -44,8 +44,8 @@ class JoinedPeople:
     ) -> None:
         """`rig` is the one that people were found with; its cameras with a `carrier` get their poses from your
         graph, all others stand still. `step_s` is from frame to frame, of those that are given: detectors' errors
-        last, so frames near each other count as less, and joints' covariances, given the poses, are too wide
-        rather than the poses' too narrow. `link_s` as in `PeopleInGraph`.
+        last, so frames near each other count as less, and joints' covariances, given the poses, are too wide.
+        `link_s` as in `PeopleInGraph`.
         """
         self._rig, self._pose_key = rig, pose_key
         self._config = ObservationConfig() if config is None else config
