@@ -7,6 +7,9 @@ a graph of your own. Units: metres in the world, pixels in the image; cameras lo
 
 from factors.body_prior import body_prior_factor, body_prior_factors
 from factors.contact import standing_factors
+from factors.graph_files import draw_graph, load_graph, save_graph
+from factors.joining import Increment, PeopleInGraph, PosedCamera, Sighting
+from factors.key_space import KeySpace
 from factors.keys import (
     CameraKey,
     JointKey,
@@ -71,10 +74,15 @@ __all__ = [
     "MEASURED_S",
     "MOTIONS",
     "CameraKey",
+    "Increment",
     "JointKey",
     "Kernel",
     "KernelName",
+    "KeySpace",
     "Motion",
+    "PeopleInGraph",
+    "PosedCamera",
+    "Sighting",
     "assert_jacobian",
     "assert_zero_at_truth",
     "body_prior_factor",
@@ -83,6 +91,7 @@ __all__ = [
     "camera_keys",
     "determined",
     "diagonal",
+    "draw_graph",
     "format_key",
     "gaussian",
     "in_front",
@@ -96,6 +105,7 @@ __all__ = [
     "lasting_blocks",
     "lasting_difference_factors",
     "lasting_prior_factors",
+    "load_graph",
     "make_calibration",
     "make_camera",
     "matrices",
@@ -114,6 +124,7 @@ __all__ = [
     "reported_keys",
     "robust",
     "robust_kernel",
+    "save_graph",
     "sigma_px",
     "split_camera_key",
     "split_key",

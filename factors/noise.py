@@ -17,7 +17,7 @@ KernelName = Literal["huber", "cauchy", "geman_mcclure", "tukey"]
 Kernel = noiseModel.mEstimator.Base
 """What the builders take as `kernel`: any of GTSAM's M-estimators (one object may serve many factors)."""
 
-_ESTIMATORS = {
+ESTIMATORS = {
     "huber": noiseModel.mEstimator.Huber,
     "cauchy": noiseModel.mEstimator.Cauchy,
     "geman_mcclure": noiseModel.mEstimator.GemanMcClure,
@@ -42,12 +42,12 @@ def robust_kernel(name: KernelName | None, width_sigma: float | None = None) -> 
     """
     if name is None:
         return None
-    if name not in _ESTIMATORS:
-        raise ValueError(f"kernel must be one of {', '.join(_ESTIMATORS)} or None, got {name!r}")
+    if name not in ESTIMATORS:
+        raise ValueError(f"kernel must be one of {', '.join(ESTIMATORS)} or None, got {name!r}")
     width = DEFAULT_WIDTH_SIGMA[name] if width_sigma is None else float(width_sigma)
     if not (np.isfinite(width) and width > 0):
         raise ValueError(f"width_sigma must be positive, got {width_sigma}")
-    return _ESTIMATORS[name].Create(width)
+    return ESTIMATORS[name].Create(width)
 
 
 def kernel_weight(

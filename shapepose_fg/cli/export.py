@@ -12,12 +12,12 @@ from shapepose_fg.core.storage.files import inside
 @grouped
 def export(
     take: TakeOptions,
-    formats: list[str] = argument("FORMAT...", "One or more of amass trc c3d bvh glb csv parquet rrd, or all."),
+    formats: list[str] = argument("FORMAT...", "Some of amass trc c3d bvh glb csv parquet mcap rrd, or all."),
     output: Path | None = option(RESULT, "Folder for the files; by default `export` in RESULTS."),
     markers: str = option(RESULT, "Of trc, c3d: opensim (Pose2Sim's), joints (ours), body (SMPL's).", "opensim"),
     fill_gaps: float = option(RESULT, "Holes up to this are filled in amass and bvh.", 0.2, metavar="SECONDS"),
 ) -> None:
-    """Write a result for other programs: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet rrd."""
+    """Write a result for others: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet mcap rrd."""
     from shapepose_fg.io.export.markers import MarkerSet
     from shapepose_fg.io.export.registry import FORMATS, chosen, export_result
 

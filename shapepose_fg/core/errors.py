@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from types import ModuleType
 
 _LONGEST = 1000
 """Characters of a message: what a file holds in place of a number can be of any length."""
@@ -39,3 +41,12 @@ def naming(place: object, cure: str = "") -> Iterator[None]:
         raise
     except ValueError as error:
         raise InputError(f"{place}: {error}{'; ' if cure else ''}{cure}") from None
+
+
+def optional(module: str, extra: str) -> ModuleType:
+    """A package of an extra; InputError with the command where it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise InputError(f'{package} is not installed; pip install "shapepose-fg[{extra}]"') from None

@@ -54,9 +54,11 @@ _LEAST = np.diag([1e-6**2] * 3 + [1e-5**2] * 3)
 """A carrier that stands still in an odometry that says so; rad and m."""
 
 
-def dilution(step_s: float) -> float:
-    """How many of the errors of one detection, of joints and of frames `step_s` apart, are one error."""
-    lags = np.arange(1, max(int(_AVERAGED_S / step_s), 1) + 1) * step_s
+def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
+    """How many of the errors of one detection, of joints and of frames `step_s` apart, are one error, where poses
+    up to `over_s` apart are known against each other better than by people.
+    """
+    lags = np.arange(1, max(int(over_s / step_s), 1) + 1) * step_s
     lasting = sum(share * np.exp(-lags / lasts).sum() for share, lasts in _ERRORS)
     return float(_SAME_PERSON * (1 + 2 * lasting))
 

@@ -1,12 +1,18 @@
 """`shapepose-fg live`: lines of detections in, lines of people out."""
 
 import json
+import socket
+import threading
+import time
 
 import numpy as np
 import pytest
 
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.ros.mcap_files import McapWriter
+from shapepose_fg.live.ends import _listening
 
 
 @pytest.fixture
@@ -63,3 +69,91 @@ def test_a_line_that_is_none_is_named(tmp_path, cameras, five_cameras, capsys, l
     assert ended.value.code == 2
     told = " ".join(capsys.readouterr().err.split())
     assert said in told and "line 1" in told and "Traceback" not in told
+
+
+def started(arguments: list[str]) -> threading.Thread:
+    """The command in a thread, which ends with its input."""
+
+    def run() -> None:
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def connected(port: int) -> socket.socket:
+    """To a command that is about to listen."""
+    for _ in range(600):
+        try:
+            return socket.create_connection(("127.0.0.1", port), timeout=60)
+        except ConnectionRefusedError:
+            time.sleep(0.1)
+    raise TimeoutError
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def test_detections_come_and_people_go_by_sockets(tmp_path, cameras, five_cameras, two_people, capsys):
+    inward, outward, text = free_port(), free_port(), lines(five_cameras, two_people, 8)
+    ends = ["--detections", f"tcp://:{inward}", "--output", f"tcp://:{outward}", "--workers", "1"]
+    thread = started(["live", "--calibration", cameras, *ends])
+    with connected(outward) as people, connected(inward) as sender:
+        with connected(inward) as stranger:  # who talks nonsense is cut off, the others go on
+            stranger.sendall(b"GET / HTTP/1.1\n")
+            assert stranger.recv(1) == b""
+        sender.sendall(text.encode())
+        sender.shutdown(socket.SHUT_WR)
+        told = [json.loads(line) for line in people.makefile()]
+    thread.join(timeout=60)
+    assert [each["time_s"] for each in told if each["kind"] == "now"] == pytest.approx(np.arange(8) / 10)
+    assert len(told[-1]["people"]) == 2
+    assert "cut off" in capsys.readouterr().err
+
+
+def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_people):
+    pytest.importorskip("mcap_ros2", reason='needs pip install "shapepose-fg[ros]"')
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    text, seen, out = lines(five_cameras, two_people, 8), tmp_path / "seen.mcap", tmp_path / "out.mcap"
+    with seen.open("wb") as stream, McapWriter(stream, None) as writer:
+        for line in map(json.loads, text.splitlines()):
+            flat = [each["pose_keypoints_2d"] for each in line["people"]]
+            writer.detections(line["camera"], flat, line["time_s"], five_cameras)
+    (tmp_path / "in.jsonl").write_text(text)
+    given = ["live", "--calibration", cameras, "--workers", "1", "--detections"]
+    for source, target in ((str(seen), str(out)), (str(tmp_path / "in.jsonl"), str(tmp_path / "out.jsonl"))):
+        with pytest.raises(SystemExit) as ended:
+            main([*given, source, "--output", target])
+        assert ended.value.code == 0
+    with out.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [
+            message for *_, message in reader.iter_decoded_messages(topics=["/people/now", "/people/settled"])
+        ]
+    told = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    for kind in ("now", "settled"):
+        mine = [each for each in found if each.kind == kind]
+        theirs = [each for each in told if each["kind"] == kind]
+        assert len(mine) == len(theirs) == 8
+        for here, there in zip(mine, theirs, strict=True):
+            joints = [np.reshape(list(each.joints), (25, 3)) for each in here.people]
+            # Lines have six digits, and stamps whole nanoseconds: times differ by less than one.
+            expected = [
+                np.array([[np.nan] * 3 if x is None else x for x in p["joints"]], float) for p in there["people"]
+            ]
+            np.testing.assert_allclose(joints, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_socket_listens_on_this_machine_only_unless_told_otherwise():
+    with _listening("tcp://:0") as own, _listening("tcp://0.0.0.0:0") as everybody:
+        assert own.getsockname()[0] == "127.0.0.1" and everybody.getsockname()[0] == "0.0.0.0"
+    for wrong in ("tcp://", "tcp://:70000", "tcp://:5000/way", "tcp://no.such.host.invalid:5000"):
+        with pytest.raises(InputError, match="cannot be listened on"):
+            _listening(wrong)

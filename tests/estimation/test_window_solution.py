@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import isotropic
+from factors import isotropic, load_graph, save_graph
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.window_solution import PersonGraph
@@ -127,3 +127,21 @@ def test_factors_of_ones_own_are_in_it(people, scene):
         at = np.array([solution.values.atPoint3(key) for key in solution.keys[:, WRIST].tolist()])
         np.testing.assert_allclose(at, solution.joints[:, WRIST], atol=1e-9)
         assert (np.abs(ratios(solution) - 1) < 0.05).mean() > 0.95
+
+
+def test_a_solved_graph_is_written_and_read_back(people, scene, tmp_path):
+    solution = solutions(people, scene)[0]
+    save_graph(tmp_path / "person.json", solution.graph, solution.values)
+    graph, values = load_graph(tmp_path / "person.json")
+    assert graph.size() == solution.graph.size() and values.equals(solution.values, 0.0)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        step = gtsam.VectorValues()
+        for key in values.keys():  # noqa: SIM118
+            step.insert(key, rng.normal(0, 0.05, 3))
+        at = values.retract(step)
+        assert graph.error(at) == pytest.approx(solution.graph.error(at), rel=1e-9)
+        gradients = [each.linearize(at).gradientAtZero() for each in (graph, solution.graph)]
+        apart = max(np.abs(gradients[0].at(key) - gradients[1].at(key)).max() for key in at.keys())  # noqa: SIM118
+        # Gradients sum what projections of 1e3 px/m and sigmas of a pixel say.
+        assert apart < 1e-9 * max(np.abs(gradients[1].at(key)).max() for key in at.keys())  # noqa: SIM118

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factors import camera_key, diagonal
+from factors import KeySpace, camera_key, diagonal, odometry_factors
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.estimation.joined_graph import JoinedPeople
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import reconstruct, refine_trajectories
 from shapepose_fg.pipeline.trajectories import keep, kept_rig, unrefined
@@ -163,6 +164,44 @@ def _order(made: Scene, people) -> tuple[int, int]:
     first = people.joints[people.person == people.person.min()][0]
     near = int(np.linalg.norm(first - made.people[0], axis=-1).mean(axis=-1).argmin())
     return near, 1 - near
+
+
+@pytest.mark.slow
+def test_people_join_a_graph_of_somebodys_own(drifted):
+    def key(carrier: str, frame: int) -> int:
+        assert carrier == "robot"
+        return gtsam.symbol("x", frame)
+
+    path, every = drifted.rig.trajectories[0], 5
+    taken = drifted.with_path(path.wTb, refined=True)
+    people = reconstruct(drifted.recording, taken, times=TIMES)
+    frames, space, graph, values = range(0, T, every), KeySpace("p"), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    at, keys = path.at(TIMES.time_s[frames]), [key("robot", frame) for frame in frames]
+    graph.addPriorPose3(keys[0], gtsam.Pose3(at[0]), diagonal([0.02] * 3 + [0.05] * 3))
+    for factor in odometry_factors(keys, at, path.drifted(at, TIMES.time_s[frames])):
+        graph.push_back(factor)
+    for one, pose in zip(keys, at, strict=True):
+        values.insert(one, gtsam.Pose3(pose))
+    given = people.rows(people.frame % every == 0)
+    joined = JoinedPeople(taken, space, key, step_s=every / FPS)
+    for frame, new in joined.increments(given):
+        assert frame in frames
+        graph.push_back(new.graph)
+        values.insert(new.values)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    true = drifted.true.at(TIMES.time_s[frames])
+    before = np.linalg.norm(at[:, :3, 3] - true[:, :3, 3], axis=1)
+    after = [
+        np.linalg.norm(found.atPose3(one).translation() - T[:3, 3]) for one, T in zip(keys, true, strict=True)
+    ]
+    assert np.mean(after) < 0.6 * before.mean()
+    joints = np.full(given.joints.shape, np.nan)
+    for row, (who, frame) in enumerate(zip(given.person.tolist(), given.frame.tolist(), strict=True)):
+        for joint, place in enumerate(space.positions(who, np.arange(25), frame).tolist()):
+            joints[row, joint] = found.atPoint3(place) if found.exists(place) else np.nan
+    assert np.isfinite(joints).mean() > 0.95
+    error = drifted.error_m(by_truth(drifted, replace(given, joints=joints)))
+    assert error < 0.9 * drifted.error_m(by_truth(drifted, given))
 
 
 @pytest.mark.slow

@@ -36,10 +36,16 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
     InputError naming the `place` of a line that is none.
     """
     line = validated(_Line, parse_json(text.strip(), Path(place)), place, _CURE)
-    if line.camera not in rig.names:
-        raise InputError(f"{place}: there is no camera {line.camera[:40]}; there are {', '.join(rig.names)}")
+    return view_of(line.camera, line.time_s, [one.pose_keypoints_2d for one in line.people], place, rig, skeleton)
+
+
+def view_of(
+    camera: str, time_s: float, flat: list[list[float]], place: str, rig: Rig, skeleton: Skeleton
+) -> tuple[str, Detections, float]:
+    """The same of people whose keypoints are x, y, score one after the other, in pixels of the picture."""
+    if camera not in rig.names:
+        raise InputError(f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}")
     K = skeleton.keypoint_count
-    flat = [person.pose_keypoints_2d for person in line.people]
     if any(len(each) != 3 * K for each in flat):
         wrong = next(len(each) for each in flat if len(each) != 3 * K)
         raise InputError(
@@ -50,5 +56,5 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
         raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; divide them")
     frame = np.zeros(len(flat), dtype=np.intp)
     view = joints_of_people(frame, keypoints, lambda score: np.minimum(score, 1.0), skeleton)
-    seen = undistorted(view, Path(place), rig.cameras[rig.names.index(line.camera)]).seen
-    return line.camera, seen, float(line.time_s)
+    seen = undistorted(view, Path(place), rig.cameras[rig.names.index(camera)]).seen
+    return camera, seen, float(time_s)

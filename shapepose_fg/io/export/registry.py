@@ -6,7 +6,6 @@ from enum import StrEnum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, get_args
 
 import numpy as np
@@ -84,15 +83,6 @@ class Written:
         return even
 
 
-def optional(module: str, extra: str) -> ModuleType:
-    """A package of an extra; InputError with the command where it is not installed."""
-    try:
-        return import_module(module)
-    except ImportError:
-        package = module.partition(".")[0]
-        raise InputError(f'{package} is not installed; pip install "shapepose-fg[{extra}]"') from None
-
-
 @dataclass(frozen=True)
 class Format:
     """One format of file."""
@@ -129,6 +119,7 @@ FORMATS = {
         Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
         Format("csv", "joints as a table", "tables:write_csv", **_ANYBODY),
         Format("parquet", "all columns, for archives", "tables:write_parquet", **_ANYBODY, rows=True),
+        Format("mcap", "ROS 2 messages, for rosbag2, RViz and Foxglove", "mcap:write_mcap"),
         Format(
             "rrd", "everything on a timeline, for the rerun viewer", "rerun_app:write_rrd", **_ANYBODY,
             observations=True,

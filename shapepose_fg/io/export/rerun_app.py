@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.io.export.registry import Job, Written, optional
+from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.rerun_log import camera_path, log_take, person_path
 from shapepose_fg.io.export.take import Take, y_up
 

@@ -14,9 +14,9 @@ from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
+from shapepose_fg.core.errors import optional
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known, sigma_m
-from shapepose_fg.io.export.registry import optional
 from shapepose_fg.io.export.skinned import motion_of, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage

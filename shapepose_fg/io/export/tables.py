@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.errors import optional
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, sigma_m
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.schema import code_names
-from shapepose_fg.io.export.registry import Job, Written, optional
+from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
 COLUMNS = (

@@ -54,7 +54,7 @@ def test_options(copied, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv parquet rrd"),
+        (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv parquet mcap rrd"),
         (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
         (["trc", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
@@ -198,3 +198,22 @@ def test_commands_load_no_torch(copied):
     code += "except SystemExit as end:\n    assert not end.code and 'torch' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+def test_mcap_has_a_message_of_each_frame_and_every_person(copied, result):
+    reader = pytest.importorskip("mcap.reader")
+    decoder = pytest.importorskip("mcap_ros2.decoder", reason='needs pip install "shapepose-fg[ros]"')
+    assert run("export", copied, "mcap") == 0
+    with (copied / "export" / "people.mcap").open("rb") as stream:
+        opened = reader.make_reader(stream, decoder_factories=[decoder.DecoderFactory()])
+        found = [each for *_, each in opened.iter_decoded_messages(topics=["/people/settled"])]
+    assert len(found) == FRAMES
+    for place, message in enumerate(found):
+        rows = result.rows(result.frame == FIRST + place)
+        assert [each.person for each in message.people] == rows.person.tolist()
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == round(rows.time_s[0] * 1e9)
+        for row, each in enumerate(message.people):
+            assert list(each.joints) == pytest.approx(rows.joints[row].ravel().tolist(), abs=0, nan_ok=True)
+            assert list(each.covariance) == pytest.approx(
+                rows.covariance[row].ravel().tolist(), abs=0, nan_ok=True
+            )

@@ -1,0 +1,88 @@
+"""The camera of a native factor, found from what it projects: GTSAM does not tell it."""
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.projection import make_calibration
+
+Array = NDArray[np.float64]
+Camera = gtsam.PinholeCameraCal3_S2
+
+_LEAST, _TRIED = 16, 4000
+"""So many points before the camera are enough, and so many are looked at, ever farther away."""
+_STEP = 1e-6
+_EXACT_PX = 1e-10
+
+
+def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | None:
+    """The pinhole camera that projects points (3,) as `pixel` does, which gives None for a point behind it.
+
+    Points around `near` (3,) are looked at. None where no such camera does, to 1e-10 of a picture's size.
+    """
+    rng, points, pixels = np.random.default_rng(0), list[Array](), list[Array]()
+    for count in range(_TRIED):
+        point = near + rng.normal(0, 1 + count / 40, 3)
+        uv = pixel(point)
+        if uv is not None:
+            points.append(point)
+            pixels.append(uv)
+        if len(points) == _LEAST:
+            break
+    else:
+        return None
+    X, uv = np.array(points), np.array(pixels)
+    camera = _of_matrix(_linear(X, uv))
+    for _ in range(4):
+        off = _seen(camera, X) - uv
+        if not np.isfinite(off).all():
+            return None
+        steps = np.eye(11) * _STEP * _scales(camera)
+        slopes = [(_seen(_moved(camera, d), X) - _seen(_moved(camera, -d), X)).ravel() / 2 for d in steps]
+        change = np.linalg.lstsq(np.stack(slopes, axis=1), -off.ravel(), rcond=None)[0]
+        camera = _moved(camera, change @ steps)
+    return camera if np.abs(_seen(camera, X) - uv).max() < _EXACT_PX * np.abs(uv).max() else None
+
+
+def _linear(X: Array, uv: Array) -> Array:
+    """(3, 4) K [R | t], but for a factor, with what makes u (p3 . X) - p1 . X and the like zero."""
+    middle, size = X.mean(axis=0), X.std()
+    centre, spread = uv.mean(axis=0), uv.std()
+    to_world = np.diag([1 / size] * 3 + [1.0])
+    to_world[:3, 3] = -middle / size
+    X1 = np.column_stack([(X - middle) / size, np.ones(len(X))])
+    x, y = ((uv - centre) / spread).T[..., None]
+    nothing = np.zeros_like(X1)
+    rows = np.vstack([np.hstack([X1, nothing, -x * X1]), np.hstack([nothing, X1, -y * X1])])
+    P = np.linalg.svd(rows)[2][-1].reshape(3, 4)
+    from_picture = np.array([[spread, 0, centre[0]], [0, spread, centre[1]], [0, 0, 1.0]])
+    P = from_picture @ P @ to_world
+    return P * np.sign((X @ P[2, :3] + P[2, 3]).mean()) / np.linalg.norm(P[2, :3])
+
+
+def _of_matrix(P: Array) -> Camera:
+    """Lens and pose: the rows of P[:, :3] = K R, from the last one up."""
+    Q, L = np.linalg.qr(P[::-1, :3].T)
+    signs = np.where(np.diag(L) < 0, -1.0, 1.0)
+    K, R = (L.T * signs)[::-1, ::-1], (Q * signs).T[::-1]
+    pose = gtsam.Pose3(gtsam.Rot3(R.T), -np.linalg.solve(P[:, :3], P[:, 3]))
+    return Camera(pose, make_calibration(K / K[2, 2]))
+
+
+def _scales(camera: Camera) -> Array:
+    """(11,) about how large a change of each of K's five numbers, the turn and the place is: px, rad, m."""
+    return np.array([camera.calibration().fx()] * 5 + [1.0] * 6)
+
+
+def _moved(camera: Camera, change: Array) -> Camera:
+    calibration = gtsam.Cal3_S2(*(camera.calibration().vector() + change[:5]))
+    return Camera(camera.pose().retract(change[5:]), calibration)
+
+
+def _seen(camera: Camera, X: Array) -> Array:
+    """(M, 2) pixels of points (M, 3)."""
+    cTw = np.linalg.inv(camera.pose().matrix())
+    ends = (X @ cTw[:3, :3].T + cTw[:3, 3]) @ camera.calibration().K().T
+    return ends[:, :2] / ends[:, 2:]

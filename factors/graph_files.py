@@ -1,0 +1,343 @@
+"""A graph and its values as a file of what they are made of, read back as the same native factors; and drawn.
+
+GTSAM's own `serialize` refuses graphs with `TriangulationFactor`, `WnoaMotionFactor` or `WnoaInterpFactor`, and
+its archives are not made for files of others. Here a factor is a record of numbers, in JSON:
+
+    {"kind": "projection", "keys": [5], "data": [uv, K, wTc], "noise": R, "kernel": ["huber", 1.5]}
+
+`noise` is the upper triangular R that whitens the residual, R r; `data` are the arrays that `_KINDS` lists.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import gtsam
+import numpy as np
+from gtsam import noiseModel
+from numpy.typing import NDArray
+
+from factors.camera_of import camera_of
+from factors.keys import format_key
+from factors.motion import contained
+from factors.noise import ESTIMATORS, robust
+from factors.projection import make_calibration, make_camera
+
+Array = NDArray[np.float64]
+
+FORMAT = "shapepose-fg graph 1"
+_CURE = "give a file that factors.save_graph wrote"
+_ROTATION_TOLERANCE = 1e-6
+_LARGEST = 1e15
+"""No number in a file is larger."""
+
+
+def save_graph(file: str | Path, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    """Write factors and values as `file`, JSON. ValueError, naming the factor or variable, for what is of no kind
+    that is known here: a Python function, a linearised factor on poses, a constraint.
+    """
+    writer = _Writer(values)
+    factors = [writer.record(n, graph.at(n)) for n in range(graph.size()) if graph.at(n) is not None]
+    lines = ",\n".join(map(json.dumps, factors))
+    text = f'{{"format": "{FORMAT}",\n"factors": [\n{lines}],\n"values": {json.dumps(writer.values())}}}\n'
+    Path(file).write_text(text, encoding="utf-8")
+
+
+def load_graph(file: str | Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Read what `save_graph` wrote, by anybody: numbers become factors, nothing is executed. ValueError, one
+    sentence, for anything else.
+    """
+    try:
+        content = json.loads(Path(file).read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: is no JSON text ({str(error)[:80]}); {_CURE}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f'{file}: is not of the format "{FORMAT}"; {_CURE}')
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    place = "values"
+    try:
+        for name, (shape, insert) in _VALUES.items():
+            for key, numbers in content["values"].get(name, []):
+                insert(values, _key(key), _array(numbers, shape))
+        for n, record in enumerate(content["factors"]):
+            place = f"factor {n}"
+            graph.push_back(_factor(record))
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
+        said = f"{error} is missing" if isinstance(error, KeyError) else str(error).strip().splitlines()[0]
+        raise ValueError(f"{file}: {place}: {said[:120]}; {_CURE}") from None
+    return graph, values
+
+
+def draw_graph(graph: gtsam.NonlinearFactorGraph, formatter: Callable[[int], str] = format_key) -> str:
+    """The graph in Graphviz' language, for `dot -Tsvg`: variables are ellipses, factors boxes with their kind."""
+    lines = ["graph {", "  overlap=false; node [fontsize=10];"]
+    lines += [f'  v{key} [label="{_quoted(formatter(key))}"];' for key in sorted(graph.keyVector())]
+    for n in range(graph.size()):
+        factor = graph.at(n)
+        if factor is not None:
+            name = _name(factor) or type(factor).__name__
+            lines.append(f'  f{n} [shape=box, style=filled, fillcolor=gray90, label="{_quoted(name)}"];')
+            lines += [f"  v{key} -- f{n};" for key in factor.keys()]  # noqa: SIM118
+    return "\n".join([*lines, "}\n"])
+
+
+def _quoted(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How factors of one class are written and made."""
+
+    of: type
+    """The class."""
+    keys: int
+    """How many variables."""
+    rows: int
+    """How many numbers the residual has."""
+    data: dict[str, tuple[int, ...]]
+    """Name and shape of each of its arrays."""
+    make: Callable[..., gtsam.NonlinearFactor]
+    """A factor of keys, arrays and noise."""
+
+
+def _triangulation(keys: list[int], uv: Array, K: Array, wTc: Array, noise: Any) -> gtsam.NonlinearFactor:
+    return gtsam.TriangulationFactorCal3_S2(make_camera(K, _pose(wTc).matrix()), uv, noise, keys[0])
+
+
+def _posed(keys: list[int], uv: Array, K: Array, bTc: Array, noise: Any) -> gtsam.NonlinearFactor:
+    pose, joint = keys
+    return gtsam.GenericProjectionFactorCal3_S2(uv, noise, pose, joint, make_calibration(K), _pose(bTc))
+
+
+def _motion(keys: list[int], dt: Array, density: Array, noise: Any) -> gtsam.NonlinearFactor:
+    del noise  # it follows from the others
+    if not (dt > 0 and (density > 0).all()):
+        raise ValueError("time and densities must be positive")
+    x, v, x_after, v_after = keys
+    before, after = gtsam.StateData(x, v, 0.0), gtsam.StateData(x_after, v_after, float(dt))
+    return gtsam.WnoaMotionFactorPoint3(before, after, density)
+
+
+def _plain(of: Any) -> Callable[..., gtsam.NonlinearFactor]:
+    """Makes factors of one measurement: a number, a point or a pose."""
+
+    def make(keys: list[int], measured: Array, noise: Any) -> gtsam.NonlinearFactor:
+        value: Any = _pose(measured) if measured.shape == (4, 4) else measured
+        return of(*keys, float(value) if measured.ndim == 0 else value, noise)
+
+    return make
+
+
+_SEEN = {"uv": (2,), "K": (3, 3), "pose": (4, 4)}
+_KINDS = {
+    "projection": _Kind(gtsam.TriangulationFactorCal3_S2, 1, 2, _SEEN, _triangulation),
+    "posed projection": _Kind(gtsam.GenericProjectionFactorCal3_S2, 2, 2, _SEEN, _posed),
+    "motion": _Kind(gtsam.WnoaMotionFactorPoint3, 4, 6, {"dt": (), "density": (3,)}, _motion),
+} | {
+    name: _Kind(of, keys, rows, {"measured": shape}, _plain(of))
+    for name, of, keys, rows, shape in (
+        ("prior point", gtsam.PriorFactorPoint3, 1, 3, (3,)),
+        ("prior pose", gtsam.PriorFactorPose3, 1, 6, (4, 4)),
+        ("between points", gtsam.BetweenFactorPoint3, 2, 3, (3,)),
+        ("between poses", gtsam.BetweenFactorPose3, 2, 6, (4, 4)),
+        ("range", gtsam.RangeFactor3, 2, 1, ()),
+    )
+}
+_LINEAR = "linear"
+"""A `LinearContainerFactor` on points: `data` are A and b of |A x - b|², as many keys and rows as they have."""
+_VALUES: dict[str, tuple[tuple[int, ...], Callable[[gtsam.Values, int, Array], None]]] = {
+    "point": ((3,), lambda values, key, x: values.insert(key, x)),
+    "pose": ((4, 4), lambda values, key, T: values.insert(key, _pose(T))),
+}
+
+
+def _name(factor: Any) -> str | None:
+    """Its kind; None of one that has none."""
+    if type(factor) is gtsam.LinearContainerFactor:
+        return _LINEAR
+    return next((name for name, kind in _KINDS.items() if type(factor) is kind.of), None)
+
+
+class _Writer:
+    """Records of the factors of a graph."""
+
+    def __init__(self, values: gtsam.Values) -> None:
+        self._values, self._cameras = values, list[gtsam.PinholeCameraCal3_S2]()
+
+    def record(self, number: int, factor: Any) -> dict[str, Any]:
+        name = _name(factor)
+        try:
+            if not all(map(self._values.exists, factor.keys())):
+                raise ValueError("has a variable that is not among the values")
+            if name is None:
+                raise ValueError("is of a class that has no record; linearise it (gtsam.LinearContainerFactor)")
+            found: dict[str, Any] = {"kind": name, "keys": list(factor.keys())}
+            if name == _LINEAR:
+                return found | _linear_data(factor)
+            found["data"] = [each.tolist() for each in self._data(name, factor)]
+            if name != "motion":
+                found |= _noise_data(factor.noiseModel())
+            for here, there in zip(
+                *(each.linearize(self._values).jacobian() for each in (factor, _factor(found))), strict=True
+            ):
+                if not np.abs(here - there).max() <= 1e-9 * max(np.abs(here).max(), 1.0):
+                    raise ValueError("would not be read back the same")
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"factor {number}, {type(factor).__name__}: {error}") from None
+        return found
+
+    def values(self) -> dict[str, list[Any]]:
+        """All variables, by their type."""
+        found: dict[str, list[Any]] = {name: [] for name in _VALUES}
+        for key in self._values.keys():  # noqa: SIM118
+            for name, get in (("point", self._values.atPoint3), ("pose", self._values.atPose3)):
+                try:
+                    value: Any = get(key)
+                except RuntimeError:
+                    continue
+                found[name].append([key, (value if name == "point" else value.matrix()).tolist()])
+                break
+            else:
+                raise ValueError(f"variable {format_key(key)} is neither Point3 nor Pose3: leave it out")
+        return found
+
+    def _data(self, name: str, factor: Any) -> Iterable[Array]:
+        if name in ("projection", "posed projection"):
+            camera = self._camera(factor, posed=name != "projection")
+            return factor.measured(), camera.calibration().K(), camera.pose().matrix()
+        if name == "motion":
+            at = gtsam.Values()
+            for key, x in zip(factor.keys(), (0.0, 1.0, 0.0, 0.0), strict=True):
+                at.insert(key, np.full(3, x))
+            dt = -np.asarray(factor.unwhitenedError(at))[0]  # r = [x' - x - dt v, v' - v] at v = 1
+            return np.array(dt), np.diag(factor.noiseModel().covariance())[3:] / dt
+        value = factor.prior() if name.startswith("prior") else factor.measured()
+        return [np.asarray(value.matrix() if isinstance(value, gtsam.Pose3) else value)]
+
+    def _camera(self, factor: Any, *, posed: bool) -> gtsam.PinholeCameraCal3_S2:
+        """That of a factor; of a posed one where its carrier is at the origin."""
+        *pose, key = factor.keys()
+        at, uv = gtsam.Values(), factor.measured()
+        near = self._values.atPoint3(key)
+        if posed:
+            at.insert(pose[0], gtsam.Pose3())
+            near = self._values.atPose3(pose[0]).transformTo(near)
+        at.insert(key, near)
+
+        def pixel(point: Array) -> Array | None:
+            at.update(key, point)
+            off = np.asarray(factor.unwhitenedError(at))
+            return None if off[0] == off[1] else off + uv  # behind the camera it is (2 fx, 2 fx)
+
+        points = near + np.array([[0.0, 0, 0], [0.3, 0.1, -0.2], [-0.2, 0.4, 0.1], [0.1, -0.3, 0.5]])
+        there = [pixel(each) for each in points]
+        for n, camera in enumerate(self._cameras):
+            if all(
+                uv is not None and np.abs(uv - camera.project(each)).max() < 1e-9
+                for each, uv in zip(points, there, strict=True)
+            ):
+                self._cameras.insert(0, self._cameras.pop(n))
+                return camera
+        found = camera_of(pixel, near)
+        if found is None:
+            raise ValueError("its camera could not be found")
+        self._cameras.insert(0, found)
+        return found
+
+
+def _noise_data(model: Any) -> dict[str, Any]:
+    """R and kernel of a noise model."""
+    kernel, base = None, model
+    if isinstance(model, noiseModel.Robust):
+        kernel, base = _kernel_data(model.robust()), cast(Any, model.noise())
+    if base is None or base.isConstrained():
+        raise ValueError("a constraint has no noise: give it a small one")
+    return {"noise": base.R().tolist()} | ({"kernel": kernel} if kernel is not None else {})
+
+
+def _kernel_data(kernel: Any) -> list[Any]:
+    """Name and width; GTSAM tells the width in its own text only, among other numbers."""
+    for name, made in ESTIMATORS.items():
+        if type(kernel) is made:
+            for word in kernel.serialize().split():
+                if "." in word and all(
+                    made.Create(float(word)).weight(r) == kernel.weight(r) for r in (0.7, 3, 30)
+                ):
+                    return [name, float(word)]
+    raise ValueError(f"a kernel must be one of {', '.join(ESTIMATORS)}")
+
+
+def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
+    """A linear factor on points, whitened, as it is linearised at zero: there it is the same as anywhere."""
+    origin, keys = gtsam.Values(), factor.keys()
+    for key in keys:
+        origin.insert(key, np.zeros(3))
+    linear = factor.linearize(origin) if factor.isJacobian() else None
+    A, b = linear.jacobian() if isinstance(linear, gtsam.JacobianFactor) else (np.zeros((0, 0)), np.zeros(0))
+    if A.shape[1] != 3 * len(keys):
+        raise ValueError("a linear factor must be a Jacobian on points: rotations turn what it was linearised at")
+    off = factor.error(origin) - (b @ b) / 2
+    if abs(off) > 1e-9 * max(b @ b, 1.0):
+        raise ValueError("has no point of linearisation, and so no error: make it with factors.motion.contained")
+    return {"data": [A.tolist(), b.tolist()]}
+
+
+def _factor(record: Any) -> gtsam.NonlinearFactor:
+    """From a record; ValueError and the like where it is none."""
+    kind, keys = _KINDS.get(record["kind"]), [_key(key) for key in record["keys"]]
+    if record["kind"] == _LINEAR:
+        return _linear(keys, *record["data"])
+    if kind is None:
+        raise ValueError(f"kind must be one of {', '.join(_KINDS)}, {_LINEAR}, got {str(record['kind'])[:40]!r}")
+    if len(keys) != kind.keys or len(record["data"]) != len(kind.data):
+        raise ValueError(f"needs {kind.keys} keys and {len(kind.data)} arrays: {', '.join(kind.data)}")
+    arrays = [_array(each, shape) for each, shape in zip(record["data"], kind.data.values(), strict=True)]
+    noise = None
+    if record["kind"] != "motion":
+        R = _array(record["noise"], (kind.rows, kind.rows))
+        if not (np.diag(R) > 0).all() or np.tril(R, -1).any():
+            raise ValueError("noise must be upper triangular with a positive diagonal")
+        noise = noiseModel.Gaussian.SqrtInformation(R)
+        if "kernel" in record:
+            name, width = record["kernel"]
+            if name not in ESTIMATORS or not 0 < float(width) < np.inf:
+                raise ValueError(f"kernel must be one of {', '.join(ESTIMATORS)}, with a positive width")
+            noise = robust(noise, ESTIMATORS[name].Create(float(width)))
+    return kind.make(keys, *arrays, noise)
+
+
+def _linear(keys: list[int], A: Any, b: Any) -> gtsam.NonlinearFactor:
+    rows = len(b)
+    if not (rows and keys) or len(set(keys)) < len(keys):
+        raise ValueError("needs rows, and keys that differ")
+    blocks = np.split(_array(A, (rows, 3 * len(keys))), len(keys), axis=1)
+    unit = noiseModel.Unit.Create(rows)
+    conditional = gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, _array(b, (rows,)), unit)
+    return contained([gtsam.JacobianFactor(conditional)], np.array(keys))[0]
+
+
+def _key(number: Any) -> int:
+    if type(number) is not int or not 0 <= number < 2**64:
+        raise ValueError(f"a key must be a whole number of 64 bits, got {str(number)[:40]}")
+    return number
+
+
+def _array(numbers: Any, shape: tuple[int, ...]) -> Array:
+    found = np.array(numbers, dtype=np.float64)
+    if found.shape != shape or not (np.abs(found) <= _LARGEST).all():
+        raise ValueError(f"numbers must be finite and of the shape {shape}, got {found.shape}")
+    return found
+
+
+def _pose(matrix: Array) -> gtsam.Pose3:
+    R = matrix[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise ValueError("a pose must be a rotation and a translation, with a last row 0 0 0 1")
+    return gtsam.Pose3(matrix)
+
+
+def _refuse(text: str) -> Iterator[None]:
+    raise ValueError(f"{text} is no number")

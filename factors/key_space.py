@@ -1,0 +1,101 @@
+"""Keys of people in a graph of yours: its owner says which keys are free, and people take no others."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors.keys import JointKey
+
+_PER_SYMBOL = 2**56
+"""Numbers behind a symbol's character."""
+_POSITION, _VELOCITY = 0, 1
+
+
+@dataclass(frozen=True)
+class KeySpace:
+    """The keys that people may have: those of a symbol's character, or a range of integers.
+
+        key = first + ((frame * people + person) * joints + joint) * 2 + kind
+
+    with the kind 0 for a position and 1 for a velocity. Identities wrap round at `people`: they are counted up
+    for ever, and no more are there at a time.
+    """
+
+    space: str | range
+    """A character, as in `gtsam.symbol("p", 0)`; or integers, with a step of 1."""
+    people: int = 1000
+    """So many identities are told apart."""
+    joints: int = 200
+    """So many joints may a person have."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.space, str):
+            if len(self.space) != 1 or not self.space.isascii() or not self.space.isprintable():
+                raise ValueError(f"space must be one ASCII character, such as 'p', or a range, got {self.space!r}")
+        elif self.space.step != 1 or not 0 <= self.space.start <= self.space.stop <= 2**63:
+            raise ValueError(f"space must be a character, or a range of step 1 within 0 to 2^63, got {self.space}")
+        if self.people < 1 or self.joints < 1:
+            raise ValueError(f"people and joints must be 1 or more, got {self.people} and {self.joints}")
+        if self.frames < 1:
+            raise ValueError(
+                f"space {self.space} is too small for one frame: give {self._per_frame} keys, or fewer people or"
+                " joints"
+            )
+
+    @property
+    def keys(self) -> range:
+        """All keys of the space."""
+        if isinstance(self.space, range):
+            return self.space
+        first = int(gtsam.symbol(self.space, 0))
+        return range(first, first + _PER_SYMBOL)
+
+    @property
+    def frames(self) -> int:
+        """How many frames have keys: frame numbers run from 0 to one less."""
+        return (self.keys.stop - self.keys.start) // self._per_frame
+
+    def positions(self, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
+        """Keys (...) of positions (`Point3`, metres, world); `joints` and `frames` broadcast. ValueError for a
+        number that has none.
+        """
+        return self._pack(_POSITION, person, joints, frames)
+
+    def velocities(self, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
+        """Keys (...) of velocities (`Point3`, metres per second, world)."""
+        return self._pack(_VELOCITY, person, joints, frames)
+
+    def split(self, key: int) -> JointKey:
+        """Who, which joint and when; ValueError for a key that is not of this space."""
+        rest, _ = divmod(int(key) - self.keys.start, 2)
+        if key not in self.keys or rest >= self.frames * self.people * self.joints:
+            raise ValueError(f"{gtsam.DefaultKeyFormatter(int(key))} is not a key of the space {self.space}")
+        rest, joint = divmod(rest, self.joints)
+        frame, person = divmod(rest, self.people)
+        return JointKey(person, joint, frame)
+
+    def format(self, key: int) -> str:
+        """Readable name of any key; goes where GTSAM takes a key formatter."""
+        try:
+            person, joint, frame = self.split(key)
+        except ValueError:
+            return gtsam.DefaultKeyFormatter(int(key))
+        kind = "velocity" if (int(key) - self.keys.start) % 2 == _VELOCITY else "position"
+        return f"{kind}(person {person}, joint {joint}, frame {frame})"
+
+    @property
+    def _per_frame(self) -> int:
+        return 2 * self.people * self.joints
+
+    def _pack(self, kind: int, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
+        joint, frame = (np.asarray(each, dtype=np.int64) for each in (joints, frames))
+        for name, value, count in (("joint", joint, self.joints), ("frame", frame, self.frames)):
+            if value.size and not (value.min() >= 0 and value.max() < count):
+                raise ValueError(
+                    f"{name} must be 0 to {count - 1} in this space, got {value.min()} to {value.max()};"
+                    " give a larger space"
+                )
+        row = (frame * self.people + int(person) % self.people) * self.joints + joint
+        return self.keys.start + row * 2 + kind

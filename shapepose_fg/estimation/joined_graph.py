@@ -1,0 +1,104 @@
+"""Reconstructed people for a graph of yours: who was seen where in which frame, as increments to it."""
+
+from collections.abc import Callable, Iterator
+
+import gtsam
+import numpy as np
+
+from factors import (
+    DEFAULT_WIDTH_SIGMA,
+    Increment,
+    KeySpace,
+    PeopleInGraph,
+    PosedCamera,
+    Sighting,
+    make_calibration,
+    make_camera,
+    robust_kernel,
+)
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.trajectory_graph import dilution
+
+_MAP_S = 15.0
+"""Landmarks hold a map together for as long as a detector's errors last, and longer."""
+PoseKey = Callable[[str, int], int]
+"""Key of the `Pose3`, world from carrier, of a trajectory's name in a frame."""
+
+
+class JoinedPeople:
+    """Turns rows of results, as they come, into factors and start values for a graph with the cameras' poses."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        space: KeySpace,
+        pose_key: PoseKey,
+        *,
+        step_s: float,
+        config: ObservationConfig | None = None,
+        link_s: float = 0.25,
+    ) -> None:
+        """`rig` is the one that people were found with; its cameras with a `carrier` get their poses from your
+        graph, all others stand still. `step_s` is from frame to frame, of those that are given: detectors' errors
+        last, so frames near each other count as less, and joints' covariances, given the poses, are too wide.
+        `link_s` as in `PeopleInGraph`.
+        """
+        self._rig, self._pose_key = rig, pose_key
+        self._config = ObservationConfig() if config is None else config
+        self._together, name = dilution(step_s, _MAP_S), self._config.robust_kernel
+        scale = np.sqrt(self._together)
+        # A lasting error is no outlier: in pixels the kernel is as wide as for the detector's own sigma.
+        kernel = robust_kernel(name, None if name is None else DEFAULT_WIDTH_SIGMA[name] / scale)
+        self._people = PeopleInGraph(space, kernel=kernel, link_s=link_s)
+        self._lenses = [make_calibration(camera.K) for camera in rig.cameras]
+        self._still = [make_camera(camera.K, camera.wTc) for camera in rig.cameras]
+
+    def increments(self, people: Reconstruction) -> Iterator[tuple[int, Increment]]:
+        """Frame number and increment of each frame of `people`, which has what it was solved from, in order.
+
+        ValueError where observations or times are missing.
+        """
+        if len(people) == 0:
+            return
+        if people.observations is None or not np.isfinite(people.time_s).all():
+            raise ValueError(
+                "people need observations and times: reconstruct over time, and keep observations.npz"
+            )
+        table, motion = people.observations, MotionModel.load(tuple(people.joint_names.tolist()))
+        # As much as what is seen: joints are smoothed as they would be if errors were new in each frame.
+        density = self._together * motion.density(np.linalg.norm(np.nan_to_num(people.velocity), axis=-1))
+        rows = table.observations(people.joints, people.time_s)
+        views = Views.of(self._rig, rows.time_s)
+        sigmas = np.sqrt(self._together) * observation_sigmas(
+            rows, people.joints, views, self._config, people.joint_names.tolist()
+        )
+        # Where a joint would have been seen at the row's time, by the camera where it was at its own.
+        xy = np.where(table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan)
+        for frame in np.unique(people.frame).tolist():
+            here = np.flatnonzero(people.frame == frame)
+            cameras = self._cameras(frame, rows.time_s[here[0]])
+            yield (
+                frame,
+                self._people.add(
+                    Sighting(
+                        int(people.person[n]), frame, float(people.time_s[n]), people.joints[n], xy[n], sigmas[n],
+                        density[n], cameras,
+                    )
+                    for n in here.tolist()
+                ),
+            )  # fmt: skip
+
+    def _cameras(self, frame: int, time_s: Array) -> list[gtsam.PinholeCameraCal3_S2 | PosedCamera]:
+        """The cameras of a frame whose views are of `time_s` (V,)."""
+        own, middle = self._rig.poses(time_s), np.full(1, time_s.mean())
+        cameras: list[gtsam.PinholeCameraCal3_S2 | PosedCamera] = list(self._still)
+        for view, on in enumerate(self._rig.carrier.tolist()):
+            if on >= 0:
+                carrier = self._rig.trajectories[on]
+                sensor = gtsam.Pose3(np.linalg.inv(carrier.at(middle)[0]) @ own[view])
+                cameras[view] = PosedCamera(self._lenses[view], self._pose_key(carrier.name, frame), sensor)
+        return cameras

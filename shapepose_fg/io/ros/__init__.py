@@ -1,0 +1,1 @@
+"""People and detections as ROS 2 messages, without ROS."""

@@ -1,0 +1,67 @@
+"""The fields of the ROS 2 messages that are written and read: those of ROS, and three of our own.
+
+ROS's are as in the distributions from Humble on; constants and comments do not change what is written.
+"""
+
+_FIELDS = {
+    "builtin_interfaces/Time": "int32 sec; uint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec; uint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp; string frame_id",
+    "std_msgs/ColorRGBA": "float32 r; float32 g; float32 b; float32 a",
+    "geometry_msgs/Vector3": "float64 x; float64 y; float64 z",
+    "geometry_msgs/Point": "float64 x; float64 y; float64 z",
+    "geometry_msgs/Quaternion": "float64 x; float64 y; float64 z; float64 w",
+    "geometry_msgs/Pose": "geometry_msgs/Point position; geometry_msgs/Quaternion orientation",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation; geometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header; string child_frame_id; geometry_msgs/Transform transform"
+    ),
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "sensor_msgs/RegionOfInterest": (
+        "uint32 x_offset; uint32 y_offset; uint32 height; uint32 width; bool do_rectify"
+    ),
+    "sensor_msgs/CameraInfo": (
+        "std_msgs/Header header; uint32 height; uint32 width; string distortion_model; float64[] d; float64[9] k;"
+        " float64[9] r; float64[12] p; uint32 binning_x; uint32 binning_y; sensor_msgs/RegionOfInterest roi"
+    ),
+    "sensor_msgs/CompressedImage": "std_msgs/Header header; string format; uint8[] data",
+    "visualization_msgs/UVCoordinate": "float32 u; float32 v",
+    "visualization_msgs/MeshFile": "string filename; uint8[] data",
+    "visualization_msgs/Marker": (
+        "std_msgs/Header header; string ns; int32 id; int32 type; int32 action; geometry_msgs/Pose pose;"
+        " geometry_msgs/Vector3 scale; std_msgs/ColorRGBA color; builtin_interfaces/Duration lifetime;"
+        " bool frame_locked; geometry_msgs/Point[] points; std_msgs/ColorRGBA[] colors; string texture_resource;"
+        " sensor_msgs/CompressedImage texture; visualization_msgs/UVCoordinate[] uv_coordinates; string text;"
+        " string mesh_resource; visualization_msgs/MeshFile mesh_file; bool mesh_use_embedded_materials"
+    ),
+    "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers",
+    "shapepose_msgs/Person": (
+        "int64 person; string status; float64[] joints; float64[] covariance; float64[] velocity;"
+        " float64[] velocity_covariance; uint8[] known; float64[] betas; float64[] global_orient;"
+        " float64[] body_pose; float64[] transl"
+    ),
+    "shapepose_msgs/People": (
+        "std_msgs/Header header; string kind; string[] joint_names; shapepose_msgs/Person[] people"
+    ),
+    "shapepose_msgs/Keypoints": "float64[] pose_keypoints_2d",
+    "shapepose_msgs/Detections": "std_msgs/Header header; string camera; shapepose_msgs/Keypoints[] people",
+}
+
+
+def definition(name: str) -> str:
+    """The text of a message and of all messages in it, as MCAP files hold it; `name` is package/Message."""
+    order = [name]
+    for each in order:
+        inner = (field.split()[0].partition("[")[0] for field in _FIELDS[each].split(";"))
+        order += [other for other in inner if other in _FIELDS and other not in order]
+    texts = ["\n".join(field.strip() for field in _FIELDS[each].split(";")) + "\n" for each in order]
+    apart = "=" * 80 + "\n"
+    return texts[0] + "".join(
+        f"{apart}MSG: {each}\n{text}" for each, text in zip(order[1:], texts[1:], strict=True)
+    )
+
+
+def type_name(name: str) -> str:
+    """package/msg/Message, as ROS 2 calls it."""
+    package, message = name.split("/")
+    return f"{package}/msg/{message}"

@@ -1,0 +1,116 @@
+"""MCAP files of ROS 2 messages: people written, detections read, without a ROS installation."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.errors import InputError, optional
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.io.detections.lines import view_of
+from shapepose_fg.io.ros.definitions import definition, type_name
+from shapepose_fg.io.ros.messages import (
+    NS,
+    Message,
+    body_transforms,
+    camera_info,
+    carrier_transforms,
+    fixed_transforms,
+    header,
+    markers,
+    nanoseconds,
+    optical,
+    people_message,
+    ros_name,
+)
+
+_DETECTIONS = "shapepose_msgs/Detections"
+_LASTS_S = 0.2
+"""Markers of who is seen no more stay so long."""
+_CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
+
+
+class McapWriter:
+    """Writes people frame by frame; a context: without its end a file has no index."""
+
+    def __init__(self, stream: IO[bytes], rig: Rig | None) -> None:
+        self._file = optional("mcap_ros2.writer", "ros").Writer(stream)
+        self._schemas: dict[str, Any] = {}
+        self._rig, self._begun = rig, False
+
+    def __enter__(self) -> "McapWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.finish()
+
+    def frame(self, rows: Reconstruction, time_s: float, kind: str = "settled") -> None:
+        """The people of one moment: /people, /people/markers, /tf; before the first one cameras, /tf_static."""
+        if not self._begun and self._rig is not None:
+            self._message("/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s), time_s)
+            for camera in self._rig.cameras:
+                topic = f"/{ros_name(camera.name)}/camera_info"
+                self._message(topic, "sensor_msgs/CameraInfo", camera_info(camera, time_s), time_s)
+        self._begun = True
+        here = f"/people/{kind}"
+        self._message(here, "shapepose_msgs/People", people_message(rows, kind, time_s), time_s)
+        shown = markers(rows, time_s, _LASTS_S)
+        self._message(f"{here}/markers", "visualization_msgs/MarkerArray", shown, time_s)
+        moved = body_transforms(rows, time_s)["transforms"]
+        if self._rig is not None:
+            moved += carrier_transforms(self._rig, time_s)["transforms"]
+        # One place for a body at a time: the refined one, where both are written.
+        if moved and kind != "now":
+            self._message("/tf", "tf2_msgs/TFMessage", {"transforms": moved}, time_s)
+
+    def detections(self, camera: str, seen: list[list[float]], time_s: float, rig: Rig) -> None:
+        """What one camera's detector saw: x, y, score of each keypoint, of each person, in picture pixels."""
+        which = rig.cameras[rig.names.index(camera)]
+        people = [{"pose_keypoints_2d": each} for each in seen]
+        message = {"header": header(optical(which), time_s), "camera": camera, "people": people}
+        self._message(f"/{ros_name(camera)}/detections", _DETECTIONS, message, time_s)
+
+    def _message(self, topic: str, kind: str, message: Message, time_s: float) -> None:
+        if kind not in self._schemas:
+            self._schemas[kind] = self._file.register_msgdef(type_name(kind), definition(kind))
+        self._file.write_message(topic, self._schemas[kind], message, log_time=nanoseconds(time_s))
+
+
+def read_views(file: Path, rig: Rig, skeleton: Skeleton) -> Iterator[tuple[str, Detections, float]]:
+    """What cameras saw, in the order in which it was logged: camera, detections, and when, seconds, by its stamp.
+
+    InputError, one sentence, for a file that is none or holds no such message.
+    """
+    number = 0
+    with open_regular(file, _CURE) as stream:
+        for number, message in enumerate(_detections(stream, file), start=1):
+            stamp = message.header.stamp
+            people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
+            time_s = (stamp.sec * NS + stamp.nanosec) / NS
+            yield view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
+    if number == 0:
+        raise InputError(f"{file}: there is no detection in it; {_CURE}")
+
+
+def _detections(stream: IO[bytes], file: Path) -> Iterator[Any]:
+    """Messages with detections; what is wrong with the file as an InputError."""
+    make, factory = (
+        optional("mcap.reader", "ros").make_reader,
+        optional("mcap_ros2.decoder", "ros").DecoderFactory(),
+    )
+    try:
+        for schema, channel, message in make(stream).iter_messages():
+            if schema is not None and schema.name == type_name(_DETECTIONS):
+                decode = factory.decoder_for(channel.message_encoding, schema)
+                if decode is None:
+                    raise ValueError(f"its encoding is {channel.message_encoding}")
+                yield decode(message.data)
+    except Exception as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
+        said = f"{type(error).__name__}: {str(error).strip()[:80]}"
+        raise InputError(f"{file}: cannot be read ({said}); {_CURE}") from None

@@ -1,0 +1,182 @@
+"""Rows of a result, and cameras, as the contents of ROS 2 messages.
+
+Frames are REP 103's and 105's: `map` has z up and holds `world`, the calibration's; `<camera>_optical` is a
+camera's, z forward; `body_<identity>` is a person's, x to the front and z to the head, at the middle of the hips.
+Stamps are the clock of the pictures.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.drawing import bones_of, colour_of
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.reconstruction import Reconstruction
+
+Message = dict[str, Any]
+MAP, WORLD = "map", "world"
+NS = 1_000_000_000
+"""Nanoseconds of a second."""
+_LAST_S = 2**31
+"""A stamp's seconds are 32 bits."""
+_SPHERES, _LINES = 7, 5
+"""`SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker."""
+_JOINT_M, _BONE_M = 0.05, 0.03
+_BODY_FROM_FRONT = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+"""Columns: SMPL's axes (x left, y up, z front) of a frame whose x is front, y left and z up."""
+_LENSES = {4: "equidistant", 5: "plumb_bob"}
+"""By the number of coefficients; those with more are `rational_polynomial`."""
+
+
+def nanoseconds(time_s: float) -> int:
+    """A time as the log of an MCAP file has it; InputError before 1970 and after 2038."""
+    if not 0 <= time_s < _LAST_S:
+        raise InputError(f"time {time_s:g} s: ROS's clocks run from 0 to 2^31 s; give times from 0 on")
+    return round(time_s * NS)
+
+
+def header(frame_id: str, time_s: float) -> Message:
+    """std_msgs/Header."""
+    sec, nanosec = divmod(nanoseconds(time_s), NS)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
+
+
+def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
+    """shapepose_msgs/People: one moment's rows, the arrays of people.npz, flat, NaN where unknown."""
+    names = "joints covariance velocity velocity_covariance betas global_orient body_pose transl".split()
+    people = [
+        {"person": int(rows.person[n]), "status": str(rows.status[n]), "known": rows.known[n].tolist()}
+        | {name: getattr(rows, name)[n].ravel().tolist() for name in names}
+        for n in range(len(rows))
+    ]
+    return {
+        "header": header(WORLD, time_s),
+        "kind": kind,
+        "joint_names": rows.joint_names.tolist(),
+        "people": people,
+    }
+
+
+def body_transforms(rows: Reconstruction, time_s: float) -> Message:
+    """tf2_msgs/TFMessage: `body_<identity>` of everybody whose hips are placed and whose body is known."""
+    from scipy.spatial.transform import Rotation
+
+    made = []
+    for n in range(len(rows)):
+        hips, turn = _hips(rows, n), rows.global_orient[n]
+        if np.isfinite(hips).all() and np.isfinite(turn).all():
+            R = Rotation.from_rotvec(turn).as_matrix() @ _BODY_FROM_FRONT
+            made.append(_transform(WORLD, f"body_{rows.person[n]}", _matrix(R, hips), time_s))
+    return {"transforms": made}
+
+
+def fixed_transforms(rig: Rig, time_s: float) -> Message:
+    """tf2_msgs/TFMessage of what does not move: the world in `map`, and cameras in it or on their carriers."""
+    up, z = rig.up_vector, np.array([0.0, 0, 1])
+    axis, R = np.cross(up, z), np.eye(3)
+    if axis.any():
+        c = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        R = np.eye(3) + c + c @ c
+    elif up @ z < 0:
+        R = np.diag([1.0, -1, -1])
+    made = [_transform(MAP, WORLD, _matrix(R, np.zeros(3)), time_s)]
+    for camera in rig.cameras:
+        parent, pose = (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
+        made.append(_transform(parent, optical(camera), pose, time_s))
+    return {"transforms": made}
+
+
+def carrier_transforms(rig: Rig, time_s: float) -> Message:
+    """tf2_msgs/TFMessage: what carries cameras, in the world."""
+    at = np.full(1, time_s)
+    return {
+        "transforms": [_transform(WORLD, ros_name(each.name), each.at(at)[0], time_s) for each in rig.trajectories]
+    }
+
+
+def camera_info(camera: Camera, time_s: float) -> Message:
+    """sensor_msgs/CameraInfo of pictures as they were taken, with the lens's distortion."""
+    width, height = camera.image_size
+    return {
+        "header": header(optical(camera), time_s),
+        "height": height,
+        "width": width,
+        "distortion_model": _LENSES.get(len(camera.distortion), "rational_polynomial"),
+        "d": camera.distortion.tolist(),
+        "k": camera.K.ravel().tolist(),
+        "r": np.eye(3).ravel().tolist(),
+        "p": np.column_stack([camera.K, np.zeros(3)]).ravel().tolist(),
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }
+
+
+def markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Message:
+    """visualization_msgs/MarkerArray: joints and bones of everybody, gone after `lasts_s`."""
+    return {"markers": list(_markers(rows, time_s, lasts_s))}
+
+
+def _markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Iterator[Message]:
+    sec, nanosec = divmod(nanoseconds(lasts_s), NS)
+    bones = np.asarray(bones_of(tuple(rows.joint_names.tolist())), dtype=np.intp).reshape(-1, 2)
+    for n in range(len(rows)):
+        joints = rows.joints[n]
+        placed = np.isfinite(joints).all(axis=1)
+        ends = bones[placed[bones].all(axis=1)].ravel()
+        color = dict(zip("rgba", (*colour_of(int(rows.person[n])), 1.0), strict=True))
+        for ns, kind, points, size in (
+            ("joints", _SPHERES, joints[placed], (_JOINT_M,) * 3),
+            ("bones", _LINES, joints[ends], (_BONE_M, 0.0, 0.0)),
+        ):
+            yield {
+                "header": header(WORLD, time_s), "ns": ns, "id": int(rows.person[n]) % _LAST_S, "type": kind,
+                "action": 0, "pose": {"position": _xyz(np.zeros(3)), "orientation": _quaternion(np.eye(3))},
+                "scale": _xyz(np.array(size)), "color": color, "lifetime": {"sec": sec, "nanosec": nanosec},
+                "frame_locked": False, "points": list(map(_xyz, points)), "colors": [], "texture_resource": "",
+                "texture": {"header": header("", 0.0), "format": "", "data": b""}, "uv_coordinates": [],
+                "text": "", "mesh_resource": "", "mesh_file": {"filename": "", "data": b""},
+                "mesh_use_embedded_materials": False,
+            }  # fmt: skip
+
+
+def ros_name(name: str) -> str:
+    """A name of topics and frames: letters, digits and underscores, not a digit first."""
+    plain = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return plain if not plain[:1].isdigit() else f"_{plain}"
+
+
+def optical(camera: Camera) -> str:
+    """The frame of a camera, z forward."""
+    return f"{ros_name(camera.name)}_optical"
+
+
+def _hips(rows: Reconstruction, n: int) -> Array:
+    """(3,) the middle of the hips; NaN where it is not known."""
+    names = rows.joint_names.tolist()
+    at = [names.index(each) for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"]) if each in names]
+    return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)
+
+
+def _matrix(R: Array, t: Array) -> Array:
+    return np.vstack([np.column_stack([R, t]), [0, 0, 0, 1.0]])
+
+
+def _transform(parent: str, child: str, pose: Array, time_s: float) -> Message:
+    turn = {"translation": _xyz(pose[:3, 3]), "rotation": _quaternion(pose[:3, :3])}
+    return {"header": header(parent, time_s), "child_frame_id": child, "transform": turn}
+
+
+def _xyz(point: Array) -> Message:
+    return dict(zip("xyz", point.tolist(), strict=True))
+
+
+def _quaternion(R: Array) -> Message:
+    from scipy.spatial.transform import Rotation
+
+    return dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist(), strict=True))
