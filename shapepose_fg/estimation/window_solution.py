@@ -16,6 +16,7 @@ from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.window_graph import WindowGraph
@@ -125,6 +126,8 @@ class PersonGraph:
     """(T, J, 3, 3) and how surely: marginals of its graph, m²."""
     lasting: Lasting
     """How the error goes on that is in the report and not in the solver's graph."""
+    body: Message
+    """(T, J) what the body says of each joint without the joint's own views; nothing where it does not pull."""
 
     @property
     def person(self) -> int:
