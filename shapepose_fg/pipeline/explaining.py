@@ -38,9 +38,9 @@ class Cause(StrEnum):
     FOREIGN = "foreign detection"
     """A detection is another's, or of the other side of the body."""
     CONTRADICTION = "contradiction"
-    """Its views, or views and body, put it at places that cannot both be true."""
+    """Several views, or a view and the body, put it at places that cannot all be true."""
     GATED = "gated view"
-    """A detection lies where the joint is not, and is nobody else's: it was left out."""
+    """One detection lies where, by all others, the joint is not, and is nobody else's."""
     PRIOR_ONLY = "prior only"
     """No view's detection was used."""
     ONE_VIEW = "one view"
@@ -350,25 +350,24 @@ def _findings(
     named = {name for each in found for name in each.cameras}
     suspects = [view for view in suspects if view.camera not in named]
     against = [view for view in suspects if view.gate == _GATES[Gate.CONTRADICTS_BODY]]
-    if against:
-        cameras = tuple(view.camera for view in against)
-        words = (
-            f"{_cameras(cameras)} put it where the body cannot have it ({', '.join(map(_off, against))}):"
-            " their detections were left out."
-        )
-        found.append(Finding(Cause.CONTRADICTION, cameras, words))
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
-    if doubted:
-        cameras = tuple(view.camera for view in doubted)
-        words = (
-            f"{_cameras(cameras)} and all else put it at different places ({', '.join(map(_off, doubted))})."
-            " The detections were used, with less weight."
-        )
-        found.append(Finding(Cause.CONTRADICTION, cameras, words))
-    for view in sorted(suspects, key=lambda view: -(view.off_sigma or 0.0)):
-        if view.gate == _GATES[Gate.TOO_FAR]:
-            words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
-            found.append(Finding(Cause.GATED, (view.camera,), words))
+    agree = [view for view in used if view not in doubted]
+    if len(against) + len(doubted) == 1 and len(agree) > 0:  # one against all others: its detection is wrong
+        alone = [*against, *doubted]
+    else:
+        alone = []
+        for several, fate in ((against, "left out"), (doubted, "used, with less weight")):
+            cameras = tuple(view.camera for view in several)
+            words = (
+                f"{_cameras(cameras)} and all else put it at different places ({', '.join(map(_off, several))}):"
+                f" detections were {fate}."
+            )
+            if several:
+                found.append(Finding(Cause.CONTRADICTION, cameras, words))
+    alone += [view for view in suspects if view.gate == _GATES[Gate.TOO_FAR]]
+    for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
+        words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
+        found.append(Finding(Cause.GATED, (view.camera,), words))
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body says {shares[0]:.0%}, motion from other frames the rest."

@@ -101,7 +101,7 @@ def test_a_detection_where_nobody_is(people, scene):
 
 
 def test_somebody_elses_detection(people, scene):
-    person, row, cameras = seen_by_many(people)
+    person, _, cameras = seen_by_many(people)
     table, view = people.observations, None
     for other in np.flatnonzero((people.frame == 5) & (people.person != person)):
         common = np.intersect1d(cameras, np.flatnonzero(table.used[other, ELBOW]))
