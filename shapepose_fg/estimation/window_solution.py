@@ -191,7 +191,7 @@ class PersonGraph:
             values.insert(key, zero)
         return values
 
-    def not_determined(self, error: RuntimeError, joint_names: Sequence[str]) -> NotDetermined | None:
+    def not_determined(self, error: RuntimeError, joint_names: list[str]) -> NotDetermined | None:
         """What GTSAM's `error` is about, where this graph, or one that it was added to, has no solution: which
         joint, when, and what is missing. None where it is about something else.
         """
@@ -202,15 +202,10 @@ class PersonGraph:
             return None
         t, joint, _ = found[0].tolist()
         views = int(self.window.seen[t, joint].sum())
+        name, frame = str(joint_names[joint]), int(self.frames[t])
         saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(views, f"{views} cameras saw it")
         body = "the body says where it may be" if self.body.known[t, joint] else "the body says nothing of it"
-        return NotDetermined(
-            self.person,
-            joint_names[joint],
-            int(self.frames[t]),
-            float(self.window.times_s[t]),
-            f"{saw}, and {body}",
-        )
+        return NotDetermined(self.person, name, frame, float(self.window.times_s[t]), f"{saw}, and {body}")
 
     @property
     def _offset_keys(self) -> NDArray[np.int64]:

@@ -219,7 +219,7 @@ class _Detections:
         rows = table.observations(people.joints, np.nan_to_num(people.time_s))
         views, names = Views.of(rig, rows.time_s), people.joint_names.tolist()
         sigmas = observation_sigmas(rows, people.joints, views, config.estimator.observations, names)
-        placed = np.isfinite(people.joints).all(axis=-1)[..., None]
+        placed = np.asarray(np.isfinite(people.joints).all(axis=-1))[..., None]
         return cls(people, table, views, sigmas, np.asarray((table.gate != Gate.NOT_SEEN) & placed))
 
 

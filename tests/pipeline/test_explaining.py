@@ -54,7 +54,7 @@ def without(table: ObservationTable, rows: np.ndarray, views: list[int]) -> dict
     empty = {"xy": np.nan, "residual_px": np.nan, "gate": 0, "candidate": -1, "confidence": 0, "probability": 0}
     columns = {name: getattr(table, name).copy() for name in empty}
     for name, nothing in empty.items():
-        columns[name][np.ix_(rows, [ELBOW], views)] = nothing
+        columns[name][rows[:, None], ELBOW, np.array(views)] = nothing
     return columns
 
 
