@@ -12,6 +12,7 @@ import typer
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.calibrate import calibrate
 from shapepose_fg.cli.detect import detect
+from shapepose_fg.cli.explain import explain
 from shapepose_fg.cli.export import export
 from shapepose_fg.cli.live import live
 from shapepose_fg.cli.options import (
@@ -53,7 +54,7 @@ evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
 for _panel, _commands in {
     _RECORDING: (detect, calibrate, check_calibration, refine_calibration, synchronise, reconstruct, live, batch),
-    _RESULT: (report, overlay, view, export),
+    _RESULT: (report, overlay, view, explain, export),
     _TRY: (train_fitter,),
 }.items():
     for _command in _commands:

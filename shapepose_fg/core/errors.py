@@ -19,6 +19,15 @@ class InputError(ValueError):
         super().__init__(line)
 
 
+class NotDetermined(ValueError):
+    """A joint, or a body, has no place: who, which, when, and what is missing."""
+
+    def __init__(self, person: int, joint: str, frame: int, time_s: float, missing: str):
+        when = f" ({time_s:.3f} s)" if time_s == time_s else ""
+        super().__init__(f"{joint} of person {person} in frame {frame}{when} is not determined: {missing}")
+        self.person, self.joint, self.frame, self.time_s, self.missing = person, joint, frame, time_s, missing
+
+
 class WorkLost(RuntimeError):
     """A process ended before its work, which is not done; what was done before it is kept."""
 

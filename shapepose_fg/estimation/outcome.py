@@ -85,7 +85,7 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         people=tuple(
             PersonGraph(
                 person, X[person.rows], covariance[person.rows], fit.rows(person.rows), state.joints[person.rows],
-                solved[person.rows], state.motion.views,
+                solved[person.rows], state.motion.views, state.of_body.rows(person.rows),
             )
             for person in people
         ),

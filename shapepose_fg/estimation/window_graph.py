@@ -4,6 +4,7 @@ Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Thet
 more than one frame, joints have velocities too, and motion factors between their states.
 """
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
@@ -95,6 +96,7 @@ class WindowGraph:
         """Why the last solution is none; empty where it is one."""
         self._motion = motion
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
+        self._names = config.joints
         self._cameras = _cameras(views)
         self._kernel: KernelName | None = config.observations.robust_kernel
         self._offset_keys = np.stack(
@@ -131,6 +133,11 @@ class WindowGraph:
         of the body; not all of them are in every problem.
         """
         return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
+
+    @property
+    def seen(self) -> Mask:
+        """(T, J, V) of which joints there are detections."""
+        return self._observations.seen
 
     @property
     def temporal(self) -> bool:
@@ -252,8 +259,12 @@ class WindowGraph:
         try:
             if self.touched.any() or not self._confirmed(ordering):
                 self._descend(None if self.coupled else ordering)
-        except RuntimeError:
-            self.failure = "the solver failed: its system is singular"
+        except RuntimeError as error:
+            key, where = undetermined_key(error), ""
+            if key is not None and key in set(self.states.ravel().tolist()):
+                joint = split_key(key)
+                where = f" near {self._names[joint.joint]} in frame {joint.frame}: nothing determines it there"
+            self.failure = f"the solver failed: its system is singular{where}"
 
     def _confirmed(self, ordering: gtsam.Ordering) -> bool:
         """Whether the error falls by no more than the tolerance in a step by Gauss and Newton; if so, take it."""
@@ -369,6 +380,12 @@ class WindowGraph:
 
 ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
 """Your own factors for a person's window, made from its keys (T, J)."""
+
+
+def undetermined_key(error: RuntimeError) -> int | None:
+    """The variable near which GTSAM found a system without a solution; None where the error is another."""
+    found = re.search(r"[Ii]ndeterminate? linear system.*?variable\s+(\d+)", str(error), re.DOTALL)
+    return None if found is None else int(found[1])
 
 
 def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:

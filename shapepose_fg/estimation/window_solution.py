@@ -12,13 +12,15 @@ from factors import lasting_difference_factors, offset_factors, offset_keys, rep
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.out_of_step import carried_to_frames
-from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.window_graph import WindowGraph, undetermined_key
 
 LEAST_M = 1e-4
 """Where the solver's graph leaves a joint no less certain than it is reported, its error is taken to be this much
@@ -125,6 +127,8 @@ class PersonGraph:
     """(T, J, 3, 3) and how surely: marginals of its graph, m²."""
     lasting: Lasting
     """How the error goes on that is in the report and not in the solver's graph."""
+    body: Message
+    """(T, J) what the body says of each joint without the joint's own views; nothing where it does not pull."""
 
     @property
     def person(self) -> int:
@@ -186,6 +190,22 @@ class PersonGraph:
         for key in self._offset_keys[known].tolist():
             values.insert(key, zero)
         return values
+
+    def not_determined(self, error: RuntimeError, joint_names: list[str]) -> NotDetermined | None:
+        """What GTSAM's `error` is about, where this graph, or one that it was added to, has no solution: which
+        joint, when, and what is missing. None where it is about something else.
+        """
+        key = undetermined_key(error)
+        keys = np.concatenate([self.window.states, self.keys[..., None], self._offset_keys[..., None]], axis=-1)
+        found = np.argwhere(keys == key)
+        if key is None or len(found) == 0:
+            return None
+        t, joint, _ = found[0].tolist()
+        views = int(self.window.seen[t, joint].sum())
+        name, frame = str(joint_names[joint]), int(self.frames[t])
+        saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(views, f"{views} cameras saw it")
+        body = "the body says where it may be" if self.body.known[t, joint] else "the body says nothing of it"
+        return NotDetermined(self.person, name, frame, float(self.window.times_s[t]), f"{saw}, and {body}")
 
     @property
     def _offset_keys(self) -> NDArray[np.int64]:

@@ -102,15 +102,28 @@ def window_solutions(
             yield person if extra_factors is not None else replace(person, **as_reported)
 
 
+def solved_around(people: Reconstruction, solver: Solver, person: int, frame: int) -> PersonGraph | None:
+    """Somebody's graph of the window that has this frame, solved anew from the person's own observations; None
+    where nothing is in it. The observations must be there.
+    """
+    mine = people.rows(people.person == person if solver.config.temporal else people.frame == frame)
+    found = [solution for _, _, solution in _solved(mine, solver, None, frame)]
+    return next((each for solution in found for each in solution.people if each.person == person), None)
+
+
 def _solved(
-    rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None
+    rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None, frame: int | None = None
 ) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
-    """Each window of the recording: its own frames, and its rows with those around it, solved."""
+    """Each window of the recording, or that of one `frame`: its own frames, and its rows with those around it,
+    solved.
+    """
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
     config, rig = solver.config, solver.rig
     settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
     for own, segment in _windows(rows, config):
+        if frame is not None and frame not in own:
+            continue
         part = rows.rows(_rows_of(rows, own, segment, config.windows.shared_s))
         if config.windows.keyframe_s > 0:
             part = part.rows(looked_at(part))

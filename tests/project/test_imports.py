@@ -44,6 +44,7 @@ LEVELS = (
     "pipeline.pipeline",
     "io",
     "pipeline.solving",
+    "pipeline.explaining",
     "live",
     "simulation viz.bodies detection2d",
     "viz.overlay setup_check",
@@ -56,7 +57,7 @@ LEVELS = (
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live cli.calibrate",
+    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live cli.calibrate cli.explain",
     "cli.main",
     "__main__",
 )

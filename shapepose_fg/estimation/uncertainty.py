@@ -1,0 +1,334 @@
+"""What may be asked of joints that are known with errors: together, how far apart, and how near to what.
+
+Of any `Reconstruction`: saved, handed out by `OnlineReconstructor.people`, or solved with factors of your own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.errors import NotDetermined
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
+
+if TYPE_CHECKING:
+    from shapepose_fg.body.model.body_model import BodyModel
+
+CORRELATION_S = 0.9
+"""Errors of a joint, in standard deviations, have the correlation exp(-t / this) over time: measured 0.97, 0.83,
+0.70, 0.56, 0.37 after 1, 4, 8, 16, 30 frames at 30 Hz (simulated, split tune, two to six cameras; seeds 6850 to
+6854)."""
+_LIMBS = {
+    ("Neck", "MidHip"): 0.57, ("Nose", "Neck"): 0.2, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.3,
+    ("Shoulder", "Neck"): 0.65, ("Elbow", "Shoulder"): 0.12, ("Wrist", "Elbow"): 0.4, ("Hip", "MidHip"): 0.89,
+    ("Knee", "Hip"): 0.55, ("Ankle", "Knee"): 0.43, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.36,
+    ("SmallToe", "BigToe"): 0.74,
+}  # fmt: skip
+"""Correlation of the errors of two joints of a person in one frame, in standard deviations, along a limb; else the
+product along the way from one to the other. Measured as above, alike for joints that are seen and not: 0.55, 0.30,
+0.18, 0.10 one to four limbs apart. Two people's are -0.02: taken as 0."""
+SURFACE_M = 0.015
+"""What a point of a body's surface is known less well than the joints around it, one sigma, metres."""
+_REACH_M = 0.15
+"""Joints within about this of a point of the surface carry it."""
+_NODES, _WIDE = 24, 6.0
+"""Of the quadrature, per axis; and how many standard deviations it spans on either side."""
+_STEPS = 64
+"""Limits at which a distance's probabilities are tabled for its quantiles."""
+
+
+@dataclass(frozen=True)
+class JointAt:
+    """A joint of a person in a frame."""
+
+    person: int
+    joint: str
+    frame: int
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """K joints together, as one Gaussian; its blocks are the reported covariances."""
+
+    mean: Array
+    """(K, 3) metres, world."""
+    covariance: Array
+    """(3 K, 3 K) m², joint by joint."""
+
+    def block(self, one: int, other: int) -> Array:
+        """(3, 3) covariance of two of them, m²."""
+        return self.covariance[3 * one : 3 * one + 3, 3 * other : 3 * other + 3]
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Distances (...,) between pairs of places, from the Gaussians of what lies between them.
+
+    Near zero a distance is no Gaussian: its probabilities are integrals of the three-dimensional one over balls,
+    by quadrature, right in the tails too, where noncentral chi-square or fits of moments to it are not.
+    """
+
+    apart: Array
+    """(..., 3) from one to the other, metres."""
+    covariance: Array
+    """(..., 3, 3) of that, m²."""
+
+    def below(self, limit_m: ArrayLike) -> Array:
+        """Probability (...,) that the distance is under a limit (...,), metres.
+
+        Along the axis of least spread the integral is a normal distribution's, over the two others it is summed by
+        Gauss and Legendre's rule.
+        """
+        limit = np.asarray(limit_m, dtype=np.float64)
+        values, axes = np.linalg.eigh(self.covariance)
+        sigma = np.sqrt(np.maximum(values, 1e-12))
+        mean = np.einsum("...ij,...i->...j", axes, self.apart)
+        shape = np.broadcast_shapes(limit.shape, mean.shape[:-1])
+        r = np.broadcast_to(np.maximum(limit, 0.0), shape)
+        (m0, m1, m2), (s0, s1, s2) = (
+            np.broadcast_to(np.moveaxis(each, -1, 0), (3, *shape)) for each in (mean, sigma)
+        )
+        z, at_z = _nodes(-r, r, m2, s2)
+        left = np.sqrt(np.maximum(r[..., None] ** 2 - z**2, 0.0))
+        y, at_y = _nodes(-left, left, m1[..., None], s1[..., None])
+        x = np.sqrt(np.maximum(left[..., None] ** 2 - y**2, 0.0))
+        m, s = m0[..., None, None], s0[..., None, None]
+        inside = _normal((x - m) / s) - _normal((-x - m) / s)
+        return np.clip(np.einsum("...i,...ij,...ij->...", at_z, at_y, inside), 0.0, 1.0)
+
+    def quantile(self, probability: ArrayLike) -> Array:
+        """Distance (...,), metres, that is under what is asked with this probability, one number."""
+        limits, under = self._table()
+        flat = under.reshape(_STEPS, -1)
+        found = [np.interp(float(np.asarray(probability)), flat[:, n], limits.reshape(_STEPS, -1)[:, n])
+                 for n in range(flat.shape[1])]  # fmt: skip
+        return np.asarray(found).reshape(under.shape[1:])
+
+    def interval(self, probability: float = 0.95) -> tuple[Array, Array]:
+        """Distances that would not have made the measured one improbable, by Neyman's construction.
+
+        It holds the true one as often as it says however near it is; quantiles do not near zero, where errors in
+        three dimensions only ever make a distance longer.
+        """
+        away = np.linalg.norm(self.apart, axis=-1)
+        way = np.where(away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0])
+        limits = self._span()
+        shorter = np.stack([Distance(each[..., None] * way, self.covariance).below(away) for each in limits])
+        flat, r = shorter.reshape(_STEPS, -1)[::-1], limits.reshape(_STEPS, -1)[::-1]
+        ends = ((1 + probability) / 2, (1 - probability) / 2)
+        low, high = (
+            np.array([np.interp(end, flat[:, n], r[:, n]) for n in range(flat.shape[1])]).reshape(away.shape)
+            for end in ends
+        )
+        return low, high
+
+    @property
+    def mean_m(self) -> Array:
+        """(...,) expected distance, metres: more than that of the means."""
+        limits, under = self._table()
+        return limits[0] + np.trapezoid(1.0 - under, limits, axis=0)
+
+    @property
+    def sigma_m(self) -> Array:
+        """(...,) standard deviation, metres."""
+        square = (self.apart**2).sum(axis=-1) + np.trace(self.covariance, axis1=-2, axis2=-1)
+        return np.sqrt(np.maximum(square - self.mean_m**2, 0.0))
+
+    def _span(self) -> Array:
+        """Limits (S, ...) from under to over all that the distances may be."""
+        away = np.linalg.norm(self.apart, axis=-1)
+        wide = 5.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance)[..., -1], 1e-12))
+        first, last = np.maximum(away - wide, 0.0), away + wide
+        return first + (last - first) * np.linspace(0, 1, _STEPS).reshape(-1, *(1,) * away.ndim)
+
+    def _table(self) -> tuple[Array, Array]:
+        """Limits (S, ...) and how probably the distances are under them."""
+        limits = self._span()
+        return limits, np.maximum.accumulate(np.stack([self.below(each) for each in limits]), axis=0)
+
+
+@dataclass(frozen=True)
+class SurfaceDistance:
+    """Distance of a point from a body's surface, which is taken to be plane within the errors."""
+
+    signed_m: float
+    """Metres; negative inside the body."""
+    sigma_m: float
+    """Standard deviation, metres."""
+    nearest: Array
+    """(3,) point of the surface, metres."""
+
+    def below(self, limit_m: float) -> float:
+        """Probability that the point is nearer than a limit, metres, or inside."""
+        return float(_normal(np.asarray((limit_m - self.signed_m) / self.sigma_m)))
+
+    def interval(self) -> tuple[float, float]:
+        """95 % of what the distance may be, metres; what is inside is at 0."""
+        away = 1.959964 * self.sigma_m
+        return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
+
+
+def marginal(people: Reconstruction, *joints: JointAt) -> Marginal:
+    """Joints of any people and frames together.
+
+    Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
+    correlate as was measured (`correlation`). NotDetermined for a joint without a place, ValueError for one that
+    is not there.
+    """
+    rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
+    roots = _roots(people.covariance[rows, numbers])
+    names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
+    rho = correlation(names, names) * np.exp(-np.abs(time_s[:, None] - time_s) / CORRELATION_S)
+    rho *= people.person[rows][:, None] == people.person[rows]
+    K = len(joints)
+    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots).reshape(3 * K, 3 * K)
+    return Marginal(people.joints[rows, numbers], covariance)
+
+
+def distance(people: Reconstruction, one: JointAt, other: JointAt | ArrayLike) -> Distance:
+    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3)."""
+    if isinstance(other, JointAt):
+        both = marginal(people, one, other)
+        across = both.block(0, 1)
+        covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
+        return Distance(both.mean[1] - both.mean[0], covariance)
+    alone, points = marginal(people, one), np.asarray(other, dtype=np.float64)
+    apart = points - alone.mean[0]
+    return Distance(apart, np.broadcast_to(alone.covariance, (*apart.shape, 3)))
+
+
+def distances(people: Reconstruction, point: ArrayLike) -> Distance:
+    """From all joints (N, J) to a point (3,) in the world, or to one of each row (N, 3); NaN where unknown."""
+    points = np.broadcast_to(np.asarray(point, dtype=np.float64), (len(people), 3))
+    return Distance(points[:, None] - people.joints, people.covariance)
+
+
+def surface_distance(
+    people: Reconstruction, body: "BodyModel", person: int, frame: int, point: ArrayLike
+) -> SurfaceDistance:
+    """From a person's body surface to a point (3,) in the world, metres.
+
+    The surface errs as the joints around its nearest place do, together, and by `SURFACE_M`. NotDetermined where
+    the person has no body in the frame.
+    """
+    from shapepose_fg.body.model.body_model import BodyParameters
+
+    row, where = _row(people, person, frame), np.asarray(point, dtype=np.float64)
+    columns = [getattr(people, name)[[row]] for name in BODY]
+    if not all(np.isfinite(each).all() for each in columns):
+        raise NotDetermined(
+            person, "body", frame, float(people.time_s[row]), f"its status is {people.status[row]}"
+        )
+    vertices = body.vertices(BodyParameters(*columns))[0]
+    near = int(((vertices - where) ** 2).sum(axis=1).argmin())
+    around = vertices[body.faces[(body.faces == near).any(axis=1)]]
+    normals = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
+    normal = normals.sum(axis=0) / max(np.linalg.norm(normals.sum(axis=0)), 1e-12)
+    nearest, away = vertices[near], where - vertices[near]
+    signed, length = float(away @ normal), float(np.linalg.norm(away))
+    # Beside the vertex by less than its triangles are wide, the plane counts; else the way from the vertex.
+    beside = np.sqrt(max(length**2 - signed**2, 0.0)) > np.sqrt(((around - nearest) ** 2).sum(axis=-1).max())
+    if beside and length > 0:
+        normal, signed = away / length * (1.0 if signed >= 0 else -1.0), length * (1.0 if signed >= 0 else -1.0)
+    names = people.joint_names.tolist()
+    known = np.isfinite(people.covariance[row]).all(axis=(1, 2)) & np.isfinite(people.joints[row]).all(axis=1)
+    weight = np.exp(-0.5 * ((people.joints[row] - nearest) ** 2).sum(axis=1) / _REACH_M**2)
+    weight = np.where(known, weight, 0.0)
+    chosen = np.argsort(-weight)[:4]
+    chosen = chosen[known[chosen]]
+    if len(chosen) == 0:
+        raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a place")
+    share = weight[chosen] / max(weight[chosen].sum(), 1e-300)
+    both = marginal(people, *(JointAt(person, names[j], frame) for j in chosen.tolist()))
+    along = (share[:, None] * normal).ravel()
+    variance = float(along @ both.covariance @ along) + SURFACE_M**2
+    return SurfaceDistance(signed, float(np.sqrt(variance)), nearest)
+
+
+def correlation(one: Sequence[str], other: Sequence[str]) -> Array:
+    """(A, B) of the errors, in standard deviations, of joints of one person in one frame, by their names; those
+    that are no part of a body known here correlate with themselves alone.
+    """
+    return np.array([[_together(a, b) for b in other] for a in one]).reshape(len(one), len(other))
+
+
+def _together(one: str, other: str) -> float:
+    ways, found = (_way_up(one), _way_up(other)), 1.0
+    if one == other:
+        return 1.0
+    common = [name for name, _ in ways[0] if name in dict(ways[1])]
+    if len(common) == 0:
+        return 0.0
+    for way in ways:
+        found *= dict(way)[common[0]]
+    return found
+
+
+def _way_up(joint: str) -> list[tuple[str, float]]:
+    """The joints from one to the middle of the hips, and the correlation with each."""
+    way, side = [(joint, 1.0)], joint[0] if joint[:1] in ("R", "L") else ""
+    table = {f"{s}{a}": (b if b in ("Neck", "MidHip", "Nose") else f"{s}{b}", r)
+             for (a, b), r in _LIMBS.items() for s in (("",) if a in ("Neck", "Nose") else (side,))}  # fmt: skip
+    while way[-1][0] in table:
+        parent, r = table[way[-1][0]]
+        way.append((parent, way[-1][1] * r))
+    return way
+
+
+def _row(people: Reconstruction, person: int, frame: int) -> int:
+    row = np.flatnonzero((people.person == person) & (people.frame == frame))
+    if len(row) == 0:
+        raise ValueError(f"person {person} is not in frame {frame} of these people")
+    return int(row[0])
+
+
+def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
+    """Row and number of a joint that has a place."""
+    row, names = _row(people, asked.person, asked.frame), people.joint_names.tolist()
+    if asked.joint not in names:
+        raise ValueError(f"joint {asked.joint}: there is none of that name, but {' '.join(names)}")
+    joint = names.index(asked.joint)
+    if not (np.isfinite(people.joints[row, joint]).all() and np.isfinite(people.covariance[row, joint]).all()):
+        raise NotDetermined(
+            asked.person, asked.joint, asked.frame, float(people.time_s[row]), _missing(people, row, joint)
+        )
+    return row, joint
+
+
+def _missing(people: Reconstruction, row: int, joint: int) -> str:
+    """What a joint without a place lacks."""
+    table, body = people.observations, "" if np.isfinite(people.transl[row]).all() else ", and no body was fitted"
+    if table is None:
+        return f"the row's status is {people.status[row]}{body}"
+    used = table.view_names[table.used[row, joint]].tolist()
+    views = {0: "no camera's detection was used", 1: f"only camera {' '.join(used)} saw it"}
+    return views.get(len(used), f"cameras {', '.join(used)} do not place it") + body
+
+
+def _roots(covariances: Array) -> Array:
+    """Symmetric square roots (K, 3, 3)."""
+    values, vectors = np.linalg.eigh(covariances)
+    return np.einsum("kia,ka,kja->kij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
+
+
+_AT, _WEIGHT = np.polynomial.legendre.leggauss(_NODES)
+
+
+def _nodes(low: Array, high: Array, mean: Array, sigma: Array) -> tuple[Array, Array]:
+    """Nodes (..., n) of the part of a normal distribution between two limits, and their weights."""
+    first = np.clip(mean - _WIDE * sigma, low, high)[..., None]
+    last = np.clip(mean + _WIDE * sigma, low, high)[..., None]
+    x = (first + last) / 2 + (last - first) / 2 * _AT
+    z = (x - mean[..., None]) / sigma[..., None]
+    density = np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * sigma[..., None])
+    return x, (last - first) / 2 * _WEIGHT * density
+
+
+def _normal(z: Array) -> Array:
+    """The standard normal distribution function."""
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(z))

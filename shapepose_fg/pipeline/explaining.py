@@ -1,0 +1,419 @@
+"""Why a joint is where it is: what each view, the body and motion say of it, and what speaks against them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from factors import kernel_weight
+from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
+from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
+from shapepose_fg.estimation.window_solution import PersonGraph
+from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.solving import Solver, solved_around
+
+OFF_SIGMA = 3.0
+"""A detection is off that lies this many standard deviations from where all else has the joint: one in 90 does by
+chance."""
+_WINDOW_FRAMES = 48
+"""Frames before and after, whose detections tell whether a camera is wrong."""
+_APART = 0.5
+"""A detection is somebody else's where it lies in less than this share of the distance from theirs."""
+
+
+class Cause(StrEnum):
+    """What is the matter with a joint, the gravest first."""
+
+    NOT_SOLVED = "not solved"
+    """The solver found no place for it."""
+    WRONG_CAMERA = "wrong camera"
+    """A camera that saw it is off with whatever it sees: its pose, its lens or its clock is wrong."""
+    FOREIGN = "foreign detection"
+    """A detection is another's, or of the other side of the body."""
+    CONTRADICTION = "contradiction"
+    """Several views, or a view and the body, put it at places that cannot all be true."""
+    GATED = "gated view"
+    """One detection lies where, by all others, the joint is not, and is nobody else's."""
+    PRIOR_ONLY = "prior only"
+    """No view's detection was used."""
+    ONE_VIEW = "one view"
+    """One view's detection was used, which tells no depth."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is the matter."""
+
+    cause: Cause
+    """What."""
+    cameras: tuple[str, ...]
+    """With which cameras; none where it is with no camera."""
+    words: str
+    """In a sentence or two."""
+
+
+@dataclass(frozen=True)
+class ViewReason:
+    """What one camera has to do with a joint."""
+
+    camera: str
+    """Its name."""
+    gate: str
+    """Whether its detection was used, and why not: a name of `Gate`."""
+    detection_px: tuple[float, float] | None
+    """Where it is, undistorted pixels; None where there is none."""
+    score: float
+    """The detector's, 0 to 1."""
+    probability: float
+    """That the detection is this person's, by the assignment."""
+    sigma_px: float | None
+    """How far off such a detection usually is, one sigma per axis."""
+    residual_px: tuple[float, float] | None
+    """The joint as it is reported, projected, minus the detection."""
+    off_px: float | None
+    """How far the detection is from where all *else* has the joint, this detection not counted."""
+    off_sigma: float | None
+    """The same in standard deviations: of the detection, and of where all else has the joint."""
+    share: float
+    """Of what the solver knows of the joint, 0 to 1."""
+    looks_like: str = ""
+    """Whose joint the detection rather is, as `person 3's RWrist`; empty where it fits nobody better."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why a joint is where it is."""
+
+    person: int
+    joint: str
+    frame: int
+    time_s: float | None
+    position_m: tuple[float, float, float] | None
+    """As reported, world; None where unknown."""
+    sigma_m: float | None
+    """As reported: root mean square over the axes."""
+    known: str
+    """A name of `Known`."""
+    status: str
+    """Of the row."""
+    views: tuple[ViewReason, ...]
+    """Camera by camera."""
+    body_share: float
+    """Of what the solver knows of the joint, what the body says of it without the joint's own views."""
+    motion_share: float
+    """And what comes from other frames."""
+    findings: tuple[Finding, ...]
+    """What is the matter, the gravest first; none where nothing is."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as `shapepose-fg explain --json` prints them."""
+        return asdict(self)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The same in sentences: where it is, what is the matter, and what says so."""
+        when = f"frame {self.frame}" + (f" ({self.time_s:.3f} s)" if self.time_s is not None else "")
+        who = f"{self.joint} of person {self.person} in {when}"
+        if self.position_m is None or self.sigma_m is None:
+            where = f"{who} has no place."
+        else:
+            x, y, z = self.position_m
+            where = f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm (one sigma)."
+        used = [view for view in self.views if view.gate == _GATES[Gate.USED]]
+        told = [f"{view.camera} {view.share:.0%}" for view in used]
+        parts = [*told, f"the body {self.body_share:.0%}", f"motion, from other frames, {self.motion_share:.0%}"]
+        shares = f"What is known of it comes from: {', '.join(parts)}."
+        matter = [finding.words for finding in self.findings]
+        good = f"{len(used)} cameras agree on it, and nothing speaks against them."
+        return (where, *(matter or [good]), *([shares] if self.position_m is not None else []))
+
+
+_GATES = {gate: gate.name.lower().replace("_", " ") for gate in Gate}
+
+
+def explain(
+    people: Reconstruction,
+    rig: Rig,
+    *,
+    person: int,
+    joint: str,
+    frame: int | None = None,
+    time_s: float | None = None,
+) -> Explanation:
+    """Why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`, seconds.
+
+    The person's window is solved once more, from the detections that `people.observations` has of them, before the
+    cameras `rig`; joints, covariances and gates are those of the result. InputError where the person, the joint or
+    the frame is not in the result, or where it does not say what it was solved from.
+    """
+    table = people.observations
+    if table is None:
+        raise InputError("the result does not say what it was solved from (observations.npz): reconstruct again")
+    row = _row_of(people, person, frame, time_s)
+    names, frame = people.joint_names.tolist(), int(people.frame[row])
+    if joint not in names:
+        raise InputError(f"joint {joint}: the result has none of that name; it has {' '.join(names)}")
+    number = names.index(joint)
+    solver = Solver.of(people, rig)
+    graph = solved_around(people, solver, person, frame)
+    near = np.abs(people.frame - frame) <= (_WINDOW_FRAMES if solver.config.temporal else 0)
+    around = _Detections.of(people.rows(near), rig, solver.config)
+    views, shares = _view_reasons(around, graph, person, frame, number, solver.config)
+    here, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
+    sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
+    seen = Seen(
+        around.table.residual_px.astype(np.float64), around.sigmas_px, around.there, around.table.gate == Gate.USED
+    )
+    wrong = wrong_view(seen, around.people.joints, around.views, solver.config.estimator.observations)
+    findings = _findings(people, row, number, views, shares, wrong)
+    return Explanation(
+        person, joint, frame, when if np.isfinite(when) else None,
+        tuple(here.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
+        Known(people.known[row, number]).name.lower(), str(people.status[row]), views, *shares, findings,
+    )  # fmt: skip
+
+
+def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: float | None) -> int:
+    """The row of a person in a frame, or nearest to a time."""
+    mine = np.flatnonzero(people.person == person)
+    if len(mine) == 0:
+        there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
+        raise InputError(f"person {person}: is not in the result; there are {there or 'none'}")
+    if (frame is None) == (time_s is None):
+        raise InputError("give a frame or a time, one of them")
+    if time_s is not None:
+        away = np.abs(people.time_s[mine] - time_s)
+        if not np.isfinite(away).any():
+            raise InputError("the result has no times; give a frame")
+        return int(mine[np.nanargmin(away)])
+    row = mine[people.frame[mine] == frame]
+    if len(row) == 0:
+        first, last = people.frame[mine].min(), people.frame[mine].max()
+        raise InputError(f"person {person} is not in frame {frame}, but in some from {first} to {last}")
+    return int(row[0])
+
+
+@dataclass(frozen=True)
+class _Detections:
+    """Everybody's detections in the frames around, N rows, against the joints as they are reported."""
+
+    people: Reconstruction
+    table: ObservationTable
+    views: Views
+    sigmas_px: Array
+    """(N, J, V); 0 where there are none."""
+    there: Mask
+    """(N, J, V) which there are of joints that have a place."""
+
+    @classmethod
+    def of(cls, people: Reconstruction, rig: Rig, config: PipelineConfig) -> "_Detections":
+        table = people.observations
+        assert table is not None
+        rows = table.observations(people.joints, np.nan_to_num(people.time_s))
+        views, names = Views.of(rig, rows.time_s), people.joint_names.tolist()
+        sigmas = observation_sigmas(rows, people.joints, views, config.estimator.observations, names)
+        placed = np.asarray(np.isfinite(people.joints).all(axis=-1))[..., None]
+        return cls(people, table, views, sigmas, np.asarray((table.gate != Gate.NOT_SEEN) & placed))
+
+
+def _view_reasons(
+    all_of_it: _Detections,
+    graph: PersonGraph | None,
+    person: int,
+    frame: int,
+    joint: int,
+    config: PipelineConfig,
+) -> tuple[tuple[ViewReason, ...], tuple[float, float]]:
+    """What each camera says of a joint; and the shares of the body and of motion in what is known of it.
+
+    The solver's information of the joint is taken apart: that of each detection, of the body, and the rest, which
+    is other frames'. The share of a part is trace(part inverse(whole)) / 3. A detection is compared with the joint
+    as it would be without it: one Gauss-Newton step from where it is.
+    """
+    people, table = all_of_it.people, all_of_it.table
+    row = int(np.flatnonzero((people.person == person) & (people.frame == frame))[0])
+    rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
+    sigma, seen = all_of_it.sigmas_px[row, joint], gates != Gate.NOT_SEEN
+    place, whole, of_body = people.joints[row, joint], None, np.zeros((3, 3))
+    solved = [] if graph is None else np.flatnonzero(graph.frames == frame).tolist()
+    if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
+        t, estimator = solved[0], config.estimator
+        place = graph.solved[t, joint]
+        # The solver's graph holds the share of the variance that is new in every frame.
+        share = graph.lasting.white_share if graph.window.temporal else 1.0
+        whole = share * np.linalg.inv(graph.solved_covariance[t, joint])
+        of_body = estimator.graph.weight_shape * graph.body.information[t, joint]
+    xy, _, slope = (each[0, 0] for each in rows.project(place[None, None]))
+    residual = xy - table.xy[row, joint]
+    information, gradient = np.zeros((len(gates), 3, 3)), np.zeros((len(gates), 3))
+    used = (gates == Gate.USED) & np.isfinite(residual).all(axis=-1) & (sigma > 0)
+    observed = config.estimator.observations
+    for v in np.flatnonzero(used).tolist():
+        weight = kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v]) / sigma[v] ** 2
+        information[v], gradient[v] = weight * slope[v].T @ slope[v], weight * slope[v].T @ residual[v]
+    if whole is None:
+        whole = information.sum(axis=0) + of_body + np.eye(3)
+    rest = np.linalg.eigvalsh(whole - information.sum(axis=0) - of_body).sum()
+    parts = [*information, of_body]
+    known = [float(np.trace(np.linalg.solve(whole, part))) / 3 for part in parts]
+    known.append(max(1.0 - sum(known), 0.0) if rest > 0 else 0.0)
+    known = [each / max(sum(known), 1e-9) for each in known]
+    reasons = []
+    for v, name in enumerate(table.view_names.tolist()):
+        off_px = off_sigma = None
+        like = ""
+        if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
+            least = np.eye(3)  # a metre
+            without = inverses(_positive(whole - information[v]) + least)
+            away = residual[v] + slope[v] @ without @ gradient[v]
+            spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
+            off_px = float(np.linalg.norm(away))
+            off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
+            like = _looks_like(all_of_it, row, joint, v, off_px, off_sigma)
+        reason = ViewReason(
+            camera=name,
+            gate=_GATES[Gate(gates[v])],
+            detection_px=_pair(table.xy[row, joint, v]),
+            score=float(table.confidence[row, joint, v]),
+            probability=float(table.probability[row, joint, v]),
+            sigma_px=float(sigma[v]) if seen[v] else None,
+            residual_px=_pair(table.residual_px[row, joint, v]),
+            off_px=off_px,
+            off_sigma=off_sigma,
+            share=known[v],
+            looks_like=like,
+        )
+        reasons.append(reason)
+    return tuple(reasons), (known[-2], known[-1])
+
+
+def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, off_px: float, off_sigma: float) -> str:
+    """Whose joint a detection that is off rather is: another's of the same name, or one of the other side."""
+    if off_sigma <= OFF_SIGMA:
+        return ""
+    people, table, names = all_of_it.people, all_of_it.table, all_of_it.people.joint_names.tolist()
+    at, sigma = table.xy[row, joint, view], all_of_it.sigmas_px[row, joint, view]
+    mine, other = names[joint], _mirrored(names[joint])
+    best, found = off_sigma, ""
+    for n in np.flatnonzero(people.frame == people.frame[row]).tolist():
+        for name in {mine, other} & {*names}:
+            j = names.index(name)
+            point, covariance = people.joints[n, j], people.covariance[n, j]
+            if (n == row and j == joint) or not (np.isfinite(point).all() and np.isfinite(covariance).all()):
+                continue
+            xy, _, slope = (
+                each[0, 0, view] for each in all_of_it.views.rows(np.array([n])).project(point[None, None])
+            )
+            away = np.asarray(xy - at)
+            spread = sigma**2 * np.eye(2) + slope @ covariance @ slope.T
+            sigmas = float(np.sqrt(away @ np.linalg.solve(spread, away)))
+            if sigmas < min(best, OFF_SIGMA) and np.linalg.norm(away) < _APART * off_px:
+                best, found = sigmas, f"person {people.person[n]}'s {name}"
+    return found
+
+
+def _findings(
+    people: Reconstruction,
+    row: int,
+    joint: int,
+    views: Sequence[ViewReason],
+    shares: tuple[float, float],
+    wrong: WrongView | None,
+) -> tuple[Finding, ...]:
+    """What is the matter with a joint, the gravest first."""
+    found, used = list[Finding](), [view for view in views if view.gate == _GATES[Gate.USED]]
+    problem = _problem(people, row, joint)
+    if problem:
+        found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
+    if wrong is not None:
+        name = views[wrong.view].camera
+        words = (
+            f"Camera {name} is off with whatever it sees around this time: turned by {wrong.turn_deg:.1f} degrees"
+            f" and moved by {100 * wrong.shift_m:.0f} cm it would fit the others. Check its pose, lens and clock."
+        )
+        found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
+    left = [view for view in views if view.gate not in (_GATES[Gate.USED], _GATES[Gate.NOT_SEEN])]
+    suspects = [view for view in (*left, *used) if view.camera not in {n for each in found for n in each.cameras}]
+    for view in suspects:
+        if view.looks_like:
+            words = (
+                f"Camera {view.camera}'s detection is rather {view.looks_like}: it is {_off(view)}. {_taken(view)}"
+            )
+            found.append(Finding(Cause.FOREIGN, (view.camera,), words))
+    named = {name for each in found for name in each.cameras}
+    suspects = [view for view in suspects if view.camera not in named]
+    against = [view for view in suspects if view.gate == _GATES[Gate.CONTRADICTS_BODY]]
+    doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
+    agree = [view for view in used if view not in doubted]
+    if len(against) + len(doubted) == 1 and len(agree) > 0:  # one against all others: its detection is wrong
+        alone = [*against, *doubted]
+    else:
+        alone = []
+        for several, fate in ((against, "left out"), (doubted, "used, with less weight")):
+            cameras = tuple(view.camera for view in several)
+            words = (
+                f"{_cameras(cameras)} and all else put it at different places ({', '.join(map(_off, several))}):"
+                f" detections were {fate}."
+            )
+            if several:
+                found.append(Finding(Cause.CONTRADICTION, cameras, words))
+    alone += [view for view in suspects if view.gate == _GATES[Gate.TOO_FAR]]
+    for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
+        words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
+        found.append(Finding(Cause.GATED, (view.camera,), words))
+    if len(used) == 0:
+        words = (
+            f"No camera's detection was used: the body says {shares[0]:.0%}, motion from other frames the rest."
+        )
+        found.append(Finding(Cause.PRIOR_ONLY, (), words))
+    if len(used) == 1:
+        words = f"Only camera {used[0].camera} tells of it: how deep it is, body and motion say."
+        found.append(Finding(Cause.ONE_VIEW, (used[0].camera,), words))
+    return tuple(found)
+
+
+def _problem(people: Reconstruction, row: int, joint: int) -> str:
+    """What run.json says went wrong with a joint; empty where nothing did."""
+    told = people.run.get("people", {})
+    for each in told.get("problems", ()) if isinstance(told, dict) else ():
+        same = each.get("person") == people.person[row] and each.get("frame") == people.frame[row]
+        if same and each.get("joint") == people.joint_names[joint]:
+            return str(each.get("reason"))
+    return ""
+
+
+def _taken(view: ViewReason) -> str:
+    return "It was left out." if view.gate != _GATES[Gate.USED] else "It was used, with less weight."
+
+
+def _off(view: ViewReason) -> str:
+    """How far a detection is from where all else has the joint."""
+    if view.off_px is None or view.off_sigma is None:
+        return "behind it"
+    return f"{view.off_px:.0f} px or {view.off_sigma:.1f} sigmas off"
+
+
+def _cameras(names: Sequence[str]) -> str:
+    return f"Camera{'s' if len(names) > 1 else ''} {', '.join(names)}"
+
+
+def _mirrored(name: str) -> str:
+    """The joint of the other side of the body, by its name."""
+    return {"R": "L", "L": "R"}.get(name[0], name[0]) + name[1:]
+
+
+def _positive(matrix: Array) -> Array:
+    """The nearest positive semi-definite matrix."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def _pair(values: Array) -> tuple[float, float] | None:
+    return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None

@@ -1,0 +1,153 @@
+"""What is asked of joints with errors: blocks of joint marginals, probabilities of distances, named failures."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import ncx2
+
+from shapepose_fg import reconstruct
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.errors import NotDetermined
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.uncertainty import (
+    Distance,
+    JointAt,
+    correlation,
+    distance,
+    distances,
+    marginal,
+    surface_distance,
+)
+from shapepose_fg.pipeline.solving import window_solutions
+from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.viz.bodies import surfaces
+
+WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return built_in_scene(people=2, cameras=4, frames=6)
+
+
+@pytest.fixture(scope="module")
+def people(scene) -> Reconstruction:
+    return reconstruct(simulate(scene), scene.rig)
+
+
+def test_blocks_are_what_is_reported(people):
+    who = int(people.person[0])
+    everything = [JointAt(who, name, frame) for frame in (1, 4) for name in BODY_25.joints]
+    both = marginal(people, *everything)
+    row = int(np.flatnonzero((people.person == who) & (people.frame == 4))[0])
+    for joint in (0, WRIST, 24):
+        np.testing.assert_allclose(both.block(25 + joint, 25 + joint), people.covariance[row, joint], atol=1e-12)
+    assert np.linalg.eigvalsh(both.covariance).min() > 0  # 150 numbers that can be known together
+    other = int(people.person[people.person != who][0])
+    apart = marginal(people, JointAt(who, "Neck", 1), JointAt(other, "Neck", 1))
+    assert not apart.block(0, 1).any()
+
+
+def test_correlation_is_the_product_along_the_limbs():
+    rho = correlation(BODY_25.joints, BODY_25.joints)
+    np.testing.assert_array_equal(np.diag(rho), 1)
+    np.testing.assert_array_equal(rho, rho.T)
+    assert np.linalg.eigvalsh(rho).min() > 0
+    at = {name: n for n, name in enumerate(BODY_25.joints)}
+    assert rho[at["RWrist"], at["RShoulder"]] == pytest.approx(0.4 * 0.12)
+    assert rho[at["RHip"], at["LHip"]] == pytest.approx(0.89**2)
+    assert correlation(["Tail"], ["Neck", "Tail"]).tolist() == [[0.0, 1.0]]
+
+
+def test_a_ball_around_nothing_is_a_noncentral_chi_square():
+    """Alike in all directions a distance has a known distribution, far into the tails."""
+    for mean, sigma, limit in (([0.1, 0.2, 0.05], 0.02, 0.2), ([0, 0, 0], 0.03, 0.05), ([0.5, 0, 0], 0.02, 0.4)):
+        apart = np.array(mean, dtype=float)
+        true = ncx2.cdf((limit / sigma) ** 2, 3, max(apart @ apart / sigma**2, 1e-12))
+        assert float(Distance(apart, sigma**2 * np.eye(3)).below(limit)) == pytest.approx(true, rel=1e-3)
+
+
+def test_any_ellipsoid_is_as_drawn():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(3, 3)) * [0.01, 0.03, 0.06]
+    apart, covariance = np.array([0.05, 0.02, -0.03]), A @ A.T
+    drawn = np.linalg.norm(rng.multivariate_normal(apart, covariance, 200_000), axis=1)
+    found = Distance(apart, covariance)
+    for limit in (0.01, 0.05, 0.1, 0.2):
+        assert float(found.below(limit)) == pytest.approx((drawn < limit).mean(), abs=4e-3)  # drawn to 1e-3
+    assert float(found.mean_m) == pytest.approx(drawn.mean(), rel=0.01)
+    assert float(found.sigma_m) == pytest.approx(drawn.std(), rel=0.02)
+    assert float(found.quantile(0.9)) == pytest.approx(np.quantile(drawn, 0.9), rel=0.02)
+
+
+def test_an_interval_holds_the_truth_at_any_distance():
+    """400 measurements of each distance, from contact on: two in 100 more or less are chance."""
+    rng = np.random.default_rng(1)
+    covariance = np.diag([0.01, 0.02, 0.015]) ** 2
+    for true in (0.0, 0.01, 0.05, 0.5):
+        measured = np.array([0, true, 0]) + rng.multivariate_normal(np.zeros(3), covariance, 400)
+        low, high = Distance(measured, np.broadcast_to(covariance, (400, 3, 3))).interval(0.95)
+        held = ((low <= true) & (true <= high)).mean()
+        assert held == pytest.approx(0.975 if true == 0 else 0.95, abs=0.025)  # from 0 on one side is left
+
+
+def test_joints_that_err_together_are_nearer_known_apart(people):
+    """Hips err alike: the way between them is known better than if each erred by itself."""
+    row = int(people.person[0]), int(people.frame[0])
+    hips = [JointAt(row[0], name, row[1]) for name in ("RHip", "LHip")]
+    together = distance(people, *hips)
+    alone = sum(marginal(people, each).covariance for each in hips)
+    assert np.trace(together.covariance) < 0.5 * np.trace(alone)
+    assert float(together.mean_m) == pytest.approx(np.linalg.norm(together.apart), rel=0.05)
+    to_point = distances(people, people.joints[:, WRIST])
+    assert to_point.below(0.1).shape == people.joints.shape[:2]
+    assert (to_point.below(0.1)[:, WRIST] > 0.9).all()
+
+
+def test_a_point_before_a_chest(people):
+    body = BodyModel.default()
+    vertices, rows = surfaces(people, body)
+    nose = people.joints[rows[0], BODY_25.index("Nose")]
+    vertex = int(np.linalg.norm(vertices[0] - nose, axis=1).argmin())
+    centre = vertices[0].mean(axis=0)
+    out = (vertices[0][vertex] - centre) * [1, 1, 0]
+    out /= np.linalg.norm(out)
+    who = int(people.person[rows[0]]), int(people.frame[rows[0]])
+    for away in (0.2, 1.0):
+        found = surface_distance(people, body, *who, vertices[0][vertex] + away * out)
+        true = np.linalg.norm(vertices[0] - vertices[0][vertex] - away * out, axis=1).min()
+        assert found.signed_m == pytest.approx(true, abs=0.01)
+        assert found.below(found.signed_m) == pytest.approx(0.5)
+    assert surface_distance(people, body, *who, people.joints[rows[0], BODY_25.index("MidHip")]).signed_m < 0
+
+
+def test_what_has_no_place_is_named(people):
+    joints = people.joints.copy()
+    joints[0, WRIST] = np.nan
+    lost = replace(people, joints=joints)
+    who = int(people.person[0]), int(people.frame[0])
+    with pytest.raises(NotDetermined, match=f"RWrist of person {who[0]} in frame {who[1]} .* is not determined"):
+        distance(lost, JointAt(who[0], "RWrist", who[1]), [0, 0, 0])
+    with pytest.raises(ValueError, match="person 99 is not in frame 0"):
+        marginal(people, JointAt(99, "RWrist", 0))
+
+
+def test_a_failure_of_gtsam_is_named(people, scene):
+    """A distance alone does not place a wrist: GTSAM tells a number, the graph whose it is and when."""
+    solution = next(window_solutions(people, scene.rig))
+    wrist, elbow = (int(solution.keys[2, joint]) for joint in (WRIST, ELBOW))
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.push_back(gtsam.RangeFactor3(wrist, elbow, 0.25, gtsam.noiseModel.Isotropic.Sigma(1, 0.01)))
+    for key in (wrist, elbow):
+        values.insert(key, solution.values.atPoint3(key))
+    with pytest.raises(RuntimeError) as told:
+        gtsam.Marginals(graph, values)
+    named = solution.not_determined(told.value, people.joint_names.tolist())
+    assert named is not None
+    assert named.joint in ("RWrist", "RElbow")
+    assert (named.person, named.frame) == (solution.person, int(solution.frames[2]))
+    assert "saw it" in str(named)
+    assert solution.not_determined(RuntimeError("no such key"), people.joint_names.tolist()) is None

@@ -1,0 +1,178 @@
+"""Joints that were spoiled on purpose: `explain` names what was done, and says nothing of those that were not."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg import InputError, explain, reconstruct, write_rig
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.pipeline.explaining import Cause, Explanation
+from shapepose_fg.pipeline.solving import Solver, solve_rows
+from shapepose_fg.simulation import built_in_scene, simulate
+
+ELBOW, SPOILED = 6, range(3, 8)
+"""LElbow, and the frames in which its detections are changed."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return built_in_scene(people=3, cameras=4, frames=12, seed=3)
+
+
+@pytest.fixture(scope="module")
+def people(scene) -> Reconstruction:
+    return reconstruct(simulate(scene, seed=3), scene.rig)
+
+
+def solved(people: Reconstruction, rig, **columns) -> Reconstruction:
+    """The rows solved from other detections, or before other cameras."""
+    assert people.observations is not None
+    table = replace(people.observations, **columns)
+    return solve_rows(replace(people, observations=table), Solver.of(people, rig))
+
+
+def seen_by_many(people: Reconstruction, frame: int = 5) -> tuple[int, int, np.ndarray]:
+    """A person whose elbow most cameras use in a frame: number, row, cameras."""
+    assert people.observations is not None
+    used = people.observations.used[:, ELBOW].sum(axis=-1) * (people.frame == frame)
+    row = int(used.argmax())
+    return int(people.person[row]), row, np.flatnonzero(people.observations.used[row, ELBOW])
+
+
+def rows_of(people: Reconstruction, person: int) -> np.ndarray:
+    return np.flatnonzero((people.person == person) & np.isin(people.frame, SPOILED))
+
+
+def without(table: ObservationTable, rows: np.ndarray, views: list[int]) -> dict[str, np.ndarray]:
+    """Columns of a table in which some views have not seen the elbow."""
+    empty = {"xy": np.nan, "residual_px": np.nan, "gate": 0, "candidate": -1, "confidence": 0, "probability": 0}
+    columns = {name: getattr(table, name).copy() for name in empty}
+    for name, nothing in empty.items():
+        columns[name][rows[:, None], ELBOW, np.array(views)] = nothing
+    return columns
+
+
+def asked(people: Reconstruction, rig, person: int) -> Explanation:
+    return explain(people, rig, person=person, joint="LElbow", frame=5)
+
+
+def first(found: Explanation) -> tuple[Cause, tuple[str, ...]]:
+    return found.findings[0].cause, found.findings[0].cameras
+
+
+def test_nothing_is_the_matter(people, scene):
+    person, _, cameras = seen_by_many(people)
+    found = asked(people, scene.rig, person)
+    assert found.findings == ()
+    assert [view.gate for view in found.views].count("used") == len(cameras)
+    whole = sum(view.share for view in found.views) + found.body_share + found.motion_share
+    assert whole == pytest.approx(1, abs=1e-9)
+    assert all(view.off_sigma < 3 for view in found.views if view.off_sigma is not None)
+
+
+def test_no_view_and_one_view(people, scene):
+    person, _, cameras = seen_by_many(people)
+    rows = rows_of(people, person)
+    nobody = asked(
+        solved(people, scene.rig, **without(people.observations, rows, [0, 1, 2, 3])), scene.rig, person
+    )
+    assert first(nobody) == (Cause.PRIOR_ONLY, ())
+    assert nobody.body_share + nobody.motion_share == pytest.approx(1, abs=1e-9)
+    others = [view for view in range(4) if view != cameras[0]]
+    one = asked(solved(people, scene.rig, **without(people.observations, rows, others)), scene.rig, person)
+    assert first(one) == (Cause.ONE_VIEW, (scene.rig.names[cameras[0]],))
+
+
+def test_a_detection_where_nobody_is(people, scene):
+    """Half a metre off, straight up in the picture."""
+    person, _, cameras = seen_by_many(people)
+    xy = people.observations.xy.copy()
+    xy[rows_of(people, person), ELBOW, cameras[0], 1] -= 150
+    found = asked(solved(people, scene.rig, xy=xy), scene.rig, person)
+    assert first(found) == (Cause.GATED, (scene.rig.names[cameras[0]],))
+    assert found.views[cameras[0]].off_px == pytest.approx(150, rel=0.2)
+    assert found.views[cameras[0]].share == 0
+
+
+def test_somebody_elses_detection(people, scene):
+    person, _, cameras = seen_by_many(people)
+    table, view = people.observations, None
+    for other in np.flatnonzero((people.frame == 5) & (people.person != person)):
+        common = np.intersect1d(cameras, np.flatnonzero(table.used[other, ELBOW]))
+        if len(common):
+            view, name = int(common[0]), int(people.person[other])
+    assert view is not None
+    theirs = np.flatnonzero((people.person == name) & np.isin(people.frame, SPOILED))
+    columns = without(table, theirs, [view])
+    for mine in rows_of(people, person):
+        same = theirs[people.frame[theirs] == people.frame[mine]]
+        if len(same) and table.gate[same[0], ELBOW, view] and table.gate[mine, ELBOW, view]:
+            columns["xy"][mine, ELBOW, view] = table.xy[same[0], ELBOW, view]
+    found = asked(solved(people, scene.rig, **columns), scene.rig, person)
+    assert first(found) == (Cause.FOREIGN, (scene.rig.names[view],))
+    assert found.views[view].looks_like == f"person {name}'s LElbow"
+
+
+def test_views_that_the_body_contradicts(people, scene):
+    """All views put the elbow 60 cm above itself."""
+    person, _, cameras = seen_by_many(people)
+    rows, xy = rows_of(people, person), people.observations.xy.copy()
+    up = np.array([0.0, 0.0, 0.6])
+    for row in rows:
+        moved = (
+            scene.rig.project(people.joints[row, ELBOW] + up)[0] - scene.rig.project(people.joints[row, ELBOW])[0]
+        )
+        xy[row, ELBOW] += moved
+    found = asked(solved(people, scene.rig, xy=xy), scene.rig, person)
+    cause, named = first(found)
+    assert cause == Cause.CONTRADICTION
+    assert set(named) == {scene.rig.names[view] for view in cameras}
+    assert {found.views[view].gate for view in cameras} == {_gate(Gate.CONTRADICTS_BODY)}
+
+
+def _gate(gate: Gate) -> str:
+    return gate.name.lower().replace("_", " ")
+
+
+def test_a_camera_that_was_turned(people, scene):
+    person, _, cameras = seen_by_many(people)
+    view, all_of_them = int(cameras[0]), list(scene.rig.cameras)
+    wTc = all_of_them[view].wTc.copy()
+    wTc[:3, :3] = wTc[:3, :3] @ Rotation.from_rotvec([0, np.radians(2.0), 0]).as_matrix()
+    all_of_them[view] = replace(all_of_them[view], wTc=wTc)
+    spoiled = replace(scene.rig, cameras=tuple(all_of_them))
+    found = asked(solved(people, spoiled), spoiled, person)
+    assert first(found) == (Cause.WRONG_CAMERA, (scene.rig.names[view],))
+    assert "turned by 2." in found.findings[0].words or "turned by 1.9" in found.findings[0].words
+
+
+def test_the_command_says_the_same(people, scene, tmp_path, capsys):
+    people.save(tmp_path)
+    write_rig(scene.rig, tmp_path / CAMERAS)
+    person, _, _ = seen_by_many(people)
+    with pytest.raises(SystemExit) as ended:
+        main(["explain", str(tmp_path), str(person), "LElbow", "--frame", "5", "--json"])
+    assert ended.value.code == 0
+    told, found = json.loads(capsys.readouterr().out), asked(people, scene.rig, person)
+    assert told["position_m"] == pytest.approx(found.position_m, abs=1e-6)
+    assert [view["gate"] for view in told["views"]] == [view.gate for view in found.views]
+    with pytest.raises(SystemExit):
+        main(["explain", str(tmp_path), str(person), "LElbow", "--time", str(5 / 30)])
+    screen = capsys.readouterr().out
+    assert "LElbow of person" in screen
+    assert "cameras agree on it" in screen
+
+
+def test_who_is_not_there_is_said(people, scene):
+    with pytest.raises(InputError, match="person 77: is not in the result"):
+        explain(people, scene.rig, person=77, joint="LElbow", frame=5)
+    with pytest.raises(InputError, match="joint Tail: the result has none of that name"):
+        explain(people, scene.rig, person=int(people.person[0]), joint="Tail", frame=int(people.frame[0]))
+    with pytest.raises(InputError, match="is not in frame 99"):
+        explain(people, scene.rig, person=int(people.person[0]), joint="LElbow", frame=99)
