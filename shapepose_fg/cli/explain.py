@@ -11,7 +11,7 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from shapepose_fg.pipeline.explaining import Explanation
+    from shapepose_fg.pipeline.explanation import Explanation
 
 
 @grouped

@@ -1,9 +1,7 @@
 """Why a joint is where it is: what each view, the body and motion say of it, and what speaks against them."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from enum import StrEnum
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +15,7 @@ from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
 from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, Finding, ViewReason
 from shapepose_fg.pipeline.solving import Solver, solved_around
 
 OFF_SIGMA = 3.0
@@ -26,116 +25,6 @@ _WINDOW_FRAMES = 48
 """Frames before and after, whose detections tell whether a camera is wrong."""
 _APART = 0.5
 """A detection is somebody else's where it lies in less than this share of the distance from theirs."""
-
-
-class Cause(StrEnum):
-    """What is the matter with a joint, the gravest first."""
-
-    NOT_SOLVED = "not solved"
-    """The solver found no place for it."""
-    WRONG_CAMERA = "wrong camera"
-    """A camera that saw it is off with whatever it sees: its pose, its lens or its clock is wrong."""
-    FOREIGN = "foreign detection"
-    """A detection is another's, or of the other side of the body."""
-    CONTRADICTION = "contradiction"
-    """Several views, or a view and the body, put it at places that cannot all be true."""
-    GATED = "gated view"
-    """One detection lies where, by all others, the joint is not, and is nobody else's."""
-    PRIOR_ONLY = "prior only"
-    """No view's detection was used."""
-    ONE_VIEW = "one view"
-    """One view's detection was used, which tells no depth."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is the matter."""
-
-    cause: Cause
-    """What."""
-    cameras: tuple[str, ...]
-    """With which cameras; none where it is with no camera."""
-    words: str
-    """In a sentence or two."""
-
-
-@dataclass(frozen=True)
-class ViewReason:
-    """What one camera has to do with a joint."""
-
-    camera: str
-    """Its name."""
-    gate: str
-    """Whether its detection was used, and why not: a name of `Gate`."""
-    detection_px: tuple[float, float] | None
-    """Where it is, undistorted pixels; None where there is none."""
-    score: float
-    """The detector's, 0 to 1."""
-    probability: float
-    """That the detection is this person's, by the assignment."""
-    sigma_px: float | None
-    """How far off such a detection usually is, one sigma per axis."""
-    residual_px: tuple[float, float] | None
-    """The joint as it is reported, projected, minus the detection."""
-    off_px: float | None
-    """How far the detection is from where all *else* has the joint, this detection not counted."""
-    off_sigma: float | None
-    """The same in standard deviations: of the detection, and of where all else has the joint."""
-    share: float
-    """Of what the solver knows of the joint, 0 to 1."""
-    looks_like: str = ""
-    """Whose joint the detection rather is, as `person 3's RWrist`; empty where it fits nobody better."""
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """Why a joint is where it is."""
-
-    person: int
-    joint: str
-    frame: int
-    time_s: float | None
-    position_m: tuple[float, float, float] | None
-    """As reported, world; None where unknown."""
-    sigma_m: float | None
-    """As reported: root mean square over the axes."""
-    known: str
-    """A name of `Known`."""
-    status: str
-    """Of the row."""
-    views: tuple[ViewReason, ...]
-    """Camera by camera."""
-    body_share: float
-    """Of what the solver knows of the joint, what the body says of it without the joint's own views."""
-    motion_share: float
-    """And what comes from other frames."""
-    findings: tuple[Finding, ...]
-    """What is the matter, the gravest first; none where nothing is."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, as `shapepose-fg explain --json` prints them."""
-        return asdict(self)
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        """The same in sentences: where it is, what is the matter, and what says so."""
-        when = f"frame {self.frame}" + (f" ({self.time_s:.3f} s)" if self.time_s is not None else "")
-        who = f"{self.joint} of person {self.person} in {when}"
-        if self.position_m is None or self.sigma_m is None:
-            where = f"{who} has no place."
-        else:
-            x, y, z = self.position_m
-            where = f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm (one sigma)."
-        used = [view for view in self.views if view.gate == _GATES[Gate.USED]]
-        told = [f"{view.camera} {view.share:.0%}" for view in used]
-        parts = [*told, f"the body {self.body_share:.0%}", f"motion, from other frames, {self.motion_share:.0%}"]
-        shares = f"What is known of it comes from: {', '.join(parts)}."
-        matter = [finding.words for finding in self.findings]
-        good = f"{len(used)} cameras agree on it, and nothing speaks against them."
-        return (where, *(matter or [good]), *([shares] if self.position_m is not None else []))
-
-
-_GATES = {gate: gate.name.lower().replace("_", " ") for gate in Gate}
 
 
 def explain(
@@ -279,7 +168,7 @@ def _view_reasons(
             like = _looks_like(all_of_it, row, joint, v, off_px, off_sigma)
         reason = ViewReason(
             camera=name,
-            gate=_GATES[Gate(gates[v])],
+            gate=GATES[Gate(gates[v])],
             detection_px=_pair(table.xy[row, joint, v]),
             score=float(table.confidence[row, joint, v]),
             probability=float(table.probability[row, joint, v]),
@@ -328,7 +217,7 @@ def _findings(
     wrong: WrongView | None,
 ) -> tuple[Finding, ...]:
     """What is the matter with a joint, the gravest first."""
-    found, used = list[Finding](), [view for view in views if view.gate == _GATES[Gate.USED]]
+    found, used = list[Finding](), [view for view in views if view.gate == GATES[Gate.USED]]
     problem = _problem(people, row, joint)
     if problem:
         found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
@@ -339,7 +228,7 @@ def _findings(
             f" and moved by {100 * wrong.shift_m:.0f} cm it would fit the others. Check its pose, lens and clock."
         )
         found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
-    left = [view for view in views if view.gate not in (_GATES[Gate.USED], _GATES[Gate.NOT_SEEN])]
+    left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
     suspects = [view for view in (*left, *used) if view.camera not in {n for each in found for n in each.cameras}]
     for view in suspects:
         if view.looks_like:
@@ -349,7 +238,7 @@ def _findings(
             found.append(Finding(Cause.FOREIGN, (view.camera,), words))
     named = {name for each in found for name in each.cameras}
     suspects = [view for view in suspects if view.camera not in named]
-    against = [view for view in suspects if view.gate == _GATES[Gate.CONTRADICTS_BODY]]
+    against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
     if len(against) + len(doubted) == 1 and len(agree) > 0:  # one against all others: its detection is wrong
@@ -364,7 +253,7 @@ def _findings(
             )
             if several:
                 found.append(Finding(Cause.CONTRADICTION, cameras, words))
-    alone += [view for view in suspects if view.gate == _GATES[Gate.TOO_FAR]]
+    alone += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
     for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
         words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
         found.append(Finding(Cause.GATED, (view.camera,), words))
@@ -390,7 +279,7 @@ def _problem(people: Reconstruction, row: int, joint: int) -> str:
 
 
 def _taken(view: ViewReason) -> str:
-    return "It was left out." if view.gate != _GATES[Gate.USED] else "It was used, with less weight."
+    return "It was left out." if view.gate != GATES[Gate.USED] else "It was used, with less weight."
 
 
 def _off(view: ViewReason) -> str:
@@ -406,7 +295,11 @@ def _cameras(names: Sequence[str]) -> str:
 
 def _mirrored(name: str) -> str:
     """The joint of the other side of the body, by its name."""
-    return {"R": "L", "L": "R"}.get(name[0], name[0]) + name[1:]
+    for sides in (("left", "right"), ("Left", "Right"), ("L", "R")):
+        for one, other in (sides, sides[::-1]):
+            if name.startswith(one):
+                return other + name.removeprefix(one)
+    return name
 
 
 def _positive(matrix: Array) -> Array:

@@ -12,7 +12,7 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline.explaining import Cause, Explanation
+from shapepose_fg.pipeline.explanation import Cause, Explanation
 from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
 

@@ -44,6 +44,7 @@ LEVELS = (
     "pipeline.pipeline",
     "io",
     "pipeline.solving",
+    "pipeline.explanation",
     "pipeline.explaining",
     "live",
     "simulation viz.bodies detection2d",

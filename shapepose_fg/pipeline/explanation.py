@@ -1,0 +1,117 @@
+"""What is said of a joint, and why it is where it is: as data, and in words."""
+
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+from shapepose_fg.core.observation_table import Gate
+
+GATES = {gate: gate.name.lower().replace("_", " ") for gate in Gate}
+"""How gates are called."""
+
+
+class Cause(StrEnum):
+    """What is the matter with a joint, the gravest first."""
+
+    NOT_SOLVED = "not solved"
+    """The solver found no place for it."""
+    WRONG_CAMERA = "wrong camera"
+    """A camera that saw it is off with whatever it sees: its pose, its lens or its clock is wrong."""
+    FOREIGN = "foreign detection"
+    """A detection is another's, or of the other side of the body."""
+    CONTRADICTION = "contradiction"
+    """Several views, or a view and the body, put it at places that cannot all be true."""
+    GATED = "gated view"
+    """One detection lies where, by all others, the joint is not, and is nobody else's."""
+    PRIOR_ONLY = "prior only"
+    """No view's detection was used."""
+    ONE_VIEW = "one view"
+    """One view's detection was used, which tells no depth."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is the matter."""
+
+    cause: Cause
+    """What."""
+    cameras: tuple[str, ...]
+    """With which cameras; none where it is with no camera."""
+    words: str
+    """In a sentence or two."""
+
+
+@dataclass(frozen=True)
+class ViewReason:
+    """What one camera has to do with a joint."""
+
+    camera: str
+    """Its name."""
+    gate: str
+    """Whether its detection was used, and why not: a name of `Gate`."""
+    detection_px: tuple[float, float] | None
+    """Where it is, undistorted pixels; None where there is none."""
+    score: float
+    """The detector's, 0 to 1."""
+    probability: float
+    """That the detection is this person's, by the assignment."""
+    sigma_px: float | None
+    """How far off such a detection usually is, one sigma per axis."""
+    residual_px: tuple[float, float] | None
+    """The joint as it is reported, projected, minus the detection."""
+    off_px: float | None
+    """How far the detection is from where all *else* has the joint, this detection not counted."""
+    off_sigma: float | None
+    """The same in standard deviations: of the detection, and of where all else has the joint."""
+    share: float
+    """Of what the solver knows of the joint, 0 to 1."""
+    looks_like: str = ""
+    """Whose joint the detection rather is, as `person 3's RWrist`; empty where it fits nobody better."""
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why a joint is where it is."""
+
+    person: int
+    joint: str
+    frame: int
+    time_s: float | None
+    position_m: tuple[float, float, float] | None
+    """As reported, world; None where unknown."""
+    sigma_m: float | None
+    """As reported: root mean square over the axes."""
+    known: str
+    """A name of `Known`."""
+    status: str
+    """Of the row."""
+    views: tuple[ViewReason, ...]
+    """Camera by camera."""
+    body_share: float
+    """Of what the solver knows of the joint, what the body says of it without the joint's own views."""
+    motion_share: float
+    """And what comes from other frames."""
+    findings: tuple[Finding, ...]
+    """What is the matter, the gravest first; none where nothing is."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as `shapepose-fg explain --json` prints them."""
+        return asdict(self)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The same in sentences: where it is, what is the matter, and what says so."""
+        when = f"frame {self.frame}" + (f" ({self.time_s:.3f} s)" if self.time_s is not None else "")
+        who = f"{self.joint} of person {self.person} in {when}"
+        if self.position_m is None or self.sigma_m is None:
+            where = f"{who} has no place."
+        else:
+            x, y, z = self.position_m
+            where = f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm (one sigma)."
+        used = [view for view in self.views if view.gate == GATES[Gate.USED]]
+        told = [f"{view.camera} {view.share:.0%}" for view in used]
+        parts = [*told, f"the body {self.body_share:.0%}", f"motion, from other frames, {self.motion_share:.0%}"]
+        shares = f"What is known of it comes from: {', '.join(parts)}."
+        matter = [finding.words for finding in self.findings]
+        good = f"{len(used)} cameras agree on it, and nothing speaks against them."
+        return (where, *(matter or [good]), *([shares] if self.position_m is not None else []))
