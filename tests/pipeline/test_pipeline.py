@@ -14,7 +14,8 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.evaluation.shelf import evaluate_shelf, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import evaluate_shelf
+from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.config import PeopleConfig, SolvingConfig
