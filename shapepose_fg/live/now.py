@@ -10,7 +10,7 @@ from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.filtering import Moment, replaced
-from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
+from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.stitching import Trace
 from shapepose_fg.tracking.tracker import Tracker
 from shapepose_fg.tracking.worlds import PLACED_M
@@ -24,9 +24,6 @@ _PACE = 0.1
 """what the filter's variances of velocities are: it follows as if everybody were fast (`pipeline.setup.FAST_M_S`).
 With both 95 % regions hold 96, 96 and 98 % of joints 0.1, 0.3 and 1 s ahead (crossing 0:120). All four constants
 were chosen on split tune, seed 6802, and on crossing, so that this is no test of them."""
-_UNSEEN_M = 0.05
-"""A joint that the filter knows less well is taken from the refined body where that knows it better."""
-
 
 @dataclass(frozen=True)
 class Bodies:
@@ -44,23 +41,19 @@ class Bodies:
 
 
 def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
-    """The people, with unseen joints where the `refined` rows of a frame shortly before put them, if these know
-    them better: a body knows where a joint must be that no camera sees.
-    """
+    """The people after a frame, with joints where its `refined` rows put them, as far as they do."""
     identity = refined.person.tolist()
     rows = np.array([n for n, who in enumerate(now.identity.tolist()) if who in identity], dtype=np.intp)
     if len(rows) == 0:
         return now
     which = np.array([identity.index(who) for who in now.identity[rows].tolist()], dtype=np.intp)
-    states, known = _states(tracker, refined.rows(which))
-    ahead_s = now.tracks.time_s - float(refined.time_s[0])
-    by, _ = _ahead(tracker, states, ahead_s)
+    by, known = _states(tracker, refined.rows(which))
     joints = now.tracks.joints.rows(rows)
-    better = known & (joints.sigma_m > _UNSEEN_M) & (by.sigma_m < joints.sigma_m) & (now.views[rows] == 0)
-    fed = replaced(joints, by, better)
+    fed = replaced(joints, by, known)
     mean, covariance = now.tracks.joints.mean.copy(), now.tracks.joints.covariance.copy()
     of_body = now.of_body.copy()
-    mean[rows], covariance[rows], of_body[rows] = fed.mean, fed.covariance, of_body[rows] | better
+    mean[rows], covariance[rows] = fed.mean, fed.covariance
+    of_body[rows] |= known & (now.views[rows] == 0)
     return replace(now, tracks=replace(now.tracks, joints=JointStates(mean, covariance)), of_body=of_body)
 
 
@@ -131,12 +124,6 @@ def later(joints: JointStates, skeleton: Skeleton, motion: MotionModel, ahead_s:
 def _no_body(P: int) -> dict[str, Array]:
     shapes = {"betas": (P, 10), "global_orient": (P, 3), "body_pose": (P, 23, 3), "transl": (P, 3)}
     return {name: np.full(shapes[name], np.nan) for name in BODY}
-
-
-def _ahead(tracker: Tracker, joints: JointStates, ahead_s: float) -> tuple[JointStates, Mask]:
-    """Joints later, by the model of motion; and which are lost."""
-    bones = Bones.of(tracker.skeleton, tracker.scale.longest_m)
-    return predicted(joints, ahead_s, tracker.scale.motion, tracker.scale.density, bones)
 
 
 def _states(tracker: Tracker, rows: Reconstruction) -> tuple[JointStates, Mask]:

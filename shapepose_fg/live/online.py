@@ -332,6 +332,15 @@ class OnlineReconstructor:
             slot.moment, slot.candidate = self._filter.step(self._state.slots[at - 1].moment, slot.given)
         self._show()
 
+    def _restart(self, refined: Reconstruction) -> None:
+        """Follow anew from a frame on whose people are refined: they know better where joints are."""
+        frames = [slot.given.frame for slot in self._state.slots]
+        if refined.frame[0] in frames:
+            at = frames.index(refined.frame[0])
+            slot = self._state.slots[at]
+            slot.moment = fed_back(self._filter.tracker, slot.moment, refined)
+            self._again(at + 1)
+
     def _refine(self, *, last: bool = False) -> None:
         """Send what is due, forget what is done.
 
@@ -366,9 +375,7 @@ class OnlineReconstructor:
                 self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
                 self._state.bodies = Bodies.of(refined.newest, self._setup.skeleton)
-                self._state.slots[-1].moment = fed_back(
-                    self._filter.tracker, self._state.slots[-1].moment, refined.newest
-                )
+                self._restart(refined.newest)
         newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
         while len(self._state.settled) > 0 and newest_s - float(self._state.settled[0].time_s.max()) > _KEPT_S:
             self._state.not_taken += len(self._state.settled.popleft())
