@@ -18,12 +18,18 @@ from shapepose_fg.tracking.worlds import PLACED_M
 _OWN_S, _TOGETHER_S = 0.3, 0.7
 """So long a joint goes on as it moves beside its person, and the person as it moves: 0.3 and 1 s ahead errors are
 11 and 39 % smaller than straight on (simulated, split tune and crossing)."""
-_LATER = 2.0
-"""What the density of accelerations is multiplied with (`MotionModel.psd_still`, `psd_speed`), and """
-_PACE = 0.1
-"""what the filter's variances of velocities are: it follows as if everybody were fast (`pipeline.setup.FAST_M_S`).
-With both 95 % regions hold 96, 96 and 98 % of joints 0.1, 0.3 and 1 s ahead (crossing 0:120). All four constants
-were chosen on split tune, seed 6802, and on crossing, so that this is no test of them."""
+_LATER, _FADES_S = 3.5, 0.25
+"""What the density of accelerations (`MotionModel.acceleration`) is multiplied with, and for how long they last."""
+_PACE, _PACE_UNSEEN = 0.1, 0.4
+"""What the filter's variances of velocities are multiplied with, of joints that two views see and of others: it
+follows as if everybody were fast (`pipeline.setup.FAST_M_S`)."""
+_OF_ONE_VIEW, _OF_NONE = 1.5, 1.8
+"""The same of positions: whose detection a view has is less sure where no other agrees.
+
+With all of these 95 % regions hold 96 to 98 % now and 0.1 s, 96 to 98 % 0.3 s and 95 to 98 % 1 s ahead, of joints
+that one view sees or none 90 to 100 % (four stretches of split `tune`, refined 0.13 s later, on which they were
+chosen; docs/live.md has others)."""
+
 
 @dataclass(frozen=True)
 class Bodies:
@@ -64,8 +70,8 @@ def people_at(
     order = np.flatnonzero(now.named)[np.argsort(now.identity[now.named], kind="stable")]
     now = now.rows(order)
     P, J = now.views.shape
-    joints, known = now.tracks.joints, now.tracks.joints.sigma_m < PLACED_M
-    mean, covariance = later(joints, tracker.skeleton, motion, ahead_s)
+    known = now.tracks.joints.sigma_m < PLACED_M
+    mean, covariance = later(now, tracker.skeleton, motion, ahead_s)
     code = np.where(now.views >= 2, Known.SEEN, np.where(now.views == 1, Known.WEAK, Known.MOTION))
     code = np.where(now.of_body, Known.BODY, code)
     places = np.where(known[..., None], mean[..., :3], np.nan)
@@ -98,26 +104,32 @@ def people_at(
     )
 
 
-def later(joints: JointStates, skeleton: Skeleton, motion: MotionModel, ahead_s: float) -> tuple[Array, Array]:
-    """Position and velocity (A, J, 6) of joints `ahead_s` later, and what is reported of them: covariances
-    (A, J, 6, 6) of either, without what they have in common.
+def later(now: Moment, skeleton: Skeleton, motion: MotionModel, ahead_s: float) -> tuple[Array, Array]:
+    """Position and velocity (A, J, 6) of everybody's joints `ahead_s` later, and what is reported of them:
+    covariances (A, J, 6, 6) of either, without what they have in common.
 
     A joint's velocity becomes that of its person, the median of the core joints', and this fades: white noise on
-    accelerations, with friction.
+    accelerations, with friction; more the faster the joint and the person's joints are: who walks swings the leg
+    that stands.
     """
+    joints = now.tracks.joints
     x, v = joints.position, joints.velocity
     core = np.median(v[:, list(skeleton.core)], axis=1, keepdims=True)
     own, together = (tau * -np.expm1(-ahead_s / tau) for tau in (_OWN_S, _TOGETHER_S))
     mean = np.empty((*x.shape[:2], 6))
     mean[..., :3] = x + together * core + own * (v - core)
     mean[..., 3:] = np.exp(-ahead_s / _TOGETHER_S) * core + np.exp(-ahead_s / _OWN_S) * (v - core)
-    density, tau, a = _LATER * motion.acceleration(np.linalg.norm(v, axis=-1)), _TOGETHER_S, ahead_s / _TOGETHER_S
+    speed = np.linalg.norm(v, axis=-1)
+    density = _LATER * motion.acceleration((speed + speed.mean(axis=1, keepdims=True)) / 2)
+    tau, a = _FADES_S, ahead_s / _FADES_S
     fades = -np.expm1(-2 * a) / 2
     covariance, eye = np.zeros((*x.shape[:2], 6, 6)), np.eye(3)
-    pace = _PACE * joints.covariance[..., 3:6, 3:6]
+    wider, pace = np.array([_OF_NONE, _OF_ONE_VIEW, 1.0]), np.array([_PACE_UNSEEN, _PACE_UNSEEN, _PACE])
+    wider, pace = (each[np.minimum(now.views, 2)][..., None, None] for each in (wider, pace))
+    moves = pace * joints.covariance[..., 3:6, 3:6]
     grows = (density * tau**3 * (a + 2 * np.expm1(-a) + fades))[..., None, None]
-    covariance[..., :3, :3] = joints.covariance[..., :3, :3] + own**2 * pace + grows * eye
-    covariance[..., 3:, 3:] = pace + (density * tau * fades)[..., None, None] * eye
+    covariance[..., :3, :3] = wider * joints.covariance[..., :3, :3] + own**2 * moves + grows * eye
+    covariance[..., 3:, 3:] = moves + (density * tau * fades)[..., None, None] * eye
     return mean, covariance
 
 
