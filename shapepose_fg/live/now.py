@@ -6,8 +6,13 @@ from typing import Any, cast
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.carried_error import carried_covariance
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.linearisation import Message, linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.filtering import Moment, replaced
 from shapepose_fg.tracking.motion_filter import JointStates
@@ -19,7 +24,7 @@ _OWN_S, _TOGETHER_S = 0.3, 0.7
 """So long a joint goes on as it moves beside its person, and the person as it moves: 0.3 and 1 s ahead errors are
 11 and 39 % smaller than straight on (simulated, split tune and crossing)."""
 _LATER, _FADES_S = 3.5, 0.25
-"""What the density of accelerations (`MotionModel.acceleration`) is multiplied with, and for how long they last."""
+"""What the density of accelerations (`MotionModel.acceleration`) is multiplied with; for so long they last."""
 _PACE, _PACE_UNSEEN = 0.1, 0.4
 """What the filter's variances of velocities are multiplied with, of joints that two views see and of others: it
 follows as if everybody were fast (`pipeline.setup.FAST_M_S`)."""
@@ -63,15 +68,42 @@ def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
     return replace(now, tracks=replace(now.tracks, joints=JointStates(mean, covariance)), of_body=of_body)
 
 
-def people_at(
-    tracker: Tracker, motion: MotionModel, frame: int, now: Moment, bodies: Bodies | None, ahead_s: float
-) -> Reconstruction:
-    """Everybody `ahead_s` after the newest moment, as rows of its `frame`."""
+def of_poses(rows: Observations, joints: JointStates, rig: Rig, config: EstimatorConfig) -> Array:
+    """(A, J, 3, 3) what is in the covariances of joints because poses of cameras that move are not known exactly.
+
+    `rows` are what the newest frame has of A people: errors of poses last, so that no frame averages them out.
+    """
+    places, views = joints.position, Views.of(rig, rows.time_s)
+    sigmas = observation_sigmas(rows, places, views, config.observations, config.joints)
+    evidence = linearise(rows, sigmas, places, views, config.observations)
+    nothing = Message(places, np.zeros((*places.shape, 3)))
+    return carried_covariance(evidence, nothing, sigmas, views, config.observations)
+
+
+@dataclass(frozen=True)
+class Newest:
+    """The newest frame, as `people` is asked of it."""
+
+    frame: int
+    """Its number."""
+    moment: Moment
+    """The people."""
+    bodies: Bodies | None
+    """The last refined bodies."""
+    of_poses: Array | None = None
+    """(A, J, 3, 3) see `of_poses`; None where no camera moves."""
+
+
+def people_at(tracker: Tracker, motion: MotionModel, newest: Newest, ahead_s: float) -> Reconstruction:
+    """Everybody `ahead_s` after the newest moment, as rows of its frame."""
+    now, bodies = newest.moment, newest.bodies
     order = np.flatnonzero(now.named)[np.argsort(now.identity[now.named], kind="stable")]
     now = now.rows(order)
     P, J = now.views.shape
     known = now.tracks.joints.sigma_m < PLACED_M
     mean, covariance = later(now, tracker.skeleton, motion, ahead_s)
+    if newest.of_poses is not None:
+        covariance[..., :3, :3] += newest.of_poses[order]
     code = np.where(now.views >= 2, Known.SEEN, np.where(now.views == 1, Known.WEAK, Known.MOTION))
     code = np.where(now.of_body, Known.BODY, code)
     places = np.where(known[..., None], mean[..., :3], np.nan)
@@ -89,7 +121,7 @@ def people_at(
             np.isfinite(body["transl"][rows]).all(axis=1), bodies.rows.status[which], status[rows]
         )
     return Reconstruction(
-        frame=np.full(P, frame),
+        frame=np.full(P, newest.frame),
         person=now.identity,
         joint_names=np.array(tracker.skeleton.joints),
         joints=places,

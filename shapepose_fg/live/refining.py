@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Index, Whole
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -43,6 +44,8 @@ class Slot:
 class LiveState:
     """All that changes while frames come in, but for windows that are under way."""
 
+    rig: Rig
+    """The cameras; of those that move, where they were lately."""
     watch: CameraWatch
     """Which cameras are believed."""
     views: ViewsInStep
@@ -99,8 +102,8 @@ class Refinery:
         """How many windows are under way."""
         return len(self._sent)
 
-    def send(self, window: list[Slot], start: int, own: int) -> None:
-        """Have the `own` slots from `start` on solved with those around them."""
+    def send(self, window: list[Slot], start: int, own: int, rig: Rig) -> None:
+        """Have the `own` slots from `start` on solved with those around them, before the cameras of `rig`."""
         names = dict[int, int]()
         for slot in window:
             ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
@@ -115,7 +118,9 @@ class Refinery:
         if len(rows) == 0:
             return
         frames = np.array([slot.given.frame for slot in window])
-        part = self._workers.submit(Setup.solve, Span(tuple(decided), start, len(decided)))
+        part = self._workers.submit(
+            Setup.solve, Span(tuple(decided), start, len(decided), rig=rig if rig.moves else None)
+        )
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:

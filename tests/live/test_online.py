@@ -70,7 +70,7 @@ def test_covariances_grow_with_the_time_ahead_and_nothing_is_said_of_other_times
     sizes = [
         np.nanmean(np.trace(live.people(0.1 + ahead).covariance, axis1=2, axis2=3)) for ahead in (0, 0.1, 0.3, 1)
     ]
-    assert (np.diff(sizes) > 0).all() and sizes[3] > 10 * sizes[2] > 10 * sizes[1]
+    assert (np.diff(sizes) > 0).all() and sizes[3] > 5 * sizes[2] > 25 * sizes[1]
     for time_s in (0.05, 1.2):
         with pytest.raises(ValueError, match=r"from 0\.1 s, the newest frame, to 1 s later"):
             live.people(time_s)
