@@ -196,7 +196,7 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
     waiting = joined([each for each, _ in state.views.waiting.values()] or [Detections.empty()])
     for name, seen in (("waiting", waiting), ("before", state.before or Detections.empty())):
         arrays |= {f"{name}.{each}": getattr(seen, each) for each in _DETECTIONS}
-    for each in state.rig.trajectories:
+    for each in sorted(state.rig.trajectories, key=lambda each: each.name):
         known = np.full(len(each), each.name), each.time_s, each.wTb, each.covariance_at(each.time_s)
         for name, values in zip(("carrier", *_POSES), known, strict=True):
             before = [arrays[f"pose.{name}"]] if f"pose.{name}" in arrays else []
