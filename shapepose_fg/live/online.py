@@ -23,7 +23,7 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.filtering import Filter
-from shapepose_fg.live.now import Bodies, Newest, fed_back, of_poses, people_at
+from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
 from shapepose_fg.live.views import ViewsInStep, joined, with_pose
@@ -40,8 +40,8 @@ rounds take a seventh to a fifth more for the same figures (Shelf, crossing)."""
 _KEPT_S = 10.0
 """What is settled and nobody takes is kept for so long."""
 _BEFORE = 7.0
-"""A window has the lag over this before what it settles: a frame or two. With a third of the lag it takes an eighth
-more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
+"""A window has the lag over this before what it settles: a frame or two. With a third of the lag it takes an
+eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
 _BEHIND = 3.0
 """Frames older than so many lags are settled as they are, where solving does not keep up."""
 _MOST_SAID = 1000
@@ -127,7 +127,7 @@ class OnlineReconstructor:
         self._refinery = Refinery(self._workers, self._filter)
         self._state = LiveState(rig, CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
         self._said = deque[Said](maxlen=_MOST_SAID)
-        self._now = Newest(0, self._filter.nobody, None)
+        self._now = Newest(0, self._filter.nobody, fitter)
 
     @classmethod
     def load(
@@ -223,8 +223,8 @@ class OnlineReconstructor:
         """The people at `time_s`, from the newest frame's time (the default) to a second after it.
 
         A row per person, of the newest frame's number. Joints are predicted by the model of motion, and their
-        covariances grow with the time ahead. Bodies are the last refined ones, moved along with the joints.
-        ValueError for another time.
+        covariances grow with the time ahead. Bodies are fitted to the newest joints when somebody asks first, and
+        moved along with them; joints that no two views see are the body's. ValueError for another time.
         """
         newest = self._now
         newest_s = newest.moment.tracks.time_s
@@ -234,7 +234,7 @@ class OnlineReconstructor:
                 f"people are known from {newest_s:g} s, the newest frame, to {AHEAD_S:g} s later, not at"
                 f" {time_s:g} s; what was before is in settled()"
             )
-        return people_at(self._filter.tracker, self._motion, newest, max(ahead_s, 0.0))
+        return people_at(newest, self._setup.skeleton, self._motion, max(ahead_s, 0.0))
 
     def settled(self, *, wait: bool = False) -> Reconstruction:
         """The refined rows of all frames that have settled since this was asked last; with `wait`, until all that
@@ -405,7 +405,6 @@ class OnlineReconstructor:
             if len(refined.rows) > 0:
                 self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
-                self._state.bodies = Bodies.of(refined.newest, self._setup.skeleton)
                 self._restart(refined.newest)
         newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
         while len(self._state.settled) > 0 and newest_s - float(self._state.settled[0].time_s.max()) > _KEPT_S:
@@ -419,7 +418,8 @@ class OnlineReconstructor:
             if rig.moves:
                 rows = self._filter.observations(newest.moment, newest.candidate, newest.given)
                 carried = of_poses(rows, newest.moment.tracks.joints, rig, self._setup.estimator)
-            self._now = Newest(newest.given.frame, newest.moment, self._state.bodies, carried)
+            doubted = len(newest.given.rig.doubted) > 0
+            self._now = Newest(newest.given.frame, newest.moment, self._setup.fitter, doubted, carried)
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:

@@ -13,7 +13,6 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.live.cameras import CameraWatch
 from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
-from shapepose_fg.live.now import Bodies
 from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.setup import Setup
@@ -56,8 +55,6 @@ class LiveState:
     """The newest frame's detections, all of them."""
     settled: deque[Reconstruction] = field(default_factory=deque)
     """Rows that nobody has taken yet."""
-    bodies: Bodies | None = None
-    """The newest refined ones."""
     frames: int = 0
     """How many frames were taken in, and so on (`LiveReport`)."""
     late: int = 0

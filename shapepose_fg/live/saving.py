@@ -21,7 +21,6 @@ from shapepose_fg.core.storage.schema import Column
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.filtering import OF_TRACKS, Filter, Gone, Moment
-from shapepose_fg.live.now import Bodies
 from shapepose_fg.live.refining import LiveState, Slot
 from shapepose_fg.live.views import ViewsInStep, joined
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -49,7 +48,6 @@ _COLUMNS = {
     "covariance": Column("A J S S", most=1e18),
     "evident_s": Column("A", most=1e12),
     "views": Column("A J", _WHOLE),
-    "of_body": Column("A J", np.bool_),
     "identity": Column("A", _WHOLE),
     "running_s": Column("A", most=1e9),
     "peak_s": Column("A", most=1e9),
@@ -204,8 +202,6 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
     if len(state.settled) > 0:
         settled = Reconstruction.concatenate(list(state.settled))
         arrays |= {f"settled.{each}": getattr(settled, each) for each in Reconstruction.ROWS}
-    if state.bodies is not None:
-        arrays |= {f"bodies.{each}": getattr(state.bodies.rows, each) for each in Reconstruction.ROWS}
     return arrays | (slot_arrays(state.slots) if len(state.slots) > 0 else {"slots": np.zeros((0, 8), np.int64)})
 
 
@@ -219,7 +215,7 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
     """A state. InputError where it is none, or of another set-up."""
     names = ["counts", "cameras", "clock", "waiting_s"]
     names += [f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS]
-    optional = [f"{name}.{each}" for name in ("settled", "bodies") for each in Reconstruction.ROWS]
+    optional = [f"settled.{each}" for each in Reconstruction.ROWS]
     optional += [f"pose.{each}" for each in ("carrier", *_POSES)]
     arrays = read_npz(path, ("format", "setup", *_COLUMNS, *names, *optional), _CURE)
     if str(arrays.get("format", "")) != FORMAT:
@@ -260,8 +256,6 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
         setattr(state, name, int(value))
     if "settled.frame" in arrays:
         state.settled.append(_rows(arrays, "settled", skeleton))
-    if "bodies.frame" in arrays:
-        state.bodies = Bodies.of(_rows(arrays, "bodies", skeleton), skeleton)
     if len(arrays["slots"]) > 0:
         state.slots, state.before = slots_of(arrays, rig, following.nobody), seen["before"]
     return state
