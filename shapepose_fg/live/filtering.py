@@ -109,15 +109,7 @@ class Filter:
         whole, real = np.zeros(0, np.int64), np.zeros(0)
         gone = Gone(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
         per_bone = np.zeros((0, B)), np.zeros((0, B))
-        own = (
-            np.zeros((0, J), np.int64),
-            whole,
-            real,
-            real,
-            real,
-            np.zeros((0, 3)),
-            *per_bone,
-        )
+        own = np.zeros((0, J), np.int64), whole, real, real, real, np.zeros((0, 3)), *per_bone
         return Moment(self.tracker.nobody(), *own, gone)
 
     def step(self, before: Moment, given: Input) -> tuple[Moment, Index]:

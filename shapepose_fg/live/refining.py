@@ -125,7 +125,7 @@ class Refinery:
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()
-            rows, at = sent.part.result().rows, 0
+            rows = sent.part.result().rows
             at = rows.frame
             person = np.array([sent.names[track] for track in rows.person.tolist()], dtype=np.int64)
             # Of two tracks of one identity in a frame, who came back while they were still followed, one stays.

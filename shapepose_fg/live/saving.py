@@ -121,7 +121,8 @@ def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
     found = []
     for name in np.unique(arrays["pose.carrier"]).tolist():
         own = arrays["pose.carrier"] == name
-        found.append(Trajectory(name, *(arrays[f"pose.{each}"][own] for each in _POSES)))
+        time_s, wTb, covariance = (arrays[f"pose.{each}"][own] for each in _POSES)
+        found.append(Trajectory(name, time_s, wTb, covariance))
     known = {each.name for each in found}
     cameras = [replace(each, carrier=each.carrier or each.name * (each.name in known)) for each in rig.cameras]
     return replace(rig, cameras=tuple(cameras), trajectories=tuple(found))
