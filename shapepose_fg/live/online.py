@@ -364,12 +364,14 @@ class OnlineReconstructor:
         self._show()
 
     def _restart(self, refined: Reconstruction) -> None:
-        """Follow anew from a frame on whose people are refined: they know better where joints are."""
-        frames = [slot.given.frame for slot in self._state.slots]
+        """Follow anew from a frame on whose people are refined: they know better where joints are. Not where it is
+        older than the lag: the frames since take too long.
+        """
+        slots = self._state.slots
+        frames = [slot.given.frame for slot in slots if slots[-1].time_s - slot.time_s < self.lag_s]
         if refined.frame[0] in frames:
-            at = frames.index(refined.frame[0])
-            slot = self._state.slots[at]
-            slot.moment = fed_back(self._filter.tracker, slot.moment, refined)
+            at = len(slots) - len(frames) + frames.index(refined.frame[0])
+            slots[at].moment = fed_back(self._filter.tracker, slots[at].moment, refined)
             self._again(at + 1)
 
     def _refine(self, *, last: bool = False) -> None:

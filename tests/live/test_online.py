@@ -207,3 +207,26 @@ def test_bodies_are_where_people_are_now_and_know_joints_that_no_two_views_see(p
     assert few.sum() > 50 and np.isfinite(error[few]).all()
     # A filter that has one view, or none, leaves them 60 and 120 mm off.
     assert error[few].mean() < 45
+
+
+def test_the_tracker_goes_on_from_refined_joints(start, dance):
+    live = start()
+    for frame in range(9):
+        live.push(dance.recording[frame], frame / 30)
+    slots, before = live._state.slots, live.people()
+    at = slots[-3].moment
+    row = int(np.flatnonzero(at.identity == 1)[0])
+    joints = before.joints + np.array([0.05, 0.0, 0.0])
+    joints[:, 4] = np.nan
+    refined = replace(before, joints=joints, frame=np.full(len(before), slots[-3].given.frame))
+    live._restart(refined.rows(before.person == 1))
+    there = slots[-3].moment.tracks.joints.position
+    known = np.arange(25) != 4
+    assert np.array_equal(there[row][known], joints[before.person == 1][0][known])
+    assert np.array_equal(there[row][4], at.tracks.joints.position[row][4])
+    others = at.identity != 1
+    assert np.array_equal(there[others], at.tracks.joints.position[others])
+    # Two frames of detections draw them back.
+    moved = np.linalg.norm(live.people().joints - before.joints, axis=-1)
+    assert 0.001 < np.median(moved[before.person == 1]) < 0.03
+    assert np.median(moved[before.person != 1]) < 1e-9
