@@ -20,7 +20,7 @@ from threading import Lock, Thread
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import config, event
+from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, UserWideCacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
@@ -88,8 +88,8 @@ class _Shared(UserWideCacheLocator):
 
     def __init__(self, py_func: Any, py_file: str):
         super().__init__(py_func, py_file)
-        user = AppDirs(appname="shapepose-fg", appauthor=False).user_cache_dir
-        self._module, self._cache_path = py_func.__module__, str(Path(config.CACHE_DIR or user) / "kernels")
+        folder = os.environ.get("NUMBA_CACHE_DIR") or AppDirs("shapepose-fg", appauthor=False).user_cache_dir
+        self._module, self._cache_path = py_func.__module__, str(Path(folder) / "kernels")
 
     def get_source_stamp(self) -> str:
         """None: `_Cache` has the files in its keys."""
