@@ -21,7 +21,8 @@ _CURE = (
     'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and of a'
     ' camera that moves "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
 )
-_Row4, _Row6 = Annotated[list[FiniteFloat], Len(4, 4)], Annotated[list[FiniteFloat], Len(6, 6)]
+_Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
+_Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
 
 
 class _Person(BaseModel):
