@@ -19,7 +19,7 @@ import torch
 
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.calibration import Calibration, Clues
+from shapepose_fg.estimation.calibration import WEIGHTS, Calibration, Clues
 from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -32,7 +32,8 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("crossing", "tune", 7007, 3), ("two", "tune", 7008, 2), ("crowd", "tune", 7009, 6),
     ("crossing", "report", 5001, 3), ("crowd", "report", 4711, 4), ("crowd", "report", 778, 3),
     ("two", "tune", 777, 2), ("crowd", "report", 90211, 3), ("crossing", "report", 5002, 3),
-    ("crowd", "report", 777, 4),
+    ("crowd", "report", 777, 4), ("crossing", "tune", 7011, 2), ("crowd", "tune", 7012, 2),
+    ("salsa", "tune", 7013, 2), ("crossing", "tune", 7014, 2),
 )  # fmt: skip
 """Scene, split, seed, cameras. Of `report` the seeds that all was developed on: exchanged limbs are rare, and in
 those of `tune` there were none for long."""
@@ -86,7 +87,7 @@ def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
     for clues, off in found:
         known = np.isfinite(off).all(-1) & np.isfinite(clues.covariance).all((-1, -2))
         added = (clues.association, clues.draft, clues.exchange)
-        features = np.stack([np.log1p(clues.disagreement), np.log(clues.carried)], axis=-1)
+        features = np.stack([np.log1p(clues.disagreement), np.log(clues.carried), clues.drawn], axis=-1)
         groups = np.broadcast_to(group, known.shape)
         columns = (off, clues.covariance, features, groups, clues.views, *added)
         parts.append([column[known] for column in columns])
@@ -97,7 +98,7 @@ def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
     share = torch.tensor(SHARES, dtype=off.dtype) / torch.bincount(views, minlength=3).clamp(min=1)
     log_scale, powers, log_added = (
         torch.full((count,), value, dtype=off.dtype, requires_grad=True)
-        for count, value in ((len(ALIKE), -0.5), (2, 0.5), (3, 0.0))
+        for count, value in ((len(ALIKE), -0.5), (3, 0.5), (3, 0.0))
     )
     optimiser = torch.optim.LBFGS([log_scale, powers, log_added], max_iter=100, line_search_fn="strong_wolfe")
 
@@ -120,7 +121,7 @@ def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
         "scale": {name: round(scale[n], 3) for name, n in zip(names, group.tolist(), strict=True)},
         **{
             name: round(value, 3)
-            for name, value in zip("power unseen association draft exchange".split(), weights, strict=True)
+            for name, value in zip(WEIGHTS, weights, strict=True)
         },
     }
 

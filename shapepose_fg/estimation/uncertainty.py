@@ -17,19 +17,19 @@ from shapepose_fg.core.reconstruction import BODY, Reconstruction
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
-CORRELATION_S = 0.9
-"""Errors of a joint, in standard deviations, have the correlation exp(-t / this) over time: measured 0.97, 0.83,
-0.70, 0.56, 0.37 after 1, 4, 8, 16, 30 frames at 30 Hz (simulated, split tune, two to six cameras; seeds 6850 to
-6854)."""
+_LASTS, _LASTS_S, _FADES_S = 0.62, 2.2, 0.115
+"""Errors of a joint, in standard deviations, have over time the correlation of a part that lasts, exp(-t / 2.2 s), and
+of one that motion smooths, (1 + t / 0.115 s) exp(-t / 0.115 s): measured 0.97, 0.84, 0.68, 0.52, 0.39, 0.25, 0.16
+after 1, 4, 8, 16, 30, 60, 90 frames at 30 Hz, alike for two to six cameras and however many views see it
+(simulated: the recordings of `scripts/fit_covariances.py`)."""
 _LIMBS = {
-    ("Neck", "MidHip"): 0.57, ("Nose", "Neck"): 0.2, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.3,
-    ("Shoulder", "Neck"): 0.65, ("Elbow", "Shoulder"): 0.12, ("Wrist", "Elbow"): 0.4, ("Hip", "MidHip"): 0.89,
-    ("Knee", "Hip"): 0.55, ("Ankle", "Knee"): 0.43, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.36,
-    ("SmallToe", "BigToe"): 0.74,
+    ("Neck", "MidHip"): 0.50, ("Nose", "Neck"): 0.30, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.44,
+    ("Shoulder", "Neck"): 0.71, ("Elbow", "Shoulder"): 0.23, ("Wrist", "Elbow"): 0.39, ("Hip", "MidHip"): 0.85,
+    ("Knee", "Hip"): 0.53, ("Ankle", "Knee"): 0.47, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.43,
+    ("SmallToe", "BigToe"): 0.77,
 }  # fmt: skip
 """Correlation of the errors of two joints of a person in one frame, in standard deviations, along a limb; else the
-product along the way from one to the other. Measured as above, alike for joints that are seen and not: 0.55, 0.30,
-0.18, 0.10 one to four limbs apart. Two people's are -0.02: taken as 0."""
+product along the way from one to the other. Measured as above. Two people's are -0.02: taken as 0."""
 SURFACE_M = 0.015
 """What a point of a body's surface is known less well than the joints around it, one sigma, metres."""
 _REACH_M = 0.15
@@ -181,7 +181,7 @@ def marginal(people: Reconstruction, *joints: JointAt) -> Marginal:
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
     roots = _roots(people.covariance[rows, numbers])
     names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
-    rho = correlation(names, names) * np.exp(-np.abs(time_s[:, None] - time_s) / CORRELATION_S)
+    rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
     rho *= people.person[rows][:, None] == people.person[rows]
     K = len(joints)
     covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots).reshape(3 * K, 3 * K)
@@ -253,6 +253,12 @@ def correlation(one: Sequence[str], other: Sequence[str]) -> Array:
     that are no part of a body known here correlate with themselves alone.
     """
     return np.array([[_together(a, b) for b in other] for a in one]).reshape(len(one), len(other))
+
+
+def _over_time(apart_s: Array) -> Array:
+    """Correlation (...) of the errors of one joint at times so far apart (...), seconds."""
+    fading = apart_s / _FADES_S
+    return (1 - _LASTS) * (1 + fading) * np.exp(-fading) + _LASTS * np.exp(-apart_s / _LASTS_S)
 
 
 def _together(one: str, other: str) -> float:
