@@ -111,7 +111,8 @@ class Distance:
         """Distances that would not have made the measured one improbable, by Neyman's construction.
 
         It holds the true one as often as it says however near it is; quantiles do not near zero, where errors in
-        three dimensions only ever make a distance longer.
+        three dimensions only ever make a distance longer. Where the measured one is shorter than errors let it
+        be, next to nothing would be left: the upper end is no less than the quantile.
         """
         away = np.linalg.norm(self.apart, axis=-1)
         way = np.where(away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0])
@@ -123,7 +124,7 @@ class Distance:
             np.array([np.interp(end, flat[:, n], r[:, n]) for n in range(flat.shape[1])]).reshape(away.shape)
             for end in ends
         )
-        return low, high
+        return low, np.maximum(high, self.quantile(ends[0]))
 
     @property
     def mean_m(self) -> Array:

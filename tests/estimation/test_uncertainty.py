@@ -57,8 +57,8 @@ def test_correlation_is_the_product_along_the_limbs():
     np.testing.assert_array_equal(rho, rho.T)
     assert np.linalg.eigvalsh(rho).min() > 0
     at = {name: n for n, name in enumerate(BODY_25.joints)}
-    assert rho[at["RWrist"], at["RShoulder"]] == pytest.approx(0.4 * 0.12)
-    assert rho[at["RHip"], at["LHip"]] == pytest.approx(0.89**2)
+    assert rho[at["RWrist"], at["RShoulder"]] == pytest.approx(0.39 * 0.23)
+    assert rho[at["RHip"], at["LHip"]] == pytest.approx(0.85**2)
     assert correlation(["Tail"], ["Neck", "Tail"]).tolist() == [[0.0, 1.0]]
 
 
