@@ -10,9 +10,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.estimation.carried_error import POSES_LAST_S, goes_with_poses
+from shapepose_fg.estimation.linearisation import (
+    Message,
+    ObservationConfig,
+    linearise,
+    observation_sigmas,
+    symmetric_roots,
+)
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
@@ -172,27 +181,57 @@ class SurfaceDistance:
         return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
 
 
-def marginal(people: Reconstruction, *joints: JointAt) -> Marginal:
+def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -> Marginal:
     """Joints of any people and frames together.
 
     Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
-    correlate as was measured (`correlation`). NotDetermined for a joint without a place, ValueError for one that
+    correlate as was measured (`correlation`). With the `rig` that people were solved with (`cameras.json`), what
+    comes of the poses of cameras that move is shared by all that they see. NotDetermined for a joint without a place, ValueError for one that
     is not there.
     """
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
-    roots = _roots(people.covariance[rows, numbers])
+    K = len(joints)
+    reported = people.covariance[rows, numbers]
+    shared = np.zeros((K, 3, K, 3))
+    if rig is not None and rig.trajectories and K > 0:
+        shared = _of_poses(people, rig, rows, numbers, reported)
+    roots = symmetric_roots(reported - np.einsum("aiaj->aij", shared))
     names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
     rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
     rho *= people.person[rows][:, None] == people.person[rows]
-    K = len(joints)
-    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots).reshape(3 * K, 3 * K)
-    return Marginal(people.joints[rows, numbers], covariance)
+    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots) + shared
+    return Marginal(people.joints[rows, numbers], covariance.reshape(3 * K, 3 * K))
 
 
-def distance(people: Reconstruction, one: JointAt, other: JointAt | ArrayLike) -> Distance:
-    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3)."""
+def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
+    """(K, 3, K, 3) what the errors of K joints have from poses of cameras that move: all that one carries errs with
+    it, and for a while. In no direction it is more than is `reported` (K, 3, 3).
+    """
+    own = people.rows(rows)
+    if own.observations is None:
+        raise ValueError("what moving cameras saw is not known: keep observations.npz, or give no rig")
+    seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
+    views = Views.of(rig, seen.time_s)
+    assert views.carried is not None
+    sigmas = observation_sigmas(seen, own.joints, views, config, own.joint_names.tolist())
+    evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
+    goes = goes_with_poses(evidence, Message(own.joints, nothing), sigmas, views, config)
+    goes = goes[np.arange(len(rows)), numbers] @ symmetric_roots(views.carried.covariance)
+    ends = symmetric_roots(np.linalg.inv(reported)) @ np.moveaxis(goes, 1, 2).reshape(len(rows), 3, -1)
+    most = np.linalg.eigvalsh(ends @ ends.mT)[:, -1]
+    goes /= np.sqrt(np.maximum(most, 1.0))[:, None, None, None]
+    lasting = np.exp(-np.abs(own.time_s[:, None] - own.time_s) / POSES_LAST_S)
+    return np.einsum("abik,ac,cbjk->aicj", goes, lasting, goes)
+
+
+def distance(
+    people: Reconstruction, one: JointAt, other: JointAt | ArrayLike, *, rig: Rig | None = None
+) -> Distance:
+    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` as of
+    `marginal`.
+    """
     if isinstance(other, JointAt):
-        both = marginal(people, one, other)
+        both = marginal(people, one, other, rig=rig)
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance)
@@ -313,12 +352,6 @@ def _missing(people: Reconstruction, row: int, joint: int) -> str:
     used = table.view_names[table.used[row, joint]].tolist()
     views = {0: "no camera's detection was used", 1: f"only camera {' '.join(used)} saw it"}
     return views.get(len(used), f"cameras {', '.join(used)} do not place it") + body
-
-
-def _roots(covariances: Array) -> Array:
-    """Symmetric square roots (K, 3, 3)."""
-    values, vectors = np.linalg.eigh(covariances)
-    return np.einsum("kia,ka,kja->kij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
 
 
 _AT, _WEIGHT = np.polynomial.legendre.leggauss(_NODES)
