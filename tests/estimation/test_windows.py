@@ -251,7 +251,7 @@ def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_came
 
 
 def test_two_cameras_that_face_each_other_are_not_averaged_over_time(walk, five_cameras, two_people):
-    """Cameras in a line with the wrist see it 4 px off in all frames, which is 8 cm and more along the line: the body
+    """Cameras in a line with the wrist see it 4 px too high and too low in all frames, 24 cm along the line: the body
     has it to 2 cm, and thirty frames of the same error are no better than one.
     """
     observations, truth = walk
@@ -270,9 +270,8 @@ def test_two_cameras_that_face_each_other_are_not_averaged_over_time(walk, five_
     )  # fmt: skip
     found = solve(seen, rig, BesideFitter(two_people[0], sigma_m=0.02))
     away = found.joints[:, WRIST] - truth[mine, WRIST]
-    sigma = np.sqrt(found.covariance[:, WRIST, 0, 0])
-    print(np.abs(away).mean(axis=0), sigma.mean())
-    assert 0, (np.abs(away).mean(axis=0), sigma.mean())
+    # 16 mm; 94 where what the views say is new in every frame.
+    assert np.abs(away[:, 0]).mean() < 0.03
 
 
 @pytest.mark.usefixtures("out_of_sight")
