@@ -12,7 +12,8 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
-from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
+from shapepose_fg.estimation.linearisation import inverses, observation_sigmas, weakest_sigma
+from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -138,10 +139,7 @@ def _view_reasons(
     solved = [] if graph is None else np.flatnonzero(graph.frames == frame).tolist()
     if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
         t, estimator = solved[0], config.estimator
-        place = graph.solved[t, joint]
-        # The solver's graph holds the share of the variance that is new in every frame.
-        share = graph.lasting.white_share if graph.window.temporal else 1.0
-        whole = share * np.linalg.inv(graph.solved_covariance[t, joint])
+        place, whole = graph.solved[t, joint], np.linalg.inv(graph.solved_covariance[t, joint])
         of_body = estimator.graph.weight_shape * graph.body.information[t, joint]
     xy, _, slope = (each[0, 0] for each in rows.project(place[None, None]))
     residual = xy - table.xy[row, joint]
@@ -151,6 +149,10 @@ def _view_reasons(
     for v in np.flatnonzero(used).tolist():
         weight = kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v]) / sigma[v] ** 2
         information[v], gradient[v] = weight * slope[v].T @ slope[v], weight * slope[v].T @ residual[v]
+    if whole is not None and graph is not None and graph.window.temporal:
+        # Of what is seen the solver's graph holds the share of the variance that is new in every frame.
+        seen_well = weakest_sigma(information.sum(axis=0)) <= LOST_M
+        whole *= graph.lasting.white_share if seen_well else 1.0
     if whole is None:
         whole = information.sum(axis=0) + of_body + np.eye(3)
     rest = np.linalg.eigvalsh(whole - information.sum(axis=0) - of_body).sum()
