@@ -7,6 +7,7 @@ Between frames joints move by white noise on acceleration (`factors.motion`).
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -101,7 +102,7 @@ def reported_factor(
     if not poses:
         return gtsam.PriorFactorPoint3(key, place, gaussian(covariance))
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    here, terms = gtsam.Values(), [key, root]
+    here, terms = gtsam.Values(), list[Any]([key, root])
     here.insert(key, place)
     for pose_key, pose, goes in poses:
         here.insert(pose_key, pose)

@@ -20,8 +20,8 @@ class KeySpace:
 
         key = first + ((frame * people + person) * joints + joint) * 3 + kind
 
-    with the kind 0 for a position, 1 for a velocity and 2 for a reported position. Identities wrap round at `people`: they are counted up
-    for ever, and no more are there at a time.
+    with the kind 0 for a position, 1 for a velocity and 2 for a reported position. Identities wrap round at
+    `people`: they are counted up for ever, and no more are there at a time.
     """
 
     space: str | range

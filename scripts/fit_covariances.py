@@ -128,10 +128,7 @@ def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
     return {
         "about": f"scripts/fit_covariances.py: {len(off)} joints of simulated people, cases {CASES}",
         "scale": {name: round(scale[n], 3) for name, n in zip(names, group.tolist(), strict=True)},
-        **{
-            name: round(value, 3)
-            for name, value in zip(WEIGHTS, weights, strict=True)
-        },
+        **{name: round(value, 3) for name, value in zip(WEIGHTS, weights, strict=True)},
     }
 
 

@@ -55,7 +55,7 @@ class Clues:
     @property
     def drawn(self) -> Array:
         """(N, J) squared logarithm of the largest sigma over the least: how badly the joint's views cross."""
-        known = np.isfinite(self.covariance).all(axis=(-2, -1))
+        known = np.asarray(np.isfinite(self.covariance).all(axis=(-2, -1)))
         values = np.linalg.eigvalsh(np.where(known[..., None, None], self.covariance, np.eye(3)))
         ratio = values[..., 2] / np.maximum(values[..., 0], 1e-12)
         return np.square(np.log(np.clip(ratio, 1.0, DRAWN_MOST**2)) / 2)
@@ -74,9 +74,9 @@ class Calibration:
     """And, of a joint that no view sees, with its sigma over `SURE_M`, to this, where that is over 1: body and
     motion, which carry it then, err rarely and by much."""
     drawn: float
-    """And by the exponential of this times how badly its views cross (`Clues.drawn`): of two cameras that face each
-    other, errors that the graph takes to be independent, of the body's joints and of frames, add up along the line
-    between them."""
+    """And by the exponential of this times how badly its views cross (`Clues.drawn`): of two cameras that face
+    each other, errors that the graph takes to be independent, of the body's joints and of frames, add up along the
+    line between them."""
     association: float
     """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
     frames are one."""

@@ -64,7 +64,8 @@ class JoinedPeople:
         """Frame number and increment of each frame of `people`, which has what it was solved from, in order.
 
         Beside the joints that tell of poses there are those that people were reported at
-        (`KeySpace.reported`): body, motion and all frames are in them, and they go with your poses. ValueError where observations or times are missing.
+        (`KeySpace.reported`): body, motion and all frames are in them, and they go with your poses. ValueError
+        where observations or times are missing.
         """
         if len(people) == 0:
             return

@@ -20,8 +20,8 @@ from shapepose_fg.estimation.linearisation import (
     mean_confidence,
     weakest_sigma,
 )
-from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.state_covariances import state_covariances

@@ -15,6 +15,7 @@ from shapepose_fg.estimation.linearisation import Message, ViewEvidence, observa
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 
+
 @dataclass
 class State:
     """N rows: what is given, and what each round changes."""

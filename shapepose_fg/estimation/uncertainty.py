@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 _LASTS, _LASTS_S, _FADES_S = 0.62, 2.2, 0.115
-"""Errors of a joint, in standard deviations, have over time the correlation of a part that lasts, exp(-t / 2.2 s), and
-of one that motion smooths, (1 + t / 0.115 s) exp(-t / 0.115 s): measured 0.97, 0.84, 0.68, 0.52, 0.39, 0.25, 0.16
-after 1, 4, 8, 16, 30, 60, 90 frames at 30 Hz, alike for two to six cameras and however many views see it
+"""Errors of a joint, in standard deviations, have over time the correlation of a part that lasts, exp(-t / 2.2 s),
+and of one that motion smooths, (1 + t / 0.115 s) exp(-t / 0.115 s): measured 0.97, 0.84, 0.68, 0.52, 0.39, 0.25,
+0.16 after 1, 4, 8, 16, 30, 60, 90 frames at 30 Hz, alike for two to six cameras and however many views see it
 (simulated: the recordings of `scripts/fit_covariances.py`)."""
 _LIMBS = {
     ("Neck", "MidHip"): 0.50, ("Nose", "Neck"): 0.30, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.44,
@@ -186,8 +186,8 @@ def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -
 
     Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
     correlate as was measured (`correlation`). With the `rig` that people were solved with (`cameras.json`), what
-    comes of the poses of cameras that move is shared by all that they see. NotDetermined for a joint without a place, ValueError for one that
-    is not there.
+    comes of the poses of cameras that move is shared by all that they see. NotDetermined for a joint without a
+    place, ValueError for one that is not there.
     """
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
     K = len(joints)
@@ -204,8 +204,8 @@ def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -
 
 
 def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
-    """(K, 3, K, 3) what the errors of K joints have from poses of cameras that move: all that one carries errs with
-    it, and for a while. In no direction it is more than is `reported` (K, 3, 3).
+    """(K, 3, K, 3) what the errors of K joints have from poses of cameras that move: all that one carries errs
+    with it, and for a while. In no direction it is more than is `reported` (K, 3, 3).
     """
     own = people.rows(rows)
     if own.observations is None:
@@ -217,7 +217,9 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
     goes = goes_with_poses(evidence, Message(own.joints, nothing), sigmas, views, config)
     goes = goes[np.arange(len(rows)), numbers] @ symmetric_roots(views.carried.covariance)
-    ends = symmetric_roots(np.linalg.inv(reported)) @ np.moveaxis(goes, 1, 2).reshape(len(rows), 3, -1)
+    ends = symmetric_roots(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(
+        goes, 1, 2
+    ).reshape(len(rows), 3, -1)
     most = np.linalg.eigvalsh(ends @ ends.mT)[:, -1]
     goes /= np.sqrt(np.maximum(most, 1.0))[:, None, None, None]
     lasting = np.exp(-np.abs(own.time_s[:, None] - own.time_s) / POSES_LAST_S)

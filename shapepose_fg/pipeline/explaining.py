@@ -42,9 +42,9 @@ def explain(
     """Why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`, seconds.
 
     The person's window is solved once more, from the detections that `people.observations` has of them, before the
-    cameras `rig`; joints, covariances and gates are those of the result. With the recording's `detections` those are
-    named, too, that a detector joins with the person's and that were not given to them. InputError where the person, the joint or
-    the frame is not in the result, or where it does not say what it was solved from.
+    cameras `rig`; joints, covariances and gates are those of the result. With the recording's `detections` those
+    are named, too, that a detector joins with the person's and that were not given to them. InputError where the
+    person, the joint or the frame is not in the result, or where it does not say what it was solved from.
     """
     table = people.observations
     if table is None:
@@ -217,8 +217,8 @@ def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, off_px:
 def _refused(
     all_of_it: _Detections, person: int, frame: int, joint: int, detections: DetectionSequence | None
 ) -> list[Finding]:
-    """Detections of a joint that the detector joins with the person's own in a camera, and that are not theirs: given
-    to somebody else, or to nobody.
+    """Detections of a joint that the detector joins with the person's own in a camera, and that are not theirs:
+    given to somebody else, or to nobody.
     """
     people, table = all_of_it.people, all_of_it.table
     if detections is None or not 0 <= frame < len(detections):

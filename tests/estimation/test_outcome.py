@@ -59,8 +59,8 @@ def test_errors_that_last_are_added_to_what_the_graph_knows():
     """Joint 0 is seen in all four frames; joint 1 in the second and the last; joint 2 is solved with offsets.
 
     Of a share f of the views' error that is new in every frame, the graph's marginal holds all, of which motion
-    takes too much by `kept`; what lasts is that of the nearest frame in which the joint was seen. What sees little of
-    it is solved with an offset, whose error the marginal has.
+    takes too much by `kept`; what lasts is that of the nearest frame in which the joint was seen. What sees little
+    of it is solved with an offset, whose error the marginal has.
     """
     f, kept = 0.3, 0.2
     sigma = np.full((4, 3), 0.02)

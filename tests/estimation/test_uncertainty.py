@@ -64,14 +64,16 @@ def test_correlation_is_the_product_along_the_limbs():
 
 
 def test_what_one_robot_sees_errs_with_it(scene):
-    """A robot carries all cameras: joints of two people, and of two frames, share the error of its pose, and as they
-    turn with it their distance is known as well as if it stood still.
+    """A robot carries all cameras: joints of two people, and of two frames, share the error of its pose, and as
+    they turn with it their distance is known as well as if it stood still.
     """
     rng = np.random.default_rng(3)
     root = rng.normal(0, [0.01] * 3 + [0.05] * 3, (6, 6))
     pose, covariance = np.eye(4), root.T @ root / 6
     pose[:3, 3] = 0.5, 0.2, 0.0
-    path = Trajectory("robot", np.linspace(0, 0.4, 3), np.stack([pose] * 3), np.stack([covariance] * 3), refined=True)
+    path = Trajectory(
+        "robot", np.linspace(0, 0.4, 3), np.stack([pose] * 3), np.stack([covariance] * 3), refined=True
+    )
     cameras = [replace(each, carrier="robot", bTc=np.linalg.inv(pose) @ each.wTc) for each in scene.rig.cameras]
     rig = replace(scene.rig, cameras=tuple(cameras), trajectories=(path,))
     people = reconstruct(simulate(scene), rig)
@@ -127,7 +129,9 @@ def test_an_interval_holds_the_truth_at_any_distance():
         low, high = Distance(measured, np.broadcast_to(covariance, (400, 3, 3))).interval(0.95)
         held = ((low <= true) & (true <= high)).mean()
         assert held > 0.93 and (true < 0.1 or held < 0.97)  # near 0 one side is left
-    assert float(Distance(np.zeros(3), covariance).interval()[1]) > 0.03  # shorter than errors let it be: it is no 0
+    assert (
+        float(Distance(np.zeros(3), covariance).interval()[1]) > 0.03
+    )  # shorter than errors let it be: it is no 0
 
 
 def test_joints_that_err_together_are_nearer_known_apart(people):

@@ -251,8 +251,8 @@ def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_came
 
 
 def test_two_cameras_that_face_each_other_are_not_averaged_over_time(walk, five_cameras, two_people):
-    """Cameras in a line with the wrist see it 4 px too high and too low in all frames, 24 cm along the line: the body
-    has it to 2 cm, and thirty frames of the same error are no better than one.
+    """Cameras in a line with the wrist see it 4 px too high and too low in all frames, 24 cm along the line: the
+    body has it to 2 cm, and thirty frames of the same error are no better than one.
     """
     observations, truth = walk
     target = truth[observations.track == 0][:, WRIST].mean(axis=0)

@@ -122,8 +122,8 @@ def test_somebody_elses_detection(people, scene):
 
 
 def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(people, scene):
-    """Spoiled before anybody is sought: in one camera an elbow is half a metre up, in another it is missed, and the
-    detector joins somebody else's with the arm. Neither is given to the person.
+    """Spoiled before anybody is sought: in one camera an elbow is half a metre up, in another it is missed, and
+    the detector joins somebody else's with the arm. Neither is given to the person.
     """
     person, row, cameras = seen_by_many(people)
     table, recording = people.observations, simulate(scene, seed=3)
@@ -156,7 +156,9 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     named = {(each.cause, each.cameras[0]) for each in told.findings if each.cameras}
     assert {(Cause.GATED, scene.rig.names[away]), (Cause.FOREIGN, scene.rig.names[taken])} <= named
     silent = asked(found, scene.rig, who)
-    assert all(each.cause == Cause.ONE_VIEW for each in silent.findings), "of what was given to them nothing is wrong"
+    assert all(each.cause == Cause.ONE_VIEW for each in silent.findings), (
+        "of what was given to them nothing is wrong"
+    )
     untouched = explain(people, scene.rig, person=person, joint="LElbow", frame=5, detections=recording)
     assert untouched.findings == ()
 
