@@ -102,12 +102,13 @@ def reported_factor(
     if not poses:
         return gtsam.PriorFactorPoint3(key, place, gaussian(covariance))
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    here, terms = gtsam.Values(), list[Any]([key, root])
+    here, terms = gtsam.Values(), [(key, root)]
     here.insert(key, place)
     for pose_key, pose, goes in poses:
         here.insert(pose_key, pose)
-        terms += [pose_key, -root @ goes]
-    linear = gtsam.JacobianFactor(*terms, np.zeros(3), gtsam.noiseModel.Unit.Create(3))
+        terms.append((pose_key, -root @ goes))
+    make: Any = gtsam.JacobianFactor  # its constructors take keys and matrices in turn
+    linear = make(*(each for term in terms for each in term), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
     return gtsam.LinearContainerFactor(linear, here)
 
 
