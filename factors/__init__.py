@@ -8,7 +8,7 @@ a graph of your own. Units: metres in the world, pixels in the image; cameras lo
 from factors.body_prior import body_prior_factor, body_prior_factors
 from factors.contact import standing_factors
 from factors.graph_files import draw_graph, load_graph, save_graph
-from factors.joining import Increment, PeopleInGraph, PosedCamera, Sighting
+from factors.joining import Increment, PeopleInGraph, PosedCamera, Sighting, reported_factor
 from factors.key_space import KeySpace
 from factors.keys import (
     CameraKey,
@@ -121,6 +121,7 @@ __all__ = [
     "project_with_jacobian",
     "projection_factor",
     "projection_factors",
+    "reported_factor",
     "reported_keys",
     "robust",
     "robust_kernel",

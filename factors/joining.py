@@ -7,6 +7,7 @@ Between frames joints move by white noise on acceleration (`factors.motion`).
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from factors.key_space import KeySpace
 from factors.motion import CONSTANT_VELOCITY, motion_factors
-from factors.noise import Kernel, isotropic
+from factors.noise import Kernel, gaussian, isotropic
 from factors.projection import posed_projection_factors, projection_factors
 
 Array = NDArray[np.float64]
@@ -85,6 +86,30 @@ class Increment:
         for key, time_s in self.times_s.items():
             stamps.insert((key, time_s))
         return stamps
+
+
+def reported_factor(
+    key: int, place: Array, covariance: Array, poses: Sequence[tuple[int, gtsam.Pose3, Array]] = ()
+) -> gtsam.NonlinearFactor:
+    """A joint as it was found by other means than your graph, and how it goes with poses of yours.
+
+    It is at `place` (3,) to `covariance` (3, 3) m² if each pose, by its key, is what it was taken for; with a turn
+    and a way of one along its axes it goes by (3, 6) of that. The factor is linear, and of the poses alone it says
+    nothing. ValueError for more than two poses.
+    """
+    if len(poses) > 2:
+        raise ValueError(f"a joint goes with two poses at the most, got {len(poses)}")
+    if not poses:
+        return gtsam.PriorFactorPoint3(key, place, gaussian(covariance))
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    here, terms = gtsam.Values(), [(key, root)]
+    here.insert(key, place)
+    for pose_key, pose, goes in poses:
+        here.insert(pose_key, pose)
+        terms.append((pose_key, -root @ goes))
+    make: Any = gtsam.JacobianFactor  # its constructors take keys and matrices in turn
+    linear = make(*(each for term in terms for each in term), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
+    return gtsam.LinearContainerFactor(linear, here)
 
 
 class PeopleInGraph:

@@ -10,17 +10,18 @@ from factors.keys import JointKey
 
 _PER_SYMBOL = 2**56
 """Numbers behind a symbol's character."""
-_POSITION, _VELOCITY = 0, 1
+_KINDS = _POSITION, _VELOCITY, _REPORTED = 0, 1, 2
+_NAMES = ("position", "velocity", "reported position")
 
 
 @dataclass(frozen=True)
 class KeySpace:
     """The keys that people may have: those of a symbol's character, or a range of integers.
 
-        key = first + ((frame * people + person) * joints + joint) * 2 + kind
+        key = first + ((frame * people + person) * joints + joint) * 3 + kind
 
-    with the kind 0 for a position and 1 for a velocity. Identities wrap round at `people`: they are counted up
-    for ever, and no more are there at a time.
+    with the kind 0 for a position, 1 for a velocity and 2 for a reported position. Identities wrap round at
+    `people`: they are counted up for ever, and no more are there at a time.
     """
 
     space: str | range
@@ -67,9 +68,13 @@ class KeySpace:
         """Keys (...) of velocities (`Point3`, metres per second, world)."""
         return self._pack(_VELOCITY, person, joints, frames)
 
+    def reported(self, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
+        """Keys (...) of reported positions (`Point3`, metres, world): see `factors.reported_factor`."""
+        return self._pack(_REPORTED, person, joints, frames)
+
     def split(self, key: int) -> JointKey:
         """Who, which joint and when; ValueError for a key that is not of this space."""
-        rest, _ = divmod(int(key) - self.keys.start, 2)
+        rest, _ = divmod(int(key) - self.keys.start, len(_KINDS))
         if key not in self.keys or rest >= self.frames * self.people * self.joints:
             raise ValueError(f"{gtsam.DefaultKeyFormatter(int(key))} is not a key of the space {self.space}")
         rest, joint = divmod(rest, self.joints)
@@ -82,12 +87,12 @@ class KeySpace:
             person, joint, frame = self.split(key)
         except ValueError:
             return gtsam.DefaultKeyFormatter(int(key))
-        kind = "velocity" if (int(key) - self.keys.start) % 2 == _VELOCITY else "position"
+        kind = _NAMES[(int(key) - self.keys.start) % len(_KINDS)]
         return f"{kind}(person {person}, joint {joint}, frame {frame})"
 
     @property
     def _per_frame(self) -> int:
-        return 2 * self.people * self.joints
+        return len(_KINDS) * self.people * self.joints
 
     def _pack(self, kind: int, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
         joint, frame = (np.asarray(each, dtype=np.int64) for each in (joints, frames))
@@ -98,4 +103,4 @@ class KeySpace:
                     " give a larger space"
                 )
         row = (frame * self.people + int(person) % self.people) * self.joints + joint
-        return self.keys.start + row * 2 + kind
+        return self.keys.start + row * len(_KINDS) + kind

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shapepose_fg.cli.options import TIME, argument, grouped, json_option, option
+from shapepose_fg.cli.options import INPUT, TIME, argument, grouped, json_option, option
 from shapepose_fg.cli.terminal import show, table
 from shapepose_fg.core.errors import InputError
 
@@ -21,12 +21,14 @@ def explain(
     joint: str = argument("JOINT", "Name of the joint, such as RWrist."),
     frame: int | None = option(TIME, "In this frame; or"),
     time: float | None = option(TIME, "in the person's frame nearest to this time, seconds."),
+    detections: Path | None = option(INPUT, "Folder that was reconstructed: names refused detections, too."),
     as_json: bool = json_option(),
 ) -> None:
     """Say why a joint is where it is: what each camera, the body and motion say, and what is the matter."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.core.result_files import results_folder
     from shapepose_fg.io.calibration import read_rig
+    from shapepose_fg.io.detections.reading import read_detections
     from shapepose_fg.io.solved_setup import CAMERAS
     from shapepose_fg.pipeline.explaining import explain
 
@@ -34,7 +36,8 @@ def explain(
         raise InputError("--frame, --time: give one of them")
     folder = results_folder(results)
     rig, people = read_rig(folder / CAMERAS), Reconstruction.load(folder)
-    found = explain(people, rig, person=person, joint=joint, frame=frame, time_s=time)
+    seen = None if detections is None else read_detections(detections, rig)
+    found = explain(people, rig, person=person, joint=joint, frame=frame, time_s=time, detections=seen)
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:

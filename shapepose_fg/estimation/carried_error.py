@@ -9,12 +9,24 @@ from shapepose_fg.estimation.linearisation import Message, ObservationConfig, Vi
 
 _NOTHING = 1.0
 """What a joint of which nothing is known is known to, 1/m²: a metre."""
+POSES_LAST_S = 3.0
+"""Errors of poses that SLAM gives are taken to be new after this time: one of them counts in so long."""
 
 
 def carried_covariance(
     evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
-    """(N, J, 3, 3) covariance of joints, m², that comes of their cameras' poses; zero where all stand still.
+    """(N, J, 3, 3) covariance of joints, m², that comes of their cameras' poses; zero where all stand still."""
+    if views.carried is None or len(evidence.points) == 0:
+        return np.zeros((*evidence.points.shape, 3))
+    goes = goes_with_poses(evidence, body, sigmas, views, config)
+    return np.einsum("njbik,nbkl,njbml->njim", goes, views.carried.covariance, goes, optimize=True)
+
+
+def goes_with_poses(
+    evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
+) -> Array:
+    """(N, J, B, 3, 6) how joints go with the poses of the B carriers of cameras, of which there is one.
 
     Joints are where they are most probable given the poses; the law of total covariance adds G S G^T, with S the
     covariance of a pose and G how the joint goes with it: the share of its information that comes from cameras on
@@ -22,9 +34,8 @@ def carried_covariance(
     with each carrier as its person's joints do on average, and so does a joint that nothing is said of.
     """
     carried, points = views.carried, np.nan_to_num(evidence.points)
-    covariance = np.zeros((*points.shape, 3))
-    if carried is None or len(points) == 0:
-        return covariance
+    assert carried is not None
+    found = np.zeros((*points.shape[:2], carried.wTb.shape[1], 3, 6))
     _, _, slope = views.project(points)
     used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
     sigma = np.where(used, sigmas, 1.0)
@@ -44,9 +55,8 @@ def carried_covariance(
         arm = points - t[:, None]
         # With a turn w and a way v along the carrier's axes a point goes by R w x arm + R v.
         goes = np.concatenate([-_cross(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
-        goes = gain @ goes
-        covariance += goes @ carried.covariance[:, number][:, None] @ goes.swapaxes(-1, -2)
-    return covariance
+        found[:, :, number] = gain @ goes
+    return found
 
 
 def _cross(v: Array) -> Array:

@@ -20,8 +20,9 @@ NEAR_M = 0.06
 points are within 4 cm."""
 UNDER_M = 0.1
 """A foot this far below the floor stands on something else; nothing does below a floor."""
-UNDER_SHARE = 0.01
-"""So many looks may be: bodies that are fitted badly. More are another floor, and then none is said."""
+UNDER_SHARE = 0.05
+"""So many looks may be: bodies that are fitted badly; before two cameras that face each other as many as 4 in 100
+are (simulated; of three and more cameras none). More are another floor, and then none is said."""
 SCALE_M = 0.015
 """Of the kernel: how much soles of bodies differ from the floor that they stand on, metres, one sigma."""
 TILT_RAD = np.deg2rad(0.5)

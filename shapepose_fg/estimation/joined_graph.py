@@ -14,12 +14,15 @@ from factors import (
     Sighting,
     make_calibration,
     make_camera,
+    reported_factor,
     robust_kernel,
 )
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
+from shapepose_fg.estimation.carried_error import goes_with_poses
+from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.trajectory_graph import dilution
 
@@ -60,7 +63,9 @@ class JoinedPeople:
     def increments(self, people: Reconstruction) -> Iterator[tuple[int, Increment]]:
         """Frame number and increment of each frame of `people`, which has what it was solved from, in order.
 
-        ValueError where observations or times are missing.
+        Beside the joints that tell of poses there are those that people were reported at
+        (`KeySpace.reported`): body, motion and all frames are in them, and they go with your poses. ValueError
+        where observations or times are missing.
         """
         if len(people) == 0:
             return
@@ -78,19 +83,48 @@ class JoinedPeople:
         )
         # Where a joint would have been seen at the row's time, by the camera where it was at its own.
         xy = np.where(table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan)
+        goes = self._goes_with_poses(people, rows, views) if views.carried is not None else None
         for frame in np.unique(people.frame).tolist():
             here = np.flatnonzero(people.frame == frame)
             cameras = self._cameras(frame, rows.time_s[here[0]])
-            yield (
-                frame,
-                self._people.add(
-                    Sighting(
-                        int(people.person[n]), frame, float(people.time_s[n]), people.joints[n], xy[n], sigmas[n],
-                        density[n], cameras,
-                    )
-                    for n in here.tolist()
-                ),
+            made = self._people.add(
+                Sighting(
+                    int(people.person[n]), frame, float(people.time_s[n]), people.joints[n], xy[n], sigmas[n],
+                    density[n], cameras,
+                )
+                for n in here.tolist()
             )  # fmt: skip
+            for n in here.tolist():
+                self._report(people, n, views, None if goes is None else goes[n], made)
+            yield frame, made
+
+    def _goes_with_poses(self, people: Reconstruction, rows: Observations, views: Views) -> Array:
+        """(N, J, B, 3, 6) how the joints as they are reported go with the poses of carriers."""
+        sigmas = observation_sigmas(rows, people.joints, views, self._config, people.joint_names.tolist())
+        evidence = linearise(rows, sigmas, people.joints, views, self._config)
+        nothing = Message(people.joints, np.zeros((*people.joints.shape, 3)))
+        return goes_with_poses(evidence, nothing, sigmas, views, self._config)
+
+    def _report(self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment) -> None:
+        """Add the joints of a row as they are reported."""
+        person, frame, time_s = int(people.person[n]), int(people.frame[n]), float(people.time_s[n])
+        X, C = people.joints[n], people.covariance[n]
+        keys = self._people.space.reported(person, np.arange(len(X)), frame)
+        for j in np.flatnonzero(np.isfinite(X).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1))).tolist():
+            key, own, poses = int(keys[j]), C[j], []
+            if goes is not None and views.carried is not None:
+                carried = views.carried
+                moves = np.linalg.norm(goes[j], axis=(1, 2))
+                for b in np.argsort(-moves)[:2][np.sort(-moves)[:2] < 0].tolist():
+                    name = self._rig.trajectories[b].name
+                    poses.append((self._pose_key(name, frame), gtsam.Pose3(carried.wTb[n, b]), goes[j, b]))
+                    # What comes of the poses is your graph's to say: no less than a tenth is the joint's own.
+                    own = own - goes[j, b] @ carried.covariance[n, b] @ goes[j, b].T
+                values, axes = np.linalg.eigh(own)
+                own = (axes * np.maximum(values, np.trace(C[j]) / 30)) @ axes.T
+            made.graph.push_back(reported_factor(key, X[j], own, poses))
+            made.values.insert(key, X[j])
+            made.times_s[key] = time_s
 
     def _cameras(self, frame: int, time_s: Array) -> list[gtsam.PinholeCameraCal3_S2 | PosedCamera]:
         """The cameras of a frame whose views are of `time_s` (V,)."""

@@ -8,7 +8,8 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.estimation.in_time import near_in_time, smoothed_in_time, waited_s
 from shapepose_fg.estimation.linearisation import weakest_sigma
-from shapepose_fg.estimation.state import SEEN_M, State
+from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.state import State
 
 LIMB_SIGMA_M = 0.03
 """Sigma of an unseen joint from which on it is more the body's than its own."""
@@ -16,7 +17,7 @@ STEP_S = 0.1
 """Time over which what a body changes of unseen joints is averaged, seconds, one sigma."""
 LENGTH_SIGMA_M = 0.1
 """How far a limb of a detector's joints may be from its length, metres, in one sweep: as far as the views may
-leave open a joint that counts as seen (`outcome.SEEN_M`). With `_SWEEPS` sweeps the length counts about four
+leave open a joint that counts as seen (`motion_model.LOST_M`). With `_SWEEPS` sweeps the length counts about four
 times, as if this were 5 cm: of what a limb lacks (s² / (v + s²))^4 is left, s being this and v the variance of its
 ends along it. Ends of 2 cm each close a quarter of it, ends of 10 cm each all but a hundredth. Results are
 measured so."""
@@ -41,7 +42,7 @@ def limbs_kept(state: State, covariance: Array, fitter: BodyFitter) -> Array:
     for person in state.people:
         unseen[person.rows] &= person.temporal & ~person.touched
     steps = limb_steps(X, covariance, unseen, fitter)
-    weak, placed = weakest_sigma(state.of_views.information) > SEEN_M, X.copy()
+    weak, placed = weakest_sigma(state.of_views.information) > LOST_M, X.copy()
     for person in state.people:
         rows, times_s = person.rows, person.times_s
         if not person.temporal:

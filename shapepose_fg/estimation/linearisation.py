@@ -121,9 +121,9 @@ class Message:
 
 
 def symmetric_roots(information: Array) -> Array:
-    """Symmetric square roots (D, 3, 3) of positive semi-definite matrices."""
+    """Symmetric square roots (..., n, n) of positive semi-definite matrices."""
     values, vectors = np.linalg.eigh(information)
-    return np.einsum("dik,dk,djk->dij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
+    return np.einsum("...ik,...k,...jk->...ij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
 
 
 def inverses(A: Array) -> Array:

@@ -20,9 +20,10 @@ from shapepose_fg.estimation.linearisation import (
     mean_confidence,
     weakest_sigma,
 )
+from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
-from shapepose_fg.estimation.state import SEEN_M, State
+from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
@@ -146,20 +147,18 @@ def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
 
     Added is the share that lasts, of what views and body leave in one frame; and of the share that motion smooths,
     the part that it does not take away in truth, because errors fade over a few frames (`Lasting.kept`). Where a
-    joint is not seen, what was left in the nearest frame in which it was is carried along; a view that still sees
-    it brings its own lasting error in, through the gain that it has. Joints solved with offsets have it all in
-    `marginal`.
+    joint is not seen, what was left in the nearest frame in which it was is carried along. What is solved with
+    offsets has its own lasting error in `marginal`.
     """
     said = state.of_views.information[person.rows]
     information = said + state.of_body.information[person.rows]
     simple = np.broadcast_to(~person.with_offsets, said.shape[:2])
-    seen = (weakest_sigma(said) <= SEEN_M) & simple
+    seen = (weakest_sigma(said) <= LOST_M) & simple
     f, kept = state.motion.views.white_share, state.motion.views.kept
     left = np.zeros(information.shape)
     left[seen] = inverses(information[seen])
     left = carried(left, seen, person.times_s)
-    own = (1 - f) / f**2 * marginal @ said @ marginal
-    total = np.where(seen[..., None, None], (1 - kept) * marginal, marginal + own) + (1 - f + kept * f) * left
+    total = np.where(seen, 1 - kept, 1.0)[..., None, None] * marginal + (1 - f + kept * f) * left
     return np.where(simple[..., None, None], total, marginal)
 
 

@@ -15,9 +15,6 @@ from shapepose_fg.estimation.linearisation import Message, ViewEvidence, observa
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
 
-SEEN_M = 0.1
-"""A joint is seen in a frame whose views leave it no less certain than this in any direction, metres."""
-
 
 @dataclass
 class State:

@@ -30,6 +30,7 @@ from factors import (
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.carried_error import POSES_LAST_S
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 
 CameraFactors = Callable[["TrajectoryGraph", NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
@@ -44,8 +45,6 @@ _ERRORS = ((0.45, 3.5), (0.25, 0.25))
 """Shares of a detector's errors that last, and how long, seconds; all as in `calibration/refinement.py`."""
 _AVERAGED_S = 1.0
 """So long an odometry of 1 % is better than what people say of a pose: over this, errors would average out."""
-_NEW_S = 3.0
-"""Errors of poses that SLAM gives are taken to be new after this time: one of them counts in so long."""
 _ANYWHERE_M = 10.0
 """Joints are about there: without it one that ends behind its cameras would make the system singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
@@ -117,7 +116,7 @@ class Mounted:
             covariance = _GAUGE
         covariances = np.tile(covariance, (len(keys), 1, 1))
         if trajectory.covariance is not None:
-            at = np.unique(np.floor((middle - middle[0]) / _NEW_S), return_index=True)[1].tolist()
+            at = np.unique(np.floor((middle - middle[0]) / POSES_LAST_S), return_index=True)[1].tolist()
             covariances = trajectory.covariance_at(middle)
         poses = self.odometry[:, carrier]
         return [

@@ -10,26 +10,35 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.estimation.carried_error import POSES_LAST_S, goes_with_poses
+from shapepose_fg.estimation.linearisation import (
+    Message,
+    ObservationConfig,
+    linearise,
+    observation_sigmas,
+    symmetric_roots,
+)
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
-CORRELATION_S = 0.9
-"""Errors of a joint, in standard deviations, have the correlation exp(-t / this) over time: measured 0.97, 0.83,
-0.70, 0.56, 0.37 after 1, 4, 8, 16, 30 frames at 30 Hz (simulated, split tune, two to six cameras; seeds 6850 to
-6854)."""
+_LASTS, _LASTS_S, _FADES_S = 0.62, 2.2, 0.115
+"""Errors of a joint, in standard deviations, have over time the correlation of a part that lasts, exp(-t / 2.2 s),
+and of one that motion smooths, (1 + t / 0.115 s) exp(-t / 0.115 s): measured 0.97, 0.84, 0.68, 0.52, 0.39, 0.25,
+0.16 after 1, 4, 8, 16, 30, 60, 90 frames at 30 Hz, alike for two to six cameras and however many views see it
+(simulated: the recordings of `scripts/fit_covariances.py`)."""
 _LIMBS = {
-    ("Neck", "MidHip"): 0.57, ("Nose", "Neck"): 0.2, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.3,
-    ("Shoulder", "Neck"): 0.65, ("Elbow", "Shoulder"): 0.12, ("Wrist", "Elbow"): 0.4, ("Hip", "MidHip"): 0.89,
-    ("Knee", "Hip"): 0.55, ("Ankle", "Knee"): 0.43, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.36,
-    ("SmallToe", "BigToe"): 0.74,
+    ("Neck", "MidHip"): 0.50, ("Nose", "Neck"): 0.30, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.44,
+    ("Shoulder", "Neck"): 0.71, ("Elbow", "Shoulder"): 0.23, ("Wrist", "Elbow"): 0.39, ("Hip", "MidHip"): 0.85,
+    ("Knee", "Hip"): 0.53, ("Ankle", "Knee"): 0.47, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.43,
+    ("SmallToe", "BigToe"): 0.77,
 }  # fmt: skip
 """Correlation of the errors of two joints of a person in one frame, in standard deviations, along a limb; else the
-product along the way from one to the other. Measured as above, alike for joints that are seen and not: 0.55, 0.30,
-0.18, 0.10 one to four limbs apart. Two people's are -0.02: taken as 0."""
+product along the way from one to the other. Measured as above. Two people's are -0.02: taken as 0."""
 SURFACE_M = 0.015
 """What a point of a body's surface is known less well than the joints around it, one sigma, metres."""
 _REACH_M = 0.15
@@ -111,7 +120,8 @@ class Distance:
         """Distances that would not have made the measured one improbable, by Neyman's construction.
 
         It holds the true one as often as it says however near it is; quantiles do not near zero, where errors in
-        three dimensions only ever make a distance longer.
+        three dimensions only ever make a distance longer. Where the measured one is shorter than errors let it
+        be, next to nothing would be left: the upper end is no less than the quantile.
         """
         away = np.linalg.norm(self.apart, axis=-1)
         way = np.where(away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0])
@@ -123,7 +133,7 @@ class Distance:
             np.array([np.interp(end, flat[:, n], r[:, n]) for n in range(flat.shape[1])]).reshape(away.shape)
             for end in ends
         )
-        return low, high
+        return low, np.maximum(high, self.quantile(ends[0]))
 
     @property
     def mean_m(self) -> Array:
@@ -171,27 +181,59 @@ class SurfaceDistance:
         return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
 
 
-def marginal(people: Reconstruction, *joints: JointAt) -> Marginal:
+def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -> Marginal:
     """Joints of any people and frames together.
 
     Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
-    correlate as was measured (`correlation`). NotDetermined for a joint without a place, ValueError for one that
-    is not there.
+    correlate as was measured (`correlation`). With the `rig` that people were solved with (`cameras.json`), what
+    comes of the poses of cameras that move is shared by all that they see. NotDetermined for a joint without a
+    place, ValueError for one that is not there.
     """
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
-    roots = _roots(people.covariance[rows, numbers])
-    names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
-    rho = correlation(names, names) * np.exp(-np.abs(time_s[:, None] - time_s) / CORRELATION_S)
-    rho *= people.person[rows][:, None] == people.person[rows]
     K = len(joints)
-    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots).reshape(3 * K, 3 * K)
-    return Marginal(people.joints[rows, numbers], covariance)
+    reported = people.covariance[rows, numbers]
+    shared = np.zeros((K, 3, K, 3))
+    if rig is not None and rig.trajectories and K > 0:
+        shared = _of_poses(people, rig, rows, numbers, reported)
+    roots = symmetric_roots(reported - np.einsum("aiaj->aij", shared))
+    names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
+    rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
+    rho *= people.person[rows][:, None] == people.person[rows]
+    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots) + shared
+    return Marginal(people.joints[rows, numbers], covariance.reshape(3 * K, 3 * K))
 
 
-def distance(people: Reconstruction, one: JointAt, other: JointAt | ArrayLike) -> Distance:
-    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3)."""
+def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
+    """(K, 3, K, 3) what the errors of K joints have from poses of cameras that move: all that one carries errs
+    with it, and for a while. In no direction it is more than is `reported` (K, 3, 3).
+    """
+    own = people.rows(rows)
+    if own.observations is None:
+        raise ValueError("what moving cameras saw is not known: keep observations.npz, or give no rig")
+    seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
+    views = Views.of(rig, seen.time_s)
+    assert views.carried is not None
+    sigmas = observation_sigmas(seen, own.joints, views, config, own.joint_names.tolist())
+    evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
+    goes = goes_with_poses(evidence, Message(own.joints, nothing), sigmas, views, config)
+    goes = goes[np.arange(len(rows)), numbers] @ symmetric_roots(views.carried.covariance)
+    ends = symmetric_roots(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(
+        goes, 1, 2
+    ).reshape(len(rows), 3, -1)
+    most = np.linalg.eigvalsh(ends @ ends.mT)[:, -1]
+    goes /= np.sqrt(np.maximum(most, 1.0))[:, None, None, None]
+    lasting = np.exp(-np.abs(own.time_s[:, None] - own.time_s) / POSES_LAST_S)
+    return np.einsum("abik,ac,cbjk->aicj", goes, lasting, goes)
+
+
+def distance(
+    people: Reconstruction, one: JointAt, other: JointAt | ArrayLike, *, rig: Rig | None = None
+) -> Distance:
+    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` as of
+    `marginal`.
+    """
     if isinstance(other, JointAt):
-        both = marginal(people, one, other)
+        both = marginal(people, one, other, rig=rig)
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance)
@@ -255,6 +297,12 @@ def correlation(one: Sequence[str], other: Sequence[str]) -> Array:
     return np.array([[_together(a, b) for b in other] for a in one]).reshape(len(one), len(other))
 
 
+def _over_time(apart_s: Array) -> Array:
+    """Correlation (...) of the errors of one joint at times so far apart (...), seconds."""
+    fading = apart_s / _FADES_S
+    return (1 - _LASTS) * (1 + fading) * np.exp(-fading) + _LASTS * np.exp(-apart_s / _LASTS_S)
+
+
 def _together(one: str, other: str) -> float:
     ways, found = (_way_up(one), _way_up(other)), 1.0
     if one == other:
@@ -306,12 +354,6 @@ def _missing(people: Reconstruction, row: int, joint: int) -> str:
     used = table.view_names[table.used[row, joint]].tolist()
     views = {0: "no camera's detection was used", 1: f"only camera {' '.join(used)} saw it"}
     return views.get(len(used), f"cameras {', '.join(used)} do not place it") + body
-
-
-def _roots(covariances: Array) -> Array:
-    """Symmetric square roots (K, 3, 3)."""
-    values, vectors = np.linalg.eigh(covariances)
-    return np.einsum("kia,ka,kja->kij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
 
 
 _AT, _WEIGHT = np.polynomial.legendre.leggauss(_NODES)

@@ -53,7 +53,8 @@ class WindowGraph:
     - projections and body priors count with the share of their variance that is new in every frame, so that motion
       smooths that only; `state_covariances` have nothing of the rest (`outcome.with_lasting` adds it);
     - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
-      (`factors.motion`): the difference between joint and body when it was seen;
+      (`factors.motion`): the difference between joint and body when it was seen; and so does what its views say,
+      which, where they hardly cross, would else be averaged over time as if it were new in every frame;
     - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
       Gaussian each: your factor is weighed against all of the error, and the covariances hold it.
     """
@@ -232,6 +233,7 @@ class WindowGraph:
             if lost is not None:
                 around = near_in_time(lost, self.times_s, self._motion.around_s)
                 of_body = self.present & (self.with_offsets | around)
+                of_views = self.present & (self.with_offsets | lost)
                 density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
         # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
         # wide as before either changed the sigma.

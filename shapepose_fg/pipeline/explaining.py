@@ -8,10 +8,12 @@ import numpy as np
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
-from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
+from shapepose_fg.estimation.linearisation import inverses, observation_sigmas, weakest_sigma
+from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -35,12 +37,14 @@ def explain(
     joint: str,
     frame: int | None = None,
     time_s: float | None = None,
+    detections: DetectionSequence | None = None,
 ) -> Explanation:
     """Why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`, seconds.
 
     The person's window is solved once more, from the detections that `people.observations` has of them, before the
-    cameras `rig`; joints, covariances and gates are those of the result. InputError where the person, the joint or
-    the frame is not in the result, or where it does not say what it was solved from.
+    cameras `rig`; joints, covariances and gates are those of the result. With the recording's `detections` those
+    are named, too, that a detector joins with the person's and that were not given to them. InputError where the
+    person, the joint or the frame is not in the result, or where it does not say what it was solved from.
     """
     table = people.observations
     if table is None:
@@ -61,7 +65,8 @@ def explain(
         around.table.residual_px.astype(np.float64), around.sigmas_px, around.there, around.table.gate == Gate.USED
     )
     wrong = wrong_view(seen, around.people.joints, around.views, solver.config.estimator.observations)
-    findings = _findings(people, row, number, views, shares, wrong)
+    refused = _refused(around, person, frame, number, detections)
+    findings = _findings(people, row, number, views, shares, wrong, refused)
     return Explanation(
         person, joint, frame, when if np.isfinite(when) else None,
         tuple(here.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
@@ -134,10 +139,7 @@ def _view_reasons(
     solved = [] if graph is None else np.flatnonzero(graph.frames == frame).tolist()
     if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
         t, estimator = solved[0], config.estimator
-        place = graph.solved[t, joint]
-        # The solver's graph holds the share of the variance that is new in every frame.
-        share = graph.lasting.white_share if graph.window.temporal else 1.0
-        whole = share * np.linalg.inv(graph.solved_covariance[t, joint])
+        place, whole = graph.solved[t, joint], np.linalg.inv(graph.solved_covariance[t, joint])
         of_body = estimator.graph.weight_shape * graph.body.information[t, joint]
     xy, _, slope = (each[0, 0] for each in rows.project(place[None, None]))
     residual = xy - table.xy[row, joint]
@@ -147,6 +149,10 @@ def _view_reasons(
     for v in np.flatnonzero(used).tolist():
         weight = kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v]) / sigma[v] ** 2
         information[v], gradient[v] = weight * slope[v].T @ slope[v], weight * slope[v].T @ residual[v]
+    if whole is not None and graph is not None and graph.window.temporal:
+        # Of what is seen the solver's graph holds the share of the variance that is new in every frame.
+        seen_well = weakest_sigma(information.sum(axis=0)) <= LOST_M
+        whole *= graph.lasting.white_share if seen_well else 1.0
     if whole is None:
         whole = information.sum(axis=0) + of_body + np.eye(3)
     rest = np.linalg.eigvalsh(whole - information.sum(axis=0) - of_body).sum()
@@ -208,6 +214,40 @@ def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, off_px:
     return found
 
 
+def _refused(
+    all_of_it: _Detections, person: int, frame: int, joint: int, detections: DetectionSequence | None
+) -> list[Finding]:
+    """Detections of a joint that the detector joins with the person's own in a camera, and that are not theirs:
+    given to somebody else, or to nobody.
+    """
+    people, table = all_of_it.people, all_of_it.table
+    if detections is None or not 0 <= frame < len(detections):
+        return []
+    seen, here = detections[frame], np.flatnonzero(people.frame == frame)
+    owner = np.full(len(seen), -1)
+    places = {at: k for k, at in enumerate(zip(seen.view.tolist(), seen.place.tolist(), strict=True))}
+    for n in here.tolist():
+        _, view = np.nonzero(table.candidate[n] >= 0)
+        given = zip(view.tolist(), table.candidate[n][table.candidate[n] >= 0].tolist(), strict=True)
+        owner[[places[at] for at in given if at in places]] = people.person[n]
+    row = int(here[people.person[here] == person][0])
+    xy, found = all_of_it.views.rows(np.array([row])).pixels(people.joints[row, joint][None, None])[0][0, 0], []
+    begin, other, affinity = seen.ties
+    for k in np.flatnonzero((seen.joint == joint) & (owner != person)).tolist():
+        view, ends = int(seen.view[k]), slice(begin[k], begin[k + 1])
+        with_whom = owner[other[ends]]
+        theirs, others = (affinity[ends][chosen].sum() for chosen in (with_whom == person, with_whom == owner[k]))
+        if table.gate[row, joint, view] != Gate.NOT_SEEN or theirs <= (others if owner[k] >= 0 else 0.0):
+            continue
+        name, off = str(table.view_names[view]), float(np.linalg.norm(seen.xy[k] - xy[view]))
+        cause, whose = Cause.GATED, "nobody's"
+        if owner[k] >= 0:
+            cause, whose = Cause.FOREIGN, f"person {owner[k]}'s"
+        words = f"Camera {name} joins a detection with theirs that is {whose}, {off:.0f} px off. It was not taken."
+        found.append(Finding(cause, (name,), words))
+    return found
+
+
 def _findings(
     people: Reconstruction,
     row: int,
@@ -215,6 +255,7 @@ def _findings(
     views: Sequence[ViewReason],
     shares: tuple[float, float],
     wrong: WrongView | None,
+    refused: Sequence[Finding],
 ) -> tuple[Finding, ...]:
     """What is the matter with a joint, the gravest first."""
     found, used = list[Finding](), [view for view in views if view.gate == GATES[Gate.USED]]
@@ -257,6 +298,7 @@ def _findings(
     for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
         words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
         found.append(Finding(Cause.GATED, (view.camera,), words))
+    found += refused
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body says {shares[0]:.0%}, motion from other frames the rest."

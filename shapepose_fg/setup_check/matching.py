@@ -262,6 +262,7 @@ def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
 
 def least_of_each(key: Index, value: Array) -> Index:
     """The row with the least `value` (N,) of each `key` (N,); the first of equal ones."""
+    key = key - key.min(initial=0)  # the first frame may have a number below 0
     best = np.full(key.max(initial=-1) + 1, -1, dtype=np.intp)
     _least_of_each(key, value, best)
     return best[best >= 0]

@@ -29,6 +29,12 @@ def test_most_feet_say_where_it_is():
     assert Floor.from_dict({"found": False, "why": "dark"}) is None
 
 
+def test_a_few_feet_that_are_placed_badly_are_no_floor():
+    points, look = feet([0.3] * 97 + [0.15] * 3)
+    floor = find_floor(points, look, UP)
+    assert isinstance(floor, Floor) and abs(floor.height_m - 0.3) < 0.002
+
+
 def test_it_may_lean_and_up_may_be_any_axis():
     points, look = feet([0.0] * 60)
     lean = np.deg2rad(0.8)

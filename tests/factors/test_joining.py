@@ -16,6 +16,7 @@ from factors import (
     make_calibration,
     make_camera,
     odometry_factors,
+    reported_factor,
 )
 
 K = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
@@ -184,6 +185,37 @@ def test_one_camera_and_holes_leave_no_system_singular():
     assert np.isfinite(errors).all() and errors[:, 0].max() < 0.3
     assert not values.exists(int(SPACE.positions(1, 0, 10)))
     assert not values.exists(int(SPACE.positions(1, 5, 3))) and values.exists(int(SPACE.positions(1, 5, 4)))
+
+
+def test_a_reported_joint_goes_with_a_pose_and_tells_nothing_of_it():
+    rng = np.random.default_rng(0)
+    pose, joint = facing(0.4, 3.0), np.array([0.2, -0.3, 1.1])
+    wide, own = diagonal([0.01] * 3 + [0.05] * 3), np.diag([1.0, 4.0, 2.0]) * 1e-4
+    goes = np.zeros((3, 6), order="F")
+    pose.transformFrom(pose.transformTo(joint), goes, np.zeros((3, 3), order="F"))
+    key = int(SPACE.reported(7, 3, 5))
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    moved = pose.retract(0.01 * rng.normal(size=6))
+    graph.addPriorPose3(X(0), moved, wide)
+    graph.push_back(reported_factor(key, joint, own, [(X(0), pose, goes)]))
+    values.insert(X(0), pose)
+    values.insert(key, joint)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    assert solved.atPose3(X(0)).equals(moved, 1e-6)
+    np.testing.assert_allclose(
+        solved.atPoint3(key), moved.transformFrom(pose.transformTo(joint)), atol=2e-3
+    )  # it is linear: 1 cm and half a degree at 3 m
+    marginals = gtsam.Marginals(graph, solved)
+    of_pose = marginals.marginalCovariance(X(0))
+    np.testing.assert_allclose(of_pose, wide.covariance(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        marginals.marginalCovariance(key), own + goes @ of_pose @ goes.T, rtol=0.1, atol=1e-5
+    )
+    assert SPACE.format(key) == "reported position(person 7, joint 3, frame 5)"
+    still = reported_factor(key, joint, own)
+    assert isinstance(still, gtsam.PriorFactorPoint3) and still.error(values) == 0
+    with pytest.raises(ValueError, match="two poses at the most"):
+        reported_factor(key, joint, own, [(X(n), pose, goes) for n in range(3)])
 
 
 def test_what_is_given_wrongly_is_refused():

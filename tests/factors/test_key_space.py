@@ -32,7 +32,7 @@ def test_a_character_takes_symbols_of_that_character_only():
 
 
 def test_what_has_no_key_is_refused_with_the_cure():
-    with pytest.raises(ValueError, match="too small for one frame: give 500 keys"):
+    with pytest.raises(ValueError, match="too small for one frame: give 750 keys"):
         KeySpace(range(100), people=10, joints=25)
     with pytest.raises(ValueError, match="joint must be 0 to 24 in this space"):
         SPACES[1].positions(0, 25, 0)

@@ -1,5 +1,6 @@
 """MCAP with ROS 2 messages, read back by readers that are not ours."""
 
+import tracemalloc
 from dataclasses import replace
 
 import gtsam
@@ -162,6 +163,29 @@ def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, file, five_cameras)
         damaged.write_bytes(bytes(spoiled))
         with pytest.raises(InputError, match=r"damaged\.mcap: "):
             list(read_views(damaged, five_cameras, BODY_25))
+
+
+@pytest.mark.parametrize("how", ["zstd", "lz4", ""])
+def test_a_chunk_that_claims_more_memory_than_it_may_is_not_unpacked(tmp_path, five_cameras, how):
+    """The frame itself says its size, and a chunk says it beside: either is refused; 80 MB of zeros are 8 kB."""
+    import lz4.frame
+    import zstandard
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import Chunk
+
+    zeros = bytes(80 * 2**20)
+    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(how, lambda data: data[:100])(zeros)
+    for claimed in (100, len(zeros)):
+        if how == "" and claimed == 100:
+            continue  # it is as long as it says
+        records = RecordBuilder()
+        Chunk(how, packed, 0, 0, 0, claimed).write(records)
+        (tmp_path / "bomb.mcap").write_bytes(b"\x89MCAP0\r\n" + records.end())
+        tracemalloc.start()
+        with pytest.raises(InputError, match=r"bomb\.mcap: cannot be read \(ValueError: a chunk claims 83886080 "):
+            list(read_views(tmp_path / "bomb.mcap", five_cameras, BODY_25))
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+        tracemalloc.stop()
 
 
 def test_a_second_reader_with_definitions_of_its_own_agrees(file, people):

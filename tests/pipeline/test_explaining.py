@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg import InputError, explain, reconstruct, write_rig
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.explanation import Cause, Explanation
 from shapepose_fg.pipeline.solving import Solver, solve_rows
@@ -117,6 +119,48 @@ def test_somebody_elses_detection(people, scene):
     found = asked(solved(people, scene.rig, **columns), scene.rig, person)
     assert first(found) == (Cause.FOREIGN, (scene.rig.names[view],))
     assert found.views[view].looks_like == f"person {name}'s LElbow"
+
+
+def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(people, scene):
+    """Spoiled before anybody is sought: in one camera an elbow is half a metre up, in another it is missed, and
+    the detector joins somebody else's with the arm. Neither is given to the person.
+    """
+    person, row, cameras = seen_by_many(people)
+    table, recording = people.observations, simulate(scene, seed=3)
+    away, taken = int(cameras[0]), None
+    for other in np.flatnonzero((people.frame == 5) & (people.person != person)):
+        for view in cameras[1:].tolist():
+            if table.used[other, ELBOW, view]:
+                taken, name = view, int(people.person[other])
+    assert taken is not None
+    frames = [recording[t] for t in range(len(recording))]
+    for mine in rows_of(people, person):
+        frame, theirs = int(people.frame[mine]), (people.person == name) & (people.frame == people.frame[mine])
+        seen = replace(frames[frame], xy=frames[frame].xy.copy(), pairs=frames[frame].pairs.copy())
+        of = table.candidate[[mine, *np.flatnonzero(theirs)]][:, ELBOW]
+        up = np.flatnonzero((seen.view == away) & (seen.place == of[0, away]))
+        seen.xy[up, 1] -= 150
+        lost, joined = (np.flatnonzero((seen.view == taken) & (seen.place == each)) for each in of[:, taken])
+        if len(lost) and len(joined):
+            ends = seen.pairs
+            seen.affinity[(ends == joined[0]).any(axis=1)] = 0.0
+            ends[ends == lost[0]] = joined[0]
+            seen = seen.only(np.arange(len(seen)) != lost[0])
+        frames[frame] = seen
+    spoiled = Recording(BODY_25, frames)
+    found = reconstruct(spoiled, scene.rig)
+    at = people.joints[row]
+    near = np.linalg.norm(found.joints - at, axis=-1).mean(axis=1) + 10 * (found.frame != 5)
+    who = int(found.person[near.argmin()])
+    told = explain(found, scene.rig, person=who, joint="LElbow", frame=5, detections=spoiled)
+    named = {(each.cause, each.cameras[0]) for each in told.findings if each.cameras}
+    assert {(Cause.GATED, scene.rig.names[away]), (Cause.FOREIGN, scene.rig.names[taken])} <= named
+    silent = asked(found, scene.rig, who)
+    assert all(each.cause == Cause.ONE_VIEW for each in silent.findings), (
+        "of what was given to them nothing is wrong"
+    )
+    untouched = explain(people, scene.rig, person=person, joint="LElbow", frame=5, detections=recording)
+    assert untouched.findings == ()
 
 
 def test_views_that_the_body_contradicts(people, scene):

@@ -13,7 +13,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
-from shapepose_fg.setup_check.matching import Sightings
+from shapepose_fg.setup_check.matching import Sightings, least_of_each
 from tests.marks import slow
 from tests.setup_check.spoiled_setups import (
     delayed,
@@ -196,3 +196,9 @@ def test_pose2sim_s_recording_has_what_is_wrong_with_it(shared_data):
     rig = read_rig(folder / "Calib.qca.txt")
     findings = diagnose(read_detections(folder / "openpose", rig), rig).findings
     assert [each.kind for each in findings] == [Kind.PRINCIPAL_POINT]
+
+
+def test_groups_of_frames_below_zero_are_those_of_any_others():
+    frame, worth = np.array([-3, 2, -3, 2, 7]), np.array([2.0, 1.0, 1.0, 3.0, 0.0])
+    np.testing.assert_array_equal(least_of_each(frame, worth), [2, 1, 4])
+    np.testing.assert_array_equal(least_of_each(frame + 3, worth), [2, 1, 4])

@@ -31,6 +31,8 @@ from shapepose_fg.io.ros.messages import (
 _DETECTIONS = "shapepose_msgs/Detections"
 _LASTS_S = 0.2
 """Markers of who is seen no more stay so long."""
+_CHUNK = 2**26
+"""Bytes that a chunk may unpack to; those of ROS 2 have one million."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 
 
@@ -100,17 +102,41 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton) -> Iterator[tuple[str, 
 
 def _detections(stream: IO[bytes], file: Path) -> Iterator[Any]:
     """Messages with detections; what is wrong with the file as an InputError."""
-    make, factory = (
-        optional("mcap.reader", "ros").make_reader,
-        optional("mcap_ros2.decoder", "ros").DecoderFactory(),
-    )
+    factory = optional("mcap_ros2.decoder", "ros").DecoderFactory()
     try:
-        for schema, channel, message in make(stream).iter_messages():
+        for schema, encoding, message in _messages(stream):
             if schema is not None and schema.name == type_name(_DETECTIONS):
-                decode = factory.decoder_for(channel.message_encoding, schema)
+                decode = factory.decoder_for(encoding, schema)
                 if decode is None:
-                    raise ValueError(f"its encoding is {channel.message_encoding}")
+                    raise ValueError(f"its encoding is {encoding}")
                 yield decode(message.data)
     except Exception as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
         said = f"{type(error).__name__}: {str(error).strip()[:80]}"
         raise InputError(f"{file}: cannot be read ({said}); {_CURE}") from None
+
+
+def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, str, Any]]:
+    """Schema, encoding and record of each message: chunk by chunk, so that one is in memory at a time, and in each
+    by the time of the log. ValueError for a chunk that claims more than `_CHUNK` bytes, before it is unpacked.
+    """
+    reading, lz4, zstd = (optional(name, "ros") for name in ("mcap.stream_reader", "lz4.frame", "zstandard"))
+    schemas, channels = {}, {}
+    # What a frame says of its size is taken before what the chunk says.
+    claims = {"zstd": zstd.frame_content_size, "lz4": lambda data: lz4.get_frame_info(data)["content_size"]}
+    most = stream.seek(0, 2)
+    stream.seek(0)
+    for record in reading.StreamReader(stream, emit_chunks=True, record_size_limit=most).records:
+        inside = [record]
+        if isinstance(record, reading.Chunk):
+            claim = claims.get(record.compression, len)(record.data)
+            if max(claim, record.uncompressed_size) > _CHUNK:
+                raise ValueError(f"a chunk claims {max(claim, record.uncompressed_size)} bytes, over {_CHUNK}")
+            inside = sorted(reading.breakup_chunk(record), key=lambda each: getattr(each, "log_time", -1))
+        for each in inside:
+            if isinstance(each, reading.Schema):
+                schemas[each.id] = each
+            elif isinstance(each, reading.Channel):
+                channels[each.id] = each
+            elif isinstance(each, reading.Message):
+                channel = channels[each.channel_id]
+                yield schemas.get(channel.schema_id), channel.message_encoding, each
