@@ -22,7 +22,7 @@ from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Change, Lag, gross_mistake, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Change, Lag, gross_mistake, judged, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted, stories
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
@@ -139,7 +139,7 @@ def build_of(points: Array, skeleton: Skeleton) -> Build:
     return Build(float(np.median(statures)) if len(statures) > 0 else np.nan, up, int(enough.sum()))
 
 
-_MOST_FINDINGS = 4
+_MOST_FINDINGS, _MOST_BIASED = 4, 3
 """More mistakes than this are not told apart."""
 _UNFIT = 0.15
 """A camera that fits the others' people no better, and nothing explains it, does not fit."""
@@ -185,6 +185,8 @@ class Diagnosis:
     """Each camera's offset in time that remains; none with too few people."""
     build: Build | None = None
     """The people, in the corrected set-up."""
+    biased: tuple[Finding, ...] = ()
+    """Single people whom a camera sees beside where they are; nothing of the set-up."""
     trust: Trust = BELIEVED
     """Which cameras a reconstruction is better without."""
 
@@ -199,15 +201,18 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS and (change := _next(look, rng)) is not None:
-        findings.append(change.finding)
+    problem, biased = Problem.of(look), list[Finding]()
+    while len(findings) < _MOST_FINDINGS and (change := _next(look, problem, rng)) is not None:
+        (biased if change.finding.kind == Kind.BIASED else findings).append(change.finding)
         look = change.look
+        problem = Problem.of(look)
+        if len(biased) == _MOST_BIASED:
+            break
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
         findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
         trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
-        return Diagnosis(tuple(findings), given, look, trust=trust)
-    problem = Problem.of(look)
+        return Diagnosis(tuple(findings), given, look, biased=tuple(biased), trust=trust)
     small = problem.small_errors()
     remaining = lags(refined := replace(look, views=small.views))
     for _ in range(_MOST_FINDINGS):
@@ -225,11 +230,21 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     build = build_of(refined.structure()[1].points, detections.skeleton)
     findings += _of_people(build, rig)
     trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
-    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, trust)
+    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 
 
-def _next(look: Look, rng: np.random.Generator) -> Change | None:
-    """The mistake that explains most: of a camera all the time, or from some time on."""
+def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | None:
+    """The mistake that explains most: of a camera all the time, or from some time on, or of one person."""
+    camera, bias = _of_cameras(look, rng), problem.bias
+    if bias is None:
+        return camera
+    finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)))
+    person = Change(finding, problem.unbiased(look, bias), 0.0, freedom=2)
+    return person if camera is None or judged(look, person) >= judged(look, camera) else camera
+
+
+def _of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
+    """The camera's mistake that explains most."""
     gross = gross_mistake(look, rng)
     views = range(look.view_count if look.cameras_used > 2 else 0)
     over_time = [story for view in views for story in stories(look, view, rng)]
@@ -239,7 +254,7 @@ def _next(look: Look, rng: np.random.Generator) -> Change | None:
     elsewhere = gross is not None and gross.finding.cameras != best.finding.cameras
     if gross is not None and elsewhere and gross.look.total > best.look.total:
         return gross
-    return Change(best.finding, best.look, 0.0)
+    return Change(best.finding, best.look, 0.0, freedom=6)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:

@@ -32,6 +32,8 @@ class Kind(StrEnum):
     STOPPED = "stopped"
     UNFIT = "does not fit"
     PICTURE_SIZE = "size of the pictures"
+    BIASED = "biased"
+    """Of one person's detections, not of the set-up."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Finding:
     cameras: tuple[int, ...]
     """Cameras that it is about; none where it is about people, all where all share it."""
     amount: float = 0.0
-    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres."""
+    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres, the part
+    of a person's size."""
     shift_px: tuple[tuple[float, float], ...] = ()
     """For each camera, how far its principal point seems to be off: right and down, pixels."""
     moved: float = 0.0
@@ -73,7 +76,7 @@ def sentence(finding: Finding, rig: Rig) -> str:
         sees="sees" if len(names) == 1 else "see",
         amount=amount,
         degrees=f"{amount:.1f}" if amount < 10 else f"{amount:.0f}",
-        percent=100 * abs(amount - (finding.kind != Kind.STOPPED)),
+        percent=100 * abs(amount - (finding.kind not in (Kind.STOPPED, Kind.BIASED))),
         frames=f"{count} frame{'s' if count != 1 else ''}",
         at=100 + round(amount),
         moved=_length(finding.moved),
@@ -203,6 +206,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",
     Kind.UNFIT: _unfit,
+    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others see that person, and"
+    " nobody else: the detector seems to err, not the camera",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }

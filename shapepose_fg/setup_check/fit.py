@@ -150,6 +150,16 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     return Pinhole(camera.K, np.column_stack([R, scale * move[:, 0] - R @ middle]))
 
 
+def centred_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
+    """The camera whose principal point lies where it sees `points` (N, 3) at `xy` (N, 2), median."""
+    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
+    if not (at[:, 2] > 0).all():
+        return None
+    K = camera.K.copy()
+    K[:2, 2] += np.median(xy - at[:, :2] / at[:, 2:], axis=0)
+    return Pinhole(K, camera.cTw)
+
+
 def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
     """The camera `scaled` by how much farther from `centre` (2,) than it says `points` (N, 3) are seen at `xy`."""
     at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
