@@ -159,10 +159,6 @@ _NOTABLE_DEG = 0.25
 _LIKELY, _SURE_OF_ONE = 1.0, 0.7
 """One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less BIC's
 price), and of all cameras' mistakes with this probability its own."""
-_SINGLE = 0.7
-"""One camera is said to be turned where it alone explains so much of what small errors of all cameras explain."""
-_TURN_DEG = 0.6
-"""Less is said of the principal point: of a calibration, and not of a camera that was knocked."""
 _NOBODY = 0.05
 """With fewer people than this for each sighting, cameras see no people in common."""
 _STOPPED = 0.02
@@ -335,20 +331,14 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         return []
     # Three cameras cannot tell which of their small errors belong to which.
     tells_apart = look.cameras_used > 3
-    if len(off) == 1 and tells_apart and int(off[0]) not in known:
-        view = int(off[0])
-        if focal[view]:
-            return [Finding(Kind.FOCAL, (view,), float(1 / small.focal[view]))]
-        found = _turned(small, view)
-        if 1 - problem.single(view, Kind.MOVED)[1] > _SINGLE * (1 - small.cost):
-            return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []
     shift = shifted.shift_deg.copy()
     shift[list(known)] = 0.0
     order, findings = np.argsort(-shift), list[Finding]()
     first, second = shift[order[:2]]
-    if tells_apart and first > _OUTLIER_DEG and first > _OUTLIER_RATIO * second:
+    alone = problem.likely(int(order[0])) > 0 and first > _OUTLIER_RATIO * second
+    if tells_apart and first > _OUTLIER_DEG and alone:
         findings.append(_turned(shifted, int(order[0])))
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)

@@ -211,21 +211,37 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
         return camera
     points, xy, width_px = points[ahead], xy[ahead], width_px[ahead, None]
 
-    def moved(step: Array) -> Pinhole:
-        change = np.zeros((1, Q))
-        change[0, columns] = step
-        new = changed(Views(camera.K[None], camera.cTw[None]), change)
-        return Pinhole(new.K[0], new.cTw[0])
+    def errors(camera: Pinhole) -> tuple[Array, Array]:
+        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
+        at[:, 2] = np.maximum(at[:, 2], 1e-9)
+        h = at @ camera.K.T
+        return at, (h[:, :2] / h[:, 2:] - xy) / width_px
 
-    def errors(step: Array) -> Array:
-        new = moved(step)
-        at = (points @ new.cTw[:, :3].T + new.cTw[:, 3]) @ new.K.T
-        return ((at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy) / width_px).ravel()
+    def cost(error: Array) -> float:
+        return float(np.log1p(error**2).sum())
 
-    from scipy.optimize import least_squares  # loads for a fifth of a second
-
-    start = np.zeros(len(columns))
-    return moved(least_squares(errors, start, x_scale="jac", loss="cauchy", max_nfev=_STEPS).x)
+    at, error = errors(camera)
+    for _ in range(_STEPS):
+        by_point = (camera.K[:2] - (xy + width_px * error)[..., None] * camera.K[2]) / at[:, 2, None, None]
+        J = np.empty((len(at), 2, Q))
+        J[..., TURN] = np.cross(at[:, None], by_point)
+        J[..., 3:6], J[..., CENTRE] = by_point, np.eye(2)
+        J[..., FOCAL] = (camera.K[:2, :2] @ (at[:, :2] / at[:, 2:]).T).T[..., None]
+        J = J[..., columns] / width_px[..., None]
+        weight = 1 / (1 + error**2)
+        H = np.einsum("nij,ni,nik->jk", J, weight, J)
+        step = np.zeros((1, Q))
+        step[0, columns] = -np.linalg.lstsq(H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12)[0]
+        for part in (1.0, 0.25, 0.06):
+            new = changed(Views(camera.K[None], camera.cTw[None]), part * step)
+            tried = Pinhole(new.K[0], new.cTw[0])
+            new_at, new_error = errors(tried)
+            if cost(new_error) < cost(error):
+                camera, at, error = tried, new_at, new_error
+                break
+        else:
+            break
+    return camera
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:

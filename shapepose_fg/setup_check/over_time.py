@@ -23,8 +23,9 @@ _LEAST_PEOPLE = 6
 """Fewer people of the others say nothing of a piece."""
 _RESTLESS = 0.03
 """A camera is looked at closely if it sees people so far apart in two pieces, a part of their size: 5 cm."""
-_LOST, _THERE = 0.35, 0.45
-"""Or if it fits less than the one in some pieces and more than the other in some: scores."""
+_LOST, _THERE, _GOOD = 0.25, 0.3, 0.45
+"""Or if its score differs by the first; a piece says something from the second on (in crowds sound cameras come
+to little more), and below the third other turns than its neighbours' are tried."""
 _LEAST_DEG = 1.2
 """A smaller step or way is not told from a detector that errs otherwise on a person who turns round."""
 _SURE = 6.0
@@ -139,7 +140,7 @@ class _Pieces:
             return False
         shift = shift[~np.isnan(shift[:, 0])]
         way = np.ptp(shift, axis=0).max(initial=0.0) if len(shift) > 0 else 0.0
-        return bool(score.min() < min(_LOST, score.max() - _LOST) or way > _RESTLESS)
+        return bool(np.ptp(score) > _LOST or way > _RESTLESS)
 
     @property
     def middle(self) -> Array:
@@ -160,7 +161,7 @@ class _Pieces:
                 continue
             tried = [self.camera, turned(self.camera, start)]
             found = [self._fitted(few, mine, each) for each in tried[: 1 if k == best else 2]]
-            if max(score for score, _ in found) < _THERE:
+            if max(score for score, _ in found) < _GOOD:
                 pairs = list(fit.tries(few, mine, rng))
                 sole = fit.best_of(few, mine, self.camera, pairs, fit.turned_to)
                 found += [] if sole is None else [self._fitted(few, mine, sole)]

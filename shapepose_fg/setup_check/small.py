@@ -37,8 +37,8 @@ _REACH, _FORGOTTEN, _BESIDE = 1.4, 40, 0.3
 and sought for so many frames; in a picture it is within this part of its size of where it was."""
 _LEAST_OF_ONE = 6
 """Fewer frames of one person say nothing of a bias."""
-_BIAS, _LIKELY_BIAS = 0.06, 5.0
-"""A detector's bias on one person, part of the size (one sigma, a tenth of a metre), and how much likelier than
+_BIAS, _LIKELY_BIAS = 0.1, 2.0
+"""A detector's bias on one person, part of the size (one sigma), and how much likelier than
 none it must be to be taken away."""
 _MOST_PEOPLE = 160
 _WEAK = 1e-6
@@ -212,7 +212,7 @@ class Problem:
         if len(self.biases) == 0:
             return None
         gain, bias = self.biases[0]
-        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0]) else None
+        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - _LIKELY_BIAS) else None
 
     def unbiased(self, look: Look, bias: Bias) -> Look:
         """The recording as if the person had been seen where the others see that person."""
@@ -257,6 +257,10 @@ class Problem:
                 gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
                 found.append((_PRIOR * gain - self._price * len(parts), view, kind))
         return sorted(found, key=lambda each: -each[0])
+
+    def likely(self, view: int) -> float:
+        """How much likelier some mistake of one camera is than none: see `singles`."""
+        return max(gain for gain, of, _ in self.singles if of == view)
 
     @property
     def _price(self) -> float:
