@@ -212,7 +212,8 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     small = problem.small_errors()
     remaining = lags(refined := replace(look, views=small.views))
     for _ in range(_MOST_FINDINGS):
-        late = [view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset]
+        most = evidence.most_lag - np.abs(look.lag)
+        late = [v for v, lag in enumerate(remaining) if 2 <= abs(lag.frames) <= most[v] and lag.is_offset]
         if len(late) == 0:
             break
         view = max(late, key=lambda view: remaining[view].gain)
@@ -320,7 +321,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         large = abs(np.log(found.amount)) > _OFF_FOCAL if kind == Kind.FOCAL else found.amount > _OFF_DEG
         if large:
             x, y = small.centre_px[view].tolist()
-            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else ())]
+            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else found.shift_px)]
     largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
     if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
         return []

@@ -206,8 +206,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",
     Kind.UNFIT: _unfit,
-    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others see that person, and"
-    " nobody else: the detector seems to err, not the camera",
+    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs"
+    " there, or, if nobody else is in the picture, the camera may be turned",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }

@@ -11,12 +11,13 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
+from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
 
-_LIKELY_LAG = 8.0
-"""An offset in time is named if the likelihood's logarithm rises by so much: sound simulated recordings of 12 rigs
-came to 1.4 with offsets of two frames or more, offsets that move joints by 2 cm to 9 and more."""
+_AGREEMENT, _LEAST_GAIN, _LIKELY_LAG = 0.12, 0.004, 12.0
+"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average, or if the
+likelihood's logarithm rises by the third: sound simulated recordings of 12 rigs came to 1.4 with offsets of two
+frames or more, offsets that move joints by 2 cm to 9 and more."""
 _HALF = 0.2
 """A half of the recording in which people move this share of all that they move has a say."""
 _STRIDE = 4
@@ -46,7 +47,8 @@ class Lag:
     @property
     def is_offset(self) -> bool:
         """Whether it is more than chance."""
-        return self.agreement > 0 and self.likely > _LIKELY_LAG
+        plain = self.agreement > _AGREEMENT and self.gain > _LEAST_GAIN
+        return plain or (self.agreement > 0 and self.likely > _LIKELY_LAG)
 
 
 NONE = Lag(0, 0.0, 0.0, 0.0)
@@ -110,9 +112,7 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
 
 
-def _compare(
-    lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest
-) -> Lag:
+def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest) -> Lag:
     """How much better people fit at an offset than without: joints of people that both have, or one has."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
@@ -148,7 +148,7 @@ _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
 _FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
-    (Kind.PRINCIPAL_POINT, fit.centred_to, CENTRE),
+    (Kind.PRINCIPAL_POINT, fit.centred_to, fit.CENTRE),
     (Kind.FOCAL, lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]), FOCAL),
     (Kind.RESIZED, lambda points, xy, camera: fit.scaled_to(points, xy, camera, fit.CORNER), []),
 )
@@ -275,7 +275,9 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
             moved,
         )
         score = match(others, seen, best).score
-        yield Change(finding, look.with_cameras({view: best}), score, max(len(columns), 1))
+        # Cameras are knocked more often than lenses change: a shift does not win by having one parameter less.
+        freedom = len(TURN) if kind == Kind.PRINCIPAL_POINT else max(len(columns), 1)
+        yield Change(finding, look.with_cameras({view: best}), score, freedom)
 
 
 def _in_mirror(look: Look, view: int) -> list[Change]:

@@ -18,7 +18,7 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, Sightings
 
-_PIECES = 8
+_PIECES = 12
 _LEAST_PEOPLE = 6
 """Fewer people of the others say nothing of a piece."""
 _RESTLESS = 0.03
@@ -244,9 +244,12 @@ def _drifted(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Wa
     return Finding(Kind.DRIFTING, (), amount), way, 6
 
 
-_PARTED, _POOR, _LEAST_PART = 0.3, 0.5, 0.15
-"""Cameras stop to agree where their score falls by so much, to so little, with this part of the people on either
-side; in sound recordings eighths of them differ by 0.26."""
+_PARTED, _LEAST_PART = 0.3, 0.15
+_POOR = {2: 0.5}
+_POOR_OF_MORE = 0.25
+"""Cameras stop to agree where their score falls by so much, with this part of the people on either side, and to so
+little: two cameras whose rays have only to meet to more than three or more, of which one that is turned by 3
+degrees leaves 0.16; people who hide each other before three sound cameras leave 0.3 to 0.5."""
 
 
 def parted(look: Look) -> tuple[int | None, int | None] | None:
@@ -259,7 +262,7 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
     enough = np.minimum(possible, rest) > _LEAST_PART * possible[-1]
     at = int(np.argmax(np.where(enough, np.abs(before - after) * np.sqrt(possible * rest), 0.0)))
     low, high = sorted((before[at], after[at]))
-    if not enough[at] or high - low < _PARTED or low > _POOR:
+    if not enough[at] or high - low < _PARTED or low > _POOR.get(look.cameras_used, _POOR_OF_MORE):
         return None
     return (None, at + 1) if before[at] < after[at] else (at + 1, None)
 

@@ -82,6 +82,8 @@ class SetupReport:
     """How tall the people come out, median; None without people."""
     trust: Trust = BELIEVED
     """Which cameras a reconstruction is better without: for `reconstruct`."""
+    notes: tuple[str, ...] = ()
+    """What is odd and not of the set-up: people whose detections are biased in one view."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
         """The warnings, and what a reconstruction makes of them."""
@@ -106,6 +108,7 @@ class SetupReport:
                 {"kind": str(each.kind), "cameras": [names[view] for view in each.cameras], "says": words}
                 for each, words in zip(self.findings, self.warnings, strict=True)
             ],
+            "notes": list(self.notes),
             "cameras": [rounded(asdict(each)) for each in self.cameras],
             "pairs": [rounded(asdict(each)) for each in self.pairs],
             "left_out": _spells(self.trust.left_out, names),
@@ -133,6 +136,7 @@ def check_setup(
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
+        tuple(sentence(finding, rig) for finding in diagnosis.biased),
     )
 
 

@@ -157,7 +157,7 @@ class Bias:
 
 @dataclass(frozen=True)
 class Problem:
-    """The residuals of a recording, to be explained by changes of its V cameras, or by people who are seen wrong."""
+    """The residuals of a recording, to be explained by changes of its V cameras, or by biases of single people."""
 
     seen: tuple[Array, Array, Array]
     """See `observed`."""
@@ -290,7 +290,9 @@ class Problem:
             return Finding(kind, (view,), float(np.exp(-change[view, FOCAL[0]]))), cost
         if kind == Kind.PRINCIPAL_POINT:
             x, y = change[view, CENTRE].tolist()
-            return Finding(kind, (view,), float(np.rad2deg(np.hypot(x, y) / views.focal_px[view])), ((x, y),)), cost
+            return Finding(
+                kind, (view,), float(np.rad2deg(np.hypot(x, y) / views.focal_px[view])), ((x, y),)
+            ), cost
         return Finding(Kind.TURNED if turn > 1 else kind, (view,), turn, moved=moved), cost
 
     def _solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:
