@@ -104,6 +104,14 @@ def _turned(finding: Finding, side_px: int) -> str:
     return f"{turned} {instead}; calibrate it again"
 
 
+def _principal_point(finding: Finding, side_px: int) -> str:
+    cure = "check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
+    if len(finding.cameras) == 1:
+        instead = "(or the camera is turned by {degrees} degrees, which people hardly tell from it)"
+        return f"the principal point of {{who}} looks off, it should lie {{shift}} {instead}; {cure}"
+    return f"principal points look off, they should lie {{shifts}} (at most a turn of {{degrees}} degrees); {cure}"
+
+
 def _late(finding: Finding, side_px: int) -> str:
     if finding.amount > 0:
         late, rest = "late", "its first {frames}"
@@ -195,9 +203,7 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.RESIZED: "the detections of {who} look as if they were made on pictures {amount:.2g} times the calibrated"
     " size ({resized} instead of {calibrated}); give detections on pictures of the calibrated size, or the"
     " calibration of these",
-    Kind.PRINCIPAL_POINT: "principal points look off, they should lie {shifts} (at most a turn of {amount:.1f}"
-    " degrees); check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics"
-    " again",
+    Kind.PRINCIPAL_POINT: _principal_point,
     Kind.DUPLICATE: _duplicate,
     Kind.UNIT: _unit,
     Kind.UP: "people stand along {axis}, and the calibration says that {up} is up; give --up {axis}"
