@@ -22,7 +22,7 @@ from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Change, Lag, gross_mistake, judged, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import GAIN, GOOD_PAIR, Change, Lag, gross_mistake, judged, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted, stories
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
@@ -237,7 +237,9 @@ def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | No
         return camera
     finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)))
     person = Change(finding, problem.unbiased(look, bias), 0.0, freedom=2)
-    return person if camera is None or judged(look, person) >= judged(look, camera) else camera
+    # Of one person alone a bias and a turn look alike, and nobody is accused.
+    more = 0.0 if camera is None else judged(look, camera) - judged(look, person)
+    return person if more <= GAIN / look.view_count else camera
 
 
 def _of_cameras(look: Look, rng: np.random.Generator) -> Change | None:

@@ -161,7 +161,7 @@ GOOD = 0.45
 GOOD_PAIR = 0.65
 """Of two cameras more is asked, because rays have only to meet: sound pairs had 0.67 and more, most of those with
 one that was mirrored, or turned by 8 degrees half-way, less."""
-_GAIN, _LIKELY = 0.12, 10.0
+GAIN, _LIKELY = 0.12, 10.0
 """What a change must bring of a camera's score, and of the likelihood's logarithm, to be named."""
 _EXPLAINED = 0.65
 """Everything fits so well where nothing but detectors err, or little more: no other explanation is sought."""
@@ -198,14 +198,14 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
     for view in weak:
         worth = independent(look.others(view))
         least = likelihood(fits[view], worth, 0) + _LIKELY
-        options = [each for each in _of_one(look, view, rng) if each.score - fits[view] > _GAIN]
+        options = [each for each in _of_one(look, view, rng) if each.score - fits[view] > GAIN]
         options = [each for each in options if not _slight(each.finding)]
         options = [each for each in options if likelihood(each.score, worth, each.freedom) > least]
         options.sort(key=lambda change: change.score - _PRICE * change.freedom, reverse=True)
         found += [(judged(look, change), change) for change in options[:2]]
     for first, second in combinations(weak, 2):
         change = _of_two(look, first, second)
-        if look.view_count == 3 or (change.score - max(fits[first], fits[second]) > _GAIN):
+        if look.view_count == 3 or (change.score - max(fits[first], fits[second]) > GAIN):
             found.append((judged(look, change), change))
     if look.view_count == 2:
         poses = [_misread(look, kind, (view,)) for view in (0, 1) for kind in _MISREAD]
@@ -218,7 +218,7 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
             (change.score - few.total, replace(change, look=replace(change.look, evidence=look.evidence)))
             for change in _of_all(few)
         ]
-    found = [(gain, change) for gain, change in found if gain > _GAIN / look.view_count]
+    found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
     if len(found) == 0:
         return None
     # All that is seen bears on it: as many independent joints as people and cameras have.
