@@ -12,7 +12,7 @@ from shapepose_fg.setup_check.fit import Others, match
 _WORSE = 0.2
 """A camera is left out whose score is so much lower than it would be if it was right: it sees people 3 % of their
 size, 5 cm, beside where it should, on average."""
-_OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED)
+_OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED)
 """What is wrong with all cameras alike, or hardly matters, or is seen to elsewhere."""
 
 

@@ -143,6 +143,8 @@ _MOST_FINDINGS, _MOST_BIASED = 4, 3
 """More mistakes than this are not told apart."""
 _UNFIT = 0.15
 """A camera that fits the others' people no better, and nothing explains it, does not fit."""
+_CROWD = 8.0
+"""With more people in a picture, who hide each other, cameras that do not fit are no mistake of the set-up."""
 MIN_SIGHTINGS = 20
 """With fewer people seen, nothing is said of a camera."""
 _OFF_DEG, _OFF_FOCAL = 0.45, 0.04
@@ -371,6 +373,9 @@ def _unfit(look: Look, known: set[int]) -> list[Finding]:
     """Cameras that fit nothing, without any explanation."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
     everybody = tuple(np.flatnonzero(seen).tolist())
+    crowd = float(seen.sum()) / max(len(everybody) * len(look.evidence.anchors), 1)
+    if crowd > _CROWD and (look.scores[list(everybody)] < _UNFIT).all():
+        return [Finding(Kind.CROWDED, (), crowd)]
     if len(known) == 0 and (frames := parted(look)) is not None:
         return [Finding(Kind.UNFIT, everybody, float(look.scores.min()), frames=frames)]
     if len(everybody) == 2:

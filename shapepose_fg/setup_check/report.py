@@ -208,6 +208,8 @@ _SHARE = 0.1
 """Of so many rows: fewer are single people that hardly any camera saw."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
 """Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
+_LEAST_USED = 0.1
+"""Of detections on Shelf, false candidates among them, most are somebody's."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -282,7 +284,7 @@ def result_check(
             if warnings
             else "Nobody was found; look with check-calibration whether cameras and detections fit"
         )
-    warnings += _shapes(people) + _speeds(people) + _too_many(people)
+    warnings += _shapes(people) + _speeds(people) + (_too_many(people) or _clutter(uses))
     if len(report.findings) == 0:
         warnings += _outlier(uses)
     return ResultCheck(report, uses, tuple(warnings))
@@ -374,6 +376,17 @@ def _too_many(people: Reconstruction) -> list[str]:
     return [
         f"{frames} frames have more detections than people could make: who is who is chance there, and rows have"
         f" the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
+    ]
+
+
+def _clutter(uses: Sequence[CameraUse]) -> list[str]:
+    """Detections of which hardly any is a person's."""
+    offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
+    if not 0 < used < _LEAST_USED * offered:
+        return []
+    return [
+        f"people explain {100 * used / offered:.1f} % of the detections, and nobody the rest: who is who may be"
+        " chance; ask the detector for surer ones only"
     ]
 
 

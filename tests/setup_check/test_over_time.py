@@ -89,3 +89,6 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     (said,) = result_check(report, fast, recording, room, range(60)).warnings
     assert "m/s" in said and "--fps is probably wrong (1000 a second" in said
     assert np.isfinite(people.time_s).all()
+    crowd = Recording(recording.skeleton, [each.only(np.tile(np.arange(len(each)), 12)) for each in recording])
+    (said,) = result_check(report, people, crowd, room, range(60)).warnings  # detections beside those of people
+    assert "people explain 8" in said and "surer ones" in said
