@@ -213,8 +213,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",
     Kind.UNFIT: _unfit,
-    Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit is not to be"
-    " told from them; check it in frames with fewer",
+    Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit they do not"
+    " tell; check it in frames with fewer",
     Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs"
     " there, or, if nobody else is in the picture, the camera may be turned",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
