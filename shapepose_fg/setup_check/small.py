@@ -128,8 +128,9 @@ class SmallErrors:
 
 def followed(frame: Index, points: Array) -> Index:
     """(P,) who people (P, J, 3) at some frames are: each is the nearest of the frame before, if that is near."""
-    middle = np.nanmean(points, axis=1)
-    reach = _REACH * float(np.median(np.sqrt(np.nanvar(points, axis=1).sum(axis=-1))))
+    middle = _middle(points)
+    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
+    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
     who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for now in np.unique(frame).tolist():
         here = np.flatnonzero(frame == now)
@@ -143,6 +144,12 @@ def followed(frame: Index, points: Array) -> Index:
         gone = last[~np.isin(who[last], who[here]) & (frame[last] > now - _FORGOTTEN)]
         last = np.concatenate([here, gone])
     return who
+
+
+def _middle(points: Array) -> Array:
+    """(N, n) mean of those `points` (N, J, n) that there are; 0 where there are none."""
+    there = ~np.isnan(points[..., :1])
+    return np.asarray(np.where(there, points, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
 
 
 @dataclass(frozen=True)
@@ -188,11 +195,15 @@ class Problem:
     @cached_property
     def normal(self) -> Normal:
         """The normal equations of all."""
-        return Normal(sum(each.H for each in self.parts), sum(each.g for each in self.parts))
+        n = Q * len(self.views)
+        H, g = (each.H for each in self.parts), (each.g for each in self.parts)
+        return Normal(sum(H, np.zeros((n, n))), sum(g, np.zeros(n)))
 
     @cached_property
     def biases(self) -> list[tuple[float, Bias]]:
         """Each person's bias in each view, best first: as `singles`, with what such a bias costs."""
+        if len(self.parts) == 0:
+            return []
         H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
         who, found = self.who[:: self.step], list[tuple[float, Bias]]()
         for person in np.flatnonzero(np.bincount(who) >= _LEAST_OF_ONE).tolist():
@@ -219,8 +230,8 @@ class Problem:
         mine = self.members[self.who == bias.person, bias.view]
         mine = look.sightings.only(mine[mine >= 0])
         order = np.argsort(mine.frame)
-        way = [np.interp(look.shifted.frame, mine.frame[order], x[order]) for x in np.nanmean(mine.xy, axis=1).T]
-        away = np.linalg.norm(np.nanmean(look.shifted.xy, axis=1).T - way, axis=0) / look.shifted.size_px
+        way = [np.interp(look.shifted.frame, mine.frame[order], x[order]) for x in _middle(mine.xy).T]
+        away = np.linalg.norm(_middle(look.shifted.xy).T - way, axis=0) / look.shifted.size_px
         away[look.shifted.view != bias.view] = np.inf
         key = look.shifted.frame - look.shifted.frame.min()
         his = least_of_each(key, away)
