@@ -214,13 +214,14 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     small = problem.small_errors()
     remaining = lags(refined := replace(look, views=small.views))
     for _ in range(_MOST_FINDINGS):
-        most = evidence.most_lag - np.abs(look.lag)
-        late = [v for v, lag in enumerate(remaining) if 2 <= abs(lag.frames) <= most[v] and lag.is_offset]
+        late = [view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset]
         if len(late) == 0:
             break
         view = max(late, key=lambda view: remaining[view].gain)
-        before = look.lag[view]
-        look, problem, small = _settled(look, view, remaining[view].frames)
+        before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
+        if abs(settled[0].lag[view]) > evidence.most_lag:  # it would run on: chance, and no offset
+            break
+        look, problem, small = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
         remaining = lags(refined := replace(look, views=small.views))
     known = {view for finding in findings for view in finding.cameras}

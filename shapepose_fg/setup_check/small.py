@@ -138,10 +138,13 @@ def followed(frame: Index, points: Array) -> Index:
         before, after = least_cost_pairs(np.minimum(np.nan_to_num(away, nan=np.inf), reach).T)
         near = away[after, before] < reach
         who[here[after[near]]] = who[last[before[near]]]
-        new = here[who[here] < 0]
-        who[new] = count + np.arange(len(new))
-        count += len(new)
-        gone = last[~np.isin(who[last], who[here]) & (frame[last] > now - _FORGOTTEN)]
+        new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
+        if len(new) == len(lost) == 1:  # the only one who can have come back, after a cut for example
+            who[new], lost = who[lost], lost[:0]
+        else:
+            who[new] = count + np.arange(len(new))
+            count += len(new)
+        gone = lost[frame[lost] > now - _FORGOTTEN]
         last = np.concatenate([here, gone])
     return who
 
