@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
@@ -159,12 +160,13 @@ def refine(
 def _found_again(detections: DetectionSequence, rig: Rig, frames: range) -> Rig:
     """The rig with cameras that look somewhere else, by degrees, turned to where they see the others' people."""
     diagnosis = diagnose(detections, rig, frames)
-    turned = {
-        view for each in diagnosis.findings if each.kind in (Kind.TURNED, Kind.MOVED) for view in each.cameras
-    }
-    cameras = list(rig.cameras)
+    kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
+    turned = {view for each in diagnosis.findings if each.kind in kinds for view in each.cameras}
+    cameras, found = list(rig.cameras), diagnosis.corrected.views
     for view in turned:
-        cTw, camera = diagnosis.corrected.views.cTw[view], rig.cameras[view]
+        camera = rig.cameras[view]
+        right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # hardly told from a turn
+        cTw = exp_so3(np.array([-down, right, 0.0])) @ found.cTw[view]
         if difference(cTw, camera.cTw)[0] > _BUMPED_DEG:
             new = (camera.name, camera.K, cTw, camera.image_size, camera.distortion.tolist(), camera.lens)
             wTc = Camera.from_camera_from_world(*new).wTc

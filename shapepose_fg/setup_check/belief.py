@@ -12,7 +12,7 @@ from shapepose_fg.setup_check.fit import Others, match
 _WORSE = 0.2
 """A camera is left out whose score is so much lower than it would be if it was right: it sees people 3 % of their
 size, 5 cm, beside where it should, on average."""
-_OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.PRINCIPAL_POINT)
+_OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED)
 """What is wrong with all cameras alike, or hardly matters, or is seen to elsewhere."""
 
 
@@ -22,7 +22,7 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
     whole = frames.start, frames.stop
     doubted = False
     for each in findings:
-        if each.kind in _OF_PEOPLE:
+        if each.kind in _OF_PEOPLE or (each.kind == Kind.PRINCIPAL_POINT and len(each.cameras) > 1):
             continue
         if each.kind == Kind.NOBODY:
             doubted |= len(each.cameras) == 0 and each.amount > 0

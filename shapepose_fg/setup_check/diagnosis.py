@@ -22,7 +22,7 @@ from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Change, Lag, gross_mistake, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import GAIN, GOOD_PAIR, Change, Lag, gross_mistake, judged, lag_of, lags
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted, stories
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
@@ -139,10 +139,12 @@ def build_of(points: Array, skeleton: Skeleton) -> Build:
     return Build(float(np.median(statures)) if len(statures) > 0 else np.nan, up, int(enough.sum()))
 
 
-_MOST_FINDINGS = 4
+_MOST_FINDINGS, _MOST_BIASED = 4, 3
 """More mistakes than this are not told apart."""
 _UNFIT = 0.15
 """A camera that fits the others' people no better, and nothing explains it, does not fit."""
+_CROWD = 8.0
+"""With more people in a picture, who hide each other, cameras that do not fit are no mistake of the set-up."""
 MIN_SIGHTINGS = 20
 """With fewer people seen, nothing is said of a camera."""
 _OFF_DEG, _OFF_FOCAL = 0.45, 0.04
@@ -159,10 +161,6 @@ _NOTABLE_DEG = 0.25
 _LIKELY, _SURE_OF_ONE = 1.0, 0.7
 """One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less BIC's
 price), and of all cameras' mistakes with this probability its own."""
-_SINGLE = 0.7
-"""One camera is said to be turned where it alone explains so much of what small errors of all cameras explain."""
-_TURN_DEG = 0.6
-"""Less is said of the principal point: of a calibration, and not of a camera that was knocked."""
 _NOBODY = 0.05
 """With fewer people than this for each sighting, cameras see no people in common."""
 _STOPPED = 0.02
@@ -185,6 +183,8 @@ class Diagnosis:
     """Each camera's offset in time that remains; none with too few people."""
     build: Build | None = None
     """The people, in the corrected set-up."""
+    biased: tuple[Finding, ...] = ()
+    """Single people whom a camera sees beside where they are; nothing of the set-up."""
     trust: Trust = BELIEVED
     """Which cameras a reconstruction is better without."""
 
@@ -199,15 +199,18 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS and (change := _next(look, rng)) is not None:
-        findings.append(change.finding)
+    problem, biased = Problem.of(look), list[Finding]()
+    while len(findings) < _MOST_FINDINGS and (change := _next(look, problem, rng)) is not None:
+        (biased if change.finding.kind == Kind.BIASED else findings).append(change.finding)
         look = change.look
+        problem = Problem.of(look)
+        if len(biased) == _MOST_BIASED:
+            break
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
         findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
         trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
-        return Diagnosis(tuple(findings), given, look, trust=trust)
-    problem = Problem.of(look)
+        return Diagnosis(tuple(findings), given, look, biased=tuple(biased), trust=trust)
     small = problem.small_errors()
     remaining = lags(refined := replace(look, views=small.views))
     for _ in range(_MOST_FINDINGS):
@@ -215,8 +218,10 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
         if len(late) == 0:
             break
         view = max(late, key=lambda view: remaining[view].gain)
-        before = look.lag[view]
-        look, problem, small = _settled(look, view, remaining[view].frames)
+        before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
+        if abs(settled[0].lag[view]) > evidence.most_lag:  # it would run on: chance, and no offset
+            break
+        look, problem, small = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
         remaining = lags(refined := replace(look, views=small.views))
     known = {view for finding in findings for view in finding.cameras}
@@ -225,11 +230,23 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     build = build_of(refined.structure()[1].points, detections.skeleton)
     findings += _of_people(build, rig)
     trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
-    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, trust)
+    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 
 
-def _next(look: Look, rng: np.random.Generator) -> Change | None:
-    """The mistake that explains most: of a camera all the time, or from some time on."""
+def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | None:
+    """The mistake that explains most: of a camera all the time, or from some time on, or of one person."""
+    camera, bias = _of_cameras(look, rng), problem.bias
+    if bias is None:
+        return camera
+    finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)))
+    person = Change(finding, problem.unbiased(look, bias), 0.0, freedom=2)
+    # Of one person alone a bias and a turn look alike, and nobody is accused.
+    more = 0.0 if camera is None else judged(look, camera) - judged(look, person)
+    return person if more <= GAIN / look.view_count else camera
+
+
+def _of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
+    """The camera's mistake that explains most."""
     gross = gross_mistake(look, rng)
     views = range(look.view_count if look.cameras_used > 2 else 0)
     over_time = [story for view in views for story in stories(look, view, rng)]
@@ -239,7 +256,7 @@ def _next(look: Look, rng: np.random.Generator) -> Change | None:
     elsewhere = gross is not None and gross.finding.cameras != best.finding.cameras
     if gross is not None and elsewhere and gross.look.total > best.look.total:
         return gross
-    return Change(best.finding, best.look, 0.0)
+    return Change(best.finding, best.look, 0.0, freedom=6)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
@@ -309,7 +326,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         large = abs(np.log(found.amount)) > _OFF_FOCAL if kind == Kind.FOCAL else found.amount > _OFF_DEG
         if large:
             x, y = small.centre_px[view].tolist()
-            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else ())]
+            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else found.shift_px)]
     largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
     if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
         return []
@@ -320,20 +337,14 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         return []
     # Three cameras cannot tell which of their small errors belong to which.
     tells_apart = look.cameras_used > 3
-    if len(off) == 1 and tells_apart and int(off[0]) not in known:
-        view = int(off[0])
-        if focal[view]:
-            return [Finding(Kind.FOCAL, (view,), float(1 / small.focal[view]))]
-        found = _turned(small, view)
-        if 1 - problem.single(view, Kind.MOVED)[1] > _SINGLE * (1 - small.cost):
-            return [found if found.amount > _TURN_DEG else replace(found, kind=Kind.PRINCIPAL_POINT)]
     if shifted.cost > _MOST_COST:
         return []
     shift = shifted.shift_deg.copy()
     shift[list(known)] = 0.0
     order, findings = np.argsort(-shift), list[Finding]()
     first, second = shift[order[:2]]
-    if tells_apart and first > _OUTLIER_DEG and first > _OUTLIER_RATIO * second:
+    alone = problem.likely(int(order[0])) > 0 and first > _OUTLIER_RATIO * second
+    if tells_apart and first > _OUTLIER_DEG and alone:
         findings.append(_turned(shifted, int(order[0])))
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)
@@ -363,6 +374,9 @@ def _unfit(look: Look, known: set[int]) -> list[Finding]:
     """Cameras that fit nothing, without any explanation."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
     everybody = tuple(np.flatnonzero(seen).tolist())
+    crowd = float(seen.sum()) / max(len(everybody) * len(look.evidence.anchors), 1)
+    if crowd > _CROWD and (look.scores[list(everybody)] < _UNFIT).all():
+        return [Finding(Kind.CROWDED, (), crowd)]
     if len(known) == 0 and (frames := parted(look)) is not None:
         return [Finding(Kind.UNFIT, everybody, float(look.scores.min()), frames=frames)]
     if len(everybody) == 2:

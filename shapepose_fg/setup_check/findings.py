@@ -31,7 +31,10 @@ class Kind(StrEnum):
     NOBODY = "nobody"
     STOPPED = "stopped"
     UNFIT = "does not fit"
+    CROWDED = "crowded"
     PICTURE_SIZE = "size of the pictures"
+    BIASED = "biased"
+    """Of one person's detections, not of the set-up."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,8 @@ class Finding:
     cameras: tuple[int, ...]
     """Cameras that it is about; none where it is about people, all where all share it."""
     amount: float = 0.0
-    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres."""
+    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres, the part
+    of a person's size."""
     shift_px: tuple[tuple[float, float], ...] = ()
     """For each camera, how far its principal point seems to be off: right and down, pixels."""
     moved: float = 0.0
@@ -73,7 +77,7 @@ def sentence(finding: Finding, rig: Rig) -> str:
         sees="sees" if len(names) == 1 else "see",
         amount=amount,
         degrees=f"{amount:.1f}" if amount < 10 else f"{amount:.0f}",
-        percent=100 * abs(amount - (finding.kind != Kind.STOPPED)),
+        percent=100 * abs(amount - (finding.kind not in (Kind.STOPPED, Kind.BIASED))),
         frames=f"{count} frame{'s' if count != 1 else ''}",
         at=100 + round(amount),
         moved=_length(finding.moved),
@@ -99,6 +103,14 @@ def _turned(finding: Finding, side_px: int) -> str:
         return f"{turned} about its axis; calibrate its pose again"
     instead = "(or its principal point should lie {shift}, which people hardly tell from a turn)"
     return f"{turned} {instead}; calibrate it again"
+
+
+def _principal_point(finding: Finding, side_px: int) -> str:
+    cure = "check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
+    if len(finding.cameras) == 1:
+        instead = "(or the camera is turned by {degrees} degrees, which people hardly tell from it)"
+        return f"the principal point of {{who}} looks off, it should lie {{shift}} {instead}; {cure}"
+    return f"principal points look off, they should lie {{shifts}} (at most a turn of {{degrees}} degrees); {cure}"
 
 
 def _late(finding: Finding, side_px: int) -> str:
@@ -192,9 +204,7 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.RESIZED: "the detections of {who} look as if they were made on pictures {amount:.2g} times the calibrated"
     " size ({resized} instead of {calibrated}); give detections on pictures of the calibrated size, or the"
     " calibration of these",
-    Kind.PRINCIPAL_POINT: "principal points look off, they should lie {shifts} (at most a turn of {amount:.1f}"
-    " degrees); check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics"
-    " again",
+    Kind.PRINCIPAL_POINT: _principal_point,
     Kind.DUPLICATE: _duplicate,
     Kind.UNIT: _unit,
     Kind.UP: "people stand along {axis}, and the calibration says that {up} is up; give --up {axis}"
@@ -203,6 +213,10 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",
     Kind.UNFIT: _unfit,
+    Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit they do not"
+    " tell; check it in frames with fewer",
+    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs"
+    " there, or, if nobody else is in the picture, the camera may be turned",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }

@@ -150,6 +150,16 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     return Pinhole(camera.K, np.column_stack([R, scale * move[:, 0] - R @ middle]))
 
 
+def centred_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
+    """The camera whose principal point lies where it sees `points` (N, 3) at `xy` (N, 2), median."""
+    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
+    if not (at[:, 2] > 0).all():
+        return None
+    K = camera.K.copy()
+    K[:2, 2] += np.median(xy - at[:, :2] / at[:, 2:], axis=0)
+    return Pinhole(K, camera.cTw)
+
+
 def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
     """The camera `scaled` by how much farther from `centre` (2,) than it says `points` (N, 3) are seen at `xy`."""
     at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
@@ -201,21 +211,37 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
         return camera
     points, xy, width_px = points[ahead], xy[ahead], width_px[ahead, None]
 
-    def moved(step: Array) -> Pinhole:
-        change = np.zeros((1, Q))
-        change[0, columns] = step
-        new = changed(Views(camera.K[None], camera.cTw[None]), change)
-        return Pinhole(new.K[0], new.cTw[0])
+    def errors(camera: Pinhole) -> tuple[Array, Array]:
+        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
+        at[:, 2] = np.maximum(at[:, 2], 1e-9)
+        h = at @ camera.K.T
+        return at, (h[:, :2] / h[:, 2:] - xy) / width_px
 
-    def errors(step: Array) -> Array:
-        new = moved(step)
-        at = (points @ new.cTw[:, :3].T + new.cTw[:, 3]) @ new.K.T
-        return ((at[:, :2] / np.maximum(at[:, 2:], 1e-9) - xy) / width_px).ravel()
+    def cost(error: Array) -> float:
+        return float(np.log1p(error**2).sum())
 
-    from scipy.optimize import least_squares  # loads for a fifth of a second
-
-    start = np.zeros(len(columns))
-    return moved(least_squares(errors, start, x_scale="jac", loss="cauchy", max_nfev=_STEPS).x)
+    at, error = errors(camera)
+    for _ in range(_STEPS):
+        by_point = (camera.K[:2] - (xy + width_px * error)[..., None] * camera.K[2]) / at[:, 2, None, None]
+        J = np.empty((len(at), 2, Q))
+        J[..., TURN] = np.cross(at[:, None], by_point)
+        J[..., 3:6], J[..., CENTRE] = by_point, np.eye(2)
+        J[..., FOCAL] = (camera.K[:2, :2] @ (at[:, :2] / at[:, 2:]).T).T[..., None]
+        J = J[..., columns] / width_px[..., None]
+        weight = 1 / (1 + error**2)
+        H = np.einsum("nij,ni,nik->jk", J, weight, J)
+        step = np.zeros((1, Q))
+        step[0, columns] = -np.linalg.lstsq(H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12)[0]
+        for part in (1.0, 0.25, 0.06):
+            new = changed(Views(camera.K[None], camera.cTw[None]), part * step)
+            tried = Pinhole(new.K[0], new.cTw[0])
+            new_at, new_error = errors(tried)
+            if cost(new_error) < cost(error):
+                camera, at, error = tried, new_at, new_error
+                break
+        else:
+            break
+    return camera
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:

@@ -14,9 +14,10 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
 
-_MIN_AGREEMENT, _MIN_LARGE = 0.12, 0.07
-_MIN_LAG_GAIN, _LARGE = 0.004, 0.012
-"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average."""
+_AGREEMENT, _LEAST_GAIN, _LIKELY_LAG, _SMALL = 0.12, 0.004, 12.0, 8
+"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average, or if the
+likelihood's logarithm rises by the third and it has no more frames than the fourth: sound simulated recordings of
+25 rigs came to 8. Farther off, people who stand come by chance to where they were."""
 _HALF = 0.2
 """A half of the recording in which people move this share of all that they move has a say."""
 _STRIDE = 4
@@ -36,19 +37,22 @@ class Lag:
     """What the others show at frame t, the camera shows at t + frames: positive is late."""
     gain: float
     """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
+    likely: float
+    """The same as the likelihood's logarithm."""
     agreement: float
-    """The same, over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
+    """The gain over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
     none, 0 without motion. Of the half of the frames in which it is less: an offset is in both halves, while
     in one of them people may come by chance to where they were."""
 
     @property
     def is_offset(self) -> bool:
         """Whether it is more than chance."""
-        small = self.agreement > _MIN_AGREEMENT and self.gain > _MIN_LAG_GAIN
-        return small or (self.agreement > _MIN_LARGE and self.gain > _LARGE)
+        plain = self.agreement > _AGREEMENT and self.gain > _LEAST_GAIN
+        small = abs(self.frames) <= _SMALL and self.likely > _LIKELY_LAG
+        return plain or (self.agreement > 0 and small)
 
 
-NONE = Lag(0, 0.0, 0.0)
+NONE = Lag(0, 0.0, 0.0, 0.0)
 
 
 def lags(look: Look) -> list[Lag]:
@@ -62,12 +66,12 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     """A camera's offset in time against the others, up to `most` frames: where its sightings fit people best."""
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
     others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
-    step = max(1, len(others) // _MOST_PEOPLE)
+    worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
     others = Others(others.frame[::step], others.points[::step])
     still = _nearest(others, seen, camera, 0)
 
     def tried(lag: int) -> Lag:
-        return _compare(lag, others.frame, seen, still, _nearest(others, seen, camera, lag))
+        return _compare(lag, others.frame, seen, worth, still, _nearest(others, seen, camera, lag))
 
     first = [tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)]
     best = max(first, key=_worth)
@@ -109,7 +113,7 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
 
 
-def _compare(lag: int, frame: Whole, seen: Sightings, still: _Nearest, moved: _Nearest) -> Lag:
+def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest) -> Lag:
     """How much better people fit at an offset than without: joints of people that both have, or one has."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
@@ -124,13 +128,14 @@ def _compare(lag: int, frame: Whole, seen: Sightings, still: _Nearest, moved: _N
     way = np.where(np.isnan(way), GATE, np.minimum(way, GATE))
     both = ~np.isnan(error_a) & ~np.isnan(error_b)
     if both.sum() < 10 * MIN_JOINTS:
-        return Lag(lag, 0.0, 0.0)
+        return Lag(lag, 0.0, 0.0, 0.0)
     better, way = np.where(both, error_a - error_b, 0.0), np.where(both, way, 0.0)
     late = frame[usable] > np.median(frame[usable])
     halves = [(float(better[half].sum()), float(way[half].sum())) for half in (late, ~late)]
     whole = max(sum(moves for _, moves in halves), 1e-9)
     agreement = min(gain / moves for gain, moves in halves if moves >= _HALF * whole) if whole > 1e-9 else 0.0
-    return Lag(lag, float(better[both].mean()), agreement)
+    gain = float(better[both].mean())
+    return Lag(lag, gain, gain / ERROR * worth, agreement)
 
 
 Fit = Callable[[Array, Array, Pinhole], Pinhole | None]
@@ -144,6 +149,7 @@ _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
 _FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
+    (Kind.PRINCIPAL_POINT, fit.centred_to, fit.CENTRE),
     (Kind.FOCAL, lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]), FOCAL),
     (Kind.RESIZED, lambda points, xy, camera: fit.scaled_to(points, xy, camera, fit.CORNER), []),
 )
@@ -156,7 +162,7 @@ GOOD = 0.45
 GOOD_PAIR = 0.65
 """Of two cameras more is asked, because rays have only to meet: sound pairs had 0.67 and more, most of those with
 one that was mirrored, or turned by 8 degrees half-way, less."""
-_GAIN, _LIKELY = 0.12, 10.0
+GAIN, _LIKELY = 0.12, 10.0
 """What a change must bring of a camera's score, and of the likelihood's logarithm, to be named."""
 _EXPLAINED = 0.65
 """Everything fits so well where nothing but detectors err, or little more: no other explanation is sought."""
@@ -193,15 +199,15 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
     for view in weak:
         worth = independent(look.others(view))
         least = likelihood(fits[view], worth, 0) + _LIKELY
-        options = [each for each in _of_one(look, view, rng) if each.score - fits[view] > _GAIN]
+        options = [each for each in _of_one(look, view, rng) if each.score - fits[view] > GAIN]
         options = [each for each in options if not _slight(each.finding)]
         options = [each for each in options if likelihood(each.score, worth, each.freedom) > least]
         options.sort(key=lambda change: change.score - _PRICE * change.freedom, reverse=True)
-        found += [(_judged(look, change), change) for change in options[:2]]
+        found += [(judged(look, change), change) for change in options[:2]]
     for first, second in combinations(weak, 2):
         change = _of_two(look, first, second)
-        if look.view_count == 3 or (change.score - max(fits[first], fits[second]) > _GAIN):
-            found.append((_judged(look, change), change))
+        if look.view_count == 3 or (change.score - max(fits[first], fits[second]) > GAIN):
+            found.append((judged(look, change), change))
     if look.view_count == 2:
         poses = [_misread(look, kind, (view,)) for view in (0, 1) for kind in _MISREAD]
         poses += [change for view in (0, 1) for change in _in_mirror(look, view)]
@@ -213,7 +219,7 @@ def gross_mistake(look: Look, rng: np.random.Generator) -> Change | None:
             (change.score - few.total, replace(change, look=replace(change.look, evidence=look.evidence)))
             for change in _of_all(few)
         ]
-    found = [(gain, change) for gain, change in found if gain > _GAIN / look.view_count]
+    found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
     if len(found) == 0:
         return None
     # All that is seen bears on it: as many independent joints as people and cameras have.
@@ -231,7 +237,7 @@ def _slight(finding: Finding) -> bool:
     return finding.kind in (Kind.FOCAL, Kind.RESIZED) and abs(np.log(finding.amount)) < _SLIGHT
 
 
-def _judged(look: Look, change: Change) -> float:
+def judged(look: Look, change: Change) -> float:
     """How much better everything fits after a change, less the price of its parameters."""
     return change.look.total - look.total - _PRICE * change.freedom / look.view_count
 
@@ -258,11 +264,21 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
         best = fit.refined(others, seen, best, columns) if columns else best
         turn, moved = fit.difference(camera.cTw, best.cTw)
         size = float(best.K[0, 0] / camera.K[0, 0])
+        x, y = (best.K - camera.K)[:2, 2].tolist()
         # What the calibration has over what fits.
-        amount = {Kind.FOCAL: 1 / size, Kind.RESIZED: size}.get(kind, turn)
-        finding = Finding(Kind.TURNED if turn > _PLAIN_TURN_DEG else kind, (view,), amount, moved=moved)
+        amounts = {Kind.FOCAL: 1 / size, Kind.RESIZED: size}
+        amounts[Kind.PRINCIPAL_POINT] = float(np.rad2deg(np.hypot(x, y) / camera.K[0, 0]))
+        finding = Finding(
+            Kind.TURNED if turn > _PLAIN_TURN_DEG else kind,
+            (view,),
+            amounts.get(kind, turn),
+            ((x, y),) if kind == Kind.PRINCIPAL_POINT else (),
+            moved,
+        )
         score = match(others, seen, best).score
-        yield Change(finding, look.with_cameras({view: best}), score, max(len(columns), 1))
+        # Cameras are knocked more often than lenses change: a shift does not win by having one parameter less.
+        freedom = len(TURN) if kind == Kind.PRINCIPAL_POINT else max(len(columns), 1)
+        yield Change(finding, look.with_cameras({view: best}), score, freedom)
 
 
 def _in_mirror(look: Look, view: int) -> list[Change]:

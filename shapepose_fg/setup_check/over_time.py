@@ -18,13 +18,14 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, Sightings
 
-_PIECES = 8
+_PIECES = 12
 _LEAST_PEOPLE = 6
 """Fewer people of the others say nothing of a piece."""
 _RESTLESS = 0.03
 """A camera is looked at closely if it sees people so far apart in two pieces, a part of their size: 5 cm."""
-_LOST, _THERE = 0.35, 0.45
-"""Or if it fits less than the one in some pieces and more than the other in some: scores."""
+_LOST, _THERE, _GOOD = 0.25, 0.3, 0.45
+"""Or if its score differs by the first; a piece says something from the second on (in crowds sound cameras come
+to little more), and below the third other turns than its neighbours' are tried."""
 _LEAST_DEG = 1.2
 """A smaller step or way is not told from a detector that errs otherwise on a person who turns round."""
 _SURE = 6.0
@@ -139,7 +140,7 @@ class _Pieces:
             return False
         shift = shift[~np.isnan(shift[:, 0])]
         way = np.ptp(shift, axis=0).max(initial=0.0) if len(shift) > 0 else 0.0
-        return bool(score.min() < min(_LOST, score.max() - _LOST) or way > _RESTLESS)
+        return bool(np.ptp(score) > _LOST or way > _RESTLESS)
 
     @property
     def middle(self) -> Array:
@@ -160,7 +161,7 @@ class _Pieces:
                 continue
             tried = [self.camera, turned(self.camera, start)]
             found = [self._fitted(few, mine, each) for each in tried[: 1 if k == best else 2]]
-            if max(score for score, _ in found) < _THERE:
+            if max(score for score, _ in found) < _GOOD:
                 pairs = list(fit.tries(few, mine, rng))
                 sole = fit.best_of(few, mine, self.camera, pairs, fit.turned_to)
                 found += [] if sole is None else [self._fitted(few, mine, sole)]
@@ -243,9 +244,12 @@ def _drifted(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Wa
     return Finding(Kind.DRIFTING, (), amount), way, 6
 
 
-_PARTED, _POOR, _LEAST_PART = 0.3, 0.5, 0.15
-"""Cameras stop to agree where their score falls by so much, to so little, with this part of the people on either
-side; in sound recordings eighths of them differ by 0.26."""
+_PARTED, _LEAST_PART = 0.3, 0.15
+_POOR = {2: 0.5}
+_POOR_OF_MORE = 0.25
+"""Cameras stop to agree where their score falls by so much, with this part of the people on either side, and to so
+little: two cameras whose rays have only to meet to more than three or more, of which one that is turned by 3
+degrees leaves 0.16; people who hide each other before three sound cameras leave 0.3 to 0.5."""
 
 
 def parted(look: Look) -> tuple[int | None, int | None] | None:
@@ -258,7 +262,7 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
     enough = np.minimum(possible, rest) > _LEAST_PART * possible[-1]
     at = int(np.argmax(np.where(enough, np.abs(before - after) * np.sqrt(possible * rest), 0.0)))
     low, high = sorted((before[at], after[at]))
-    if not enough[at] or high - low < _PARTED or low > _POOR:
+    if not enough[at] or high - low < _PARTED or low > _POOR.get(look.cameras_used, _POOR_OF_MORE):
         return None
     return (None, at + 1) if before[at] < after[at] else (at + 1, None)
 

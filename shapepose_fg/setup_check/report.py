@@ -82,6 +82,8 @@ class SetupReport:
     """How tall the people come out, median; None without people."""
     trust: Trust = BELIEVED
     """Which cameras a reconstruction is better without: for `reconstruct`."""
+    notes: tuple[str, ...] = ()
+    """What is odd and not of the set-up: people whose detections are biased in one view."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
         """The warnings, and what a reconstruction makes of them."""
@@ -106,6 +108,7 @@ class SetupReport:
                 {"kind": str(each.kind), "cameras": [names[view] for view in each.cameras], "says": words}
                 for each, words in zip(self.findings, self.warnings, strict=True)
             ],
+            "notes": list(self.notes),
             "cameras": [rounded(asdict(each)) for each in self.cameras],
             "pairs": [rounded(asdict(each)) for each in self.pairs],
             "left_out": _spells(self.trust.left_out, names),
@@ -133,6 +136,7 @@ def check_setup(
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
+        tuple(sentence(finding, rig) for finding in diagnosis.biased),
     )
 
 
@@ -204,6 +208,8 @@ _SHARE = 0.1
 """Of so many rows: fewer are single people that hardly any camera saw."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
 """Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
+_LEAST_USED = 0.1
+"""Of detections on Shelf, false candidates among them, most are somebody's."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -278,7 +284,7 @@ def result_check(
             if warnings
             else "Nobody was found; look with check-calibration whether cameras and detections fit"
         )
-    warnings += _shapes(people) + _speeds(people) + _too_many(people)
+    warnings += _shapes(people) + _speeds(people) + (_too_many(people) or _clutter(uses))
     if len(report.findings) == 0:
         warnings += _outlier(uses)
     return ResultCheck(report, uses, tuple(warnings))
@@ -370,6 +376,17 @@ def _too_many(people: Reconstruction) -> list[str]:
     return [
         f"{frames} frames have more detections than people could make: who is who is chance there, and rows have"
         f" the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
+    ]
+
+
+def _clutter(uses: Sequence[CameraUse]) -> list[str]:
+    """Detections of which hardly any is a person's."""
+    offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
+    if not 0 < used < _LEAST_USED * offered:
+        return []
+    return [
+        f"people explain {100 * used / offered:.1f} % of the detections, and nobody the rest: who is who may be"
+        " chance; ask the detector for surer ones only"
     ]
 
 

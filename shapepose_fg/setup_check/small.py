@@ -5,7 +5,7 @@ them (bundle adjustment).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property, partial
 
 import gtsam
@@ -13,16 +13,17 @@ import numpy as np
 from gtsam.symbol_shorthand import C, K, P
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import KERNEL, Look, Structure, observed, triangulate
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
-from shapepose_fg.setup_check.matching import Groups
+from shapepose_fg.setup_check.matching import Groups, least_of_each
 
 _ROLL = [2]
 Parts = tuple[tuple[list[int], float], ...]
 SHIFT: Parts = ((CENTRE, 10.0),)
-ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL}
+ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL, Kind.PRINCIPAL_POINT: CENTRE}
 """What one camera alone may have wrong."""
 ALL: Parts = (*SHIFT, (_ROLL, np.deg2rad(0.4)), (FOCAL, 0.02))
 """What a camera may have wrong, each with its unit of size: 10 px, 0.4 degrees, 2 percent. Turns sideways and up
@@ -31,6 +32,14 @@ _PRIOR = 0.05
 """The weight of not changing a camera, against all that it saw. Joints of one person, and of frames that follow
 each other, err alike: of twenty one is independent."""
 _ROUNDS, _SPARSE_STEPS = 3, 12
+_REACH, _FORGOTTEN, _BESIDE = 1.4, 40, 0.3
+"""A person is followed from frame to frame over so many times the spread of the joints (two thirds of a metre),
+and sought for so many frames; in a picture it is within this part of its size of where it was."""
+_LEAST_OF_ONE = 6
+"""Fewer frames of one person say nothing of a bias."""
+_BIAS, _LIKELY_BIAS = 0.1, 2.0
+"""A detector's bias on one person, part of the size (one sigma), and how much likelier than
+none it must be to be taken away."""
 _MOST_PEOPLE = 160
 _WEAK = 1e-6
 """The information that a point has without any view, as a part of what it has: two rays may be parallel."""
@@ -117,9 +126,48 @@ class SmallErrors:
     """What remains of the robust cost of all residuals, as a part of what it was."""
 
 
+def followed(frame: Index, points: Array) -> Index:
+    """(P,) who people (P, J, 3) at some frames are: each is the nearest of the frame before, if that is near."""
+    middle = _middle(points)
+    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
+    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
+    who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
+    for now in np.unique(frame).tolist():
+        here = np.flatnonzero(frame == now)
+        away = np.linalg.norm(middle[here, None] - middle[last], axis=-1)
+        before, after = least_cost_pairs(np.minimum(np.nan_to_num(away, nan=np.inf), reach).T)
+        near = away[after, before] < reach
+        who[here[after[near]]] = who[last[before[near]]]
+        new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
+        if len(new) == len(lost) == 1:  # the only one who can have come back, after a cut for example
+            who[new], lost = who[lost], lost[:0]
+        else:
+            who[new] = count + np.arange(len(new))
+            count += len(new)
+        gone = lost[frame[lost] > now - _FORGOTTEN]
+        last = np.concatenate([here, gone])
+    return who
+
+
+def _middle(points: Array) -> Array:
+    """(N, n) mean of those `points` (N, J, n) that there are; 0 where there are none."""
+    there = ~np.isnan(points[..., :1])
+    return np.asarray(np.where(there, points, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+
+
+@dataclass(frozen=True)
+class Bias:
+    """One person whom one camera sees beside where the others do."""
+
+    person: int
+    view: int
+    shift: Array
+    """(2,) right and down, parts of the person's size in the picture."""
+
+
 @dataclass(frozen=True)
 class Problem:
-    """The residuals of a recording, to be explained by changes of its V cameras."""
+    """The residuals of a recording, to be explained by changes of its V cameras, or by biases of single people."""
 
     seen: tuple[Array, Array, Array]
     """See `observed`."""
@@ -127,17 +175,73 @@ class Problem:
     """The cameras before."""
     structure: Structure
     """The people before."""
-    normal: Normal
-    """The normal equations there."""
+    parts: tuple[Normal, ...]
+    """The normal equations there, of each person and frame: points of different ones share no factor."""
+    members: Index
+    """(N, V) the sightings of all people, -1 for none."""
+    who: Index
+    """(N,) who each is."""
+    step: int
+    """Of these N every so many is in `structure`."""
 
     @classmethod
     def of(cls, look: Look) -> "Problem":
         """Of people spread over the frames."""
-        groups, views = look.groups(), look.views
+        (groups, all_people), views = look.structure(steps=2), look.views
         step = max(1, -(-len(groups) // _MOST_PEOPLE))
         seen = observed(Groups(groups.frame[::step], groups.member[::step]), look.sightings)
         structure = triangulate(*seen, views, 5)
-        return cls(seen, views, structure, normal_equations(structure, views))
+        one = [Structure(*(each[n : n + 1] for each in astuple(structure))) for n in range(len(structure.points))]
+        parts = tuple(normal_equations(each, views) for each in one)
+        return cls(seen, views, structure, parts, groups.member, followed(groups.frame, all_people.points), step)
+
+    @cached_property
+    def normal(self) -> Normal:
+        """The normal equations of all."""
+        n = Q * len(self.views)
+        H, g = (each.H for each in self.parts), (each.g for each in self.parts)
+        return Normal(sum(H, np.zeros((n, n))), sum(g, np.zeros(n)))
+
+    @cached_property
+    def biases(self) -> list[tuple[float, Bias]]:
+        """Each person's bias in each view, best first: as `singles`, with what such a bias costs."""
+        if len(self.parts) == 0:
+            return []
+        H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
+        who, found = self.who[:: self.step], list[tuple[float, Bias]]()
+        for person in np.flatnonzero(np.bincount(who) >= _LEAST_OF_ONE).tolist():
+            for view in range(len(self.views)):
+                columns, size = np.array(CENTRE) + Q * view, np.nan_to_num(self.structure.size_px[:, view])
+                size = np.where(who == person, size, 0.0)
+                matrix = np.einsum("n,nij->ij", size**2, H[:, columns[:, None], columns])
+                slope = size @ g[:, columns]
+                shift = -np.linalg.solve(matrix + np.eye(2) / (_PRIOR * _BIAS**2), slope)
+                gain = -0.5 * _PRIOR * float(slope @ shift)
+                found.append((gain - self._price * len(CENTRE), Bias(person, view, shift)))
+        return sorted(found, key=lambda each: -each[0])
+
+    @property
+    def bias(self) -> Bias | None:
+        """One person's bias, if it explains the residuals better than any camera's mistake."""
+        if len(self.biases) == 0:
+            return None
+        gain, bias = self.biases[0]
+        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - _LIKELY_BIAS) else None
+
+    def unbiased(self, look: Look, bias: Bias) -> Look:
+        """The recording as if the person had been seen where the others see that person."""
+        mine = self.members[self.who == bias.person, bias.view]
+        mine = look.sightings.only(mine[mine >= 0])
+        order = np.argsort(mine.frame)
+        way = [np.interp(look.shifted.frame, mine.frame[order], x[order]) for x in _middle(mine.xy).T]
+        away = np.linalg.norm(_middle(look.shifted.xy).T - way, axis=0) / look.shifted.size_px
+        away[look.shifted.view != bias.view] = np.inf
+        key = look.shifted.frame - look.shifted.frame.min()
+        his = least_of_each(key, away)
+        his = his[away[his] < _BESIDE]
+        xy, every = look.evidence.sightings.xy.copy(), look.evidence.sightings
+        xy[his] -= (bias.shift * every.size_px[his, None])[:, None]
+        return replace(look, evidence=replace(look.evidence, sightings=replace(every, xy=xy)))
 
     def small_errors(self, parts: Parts = ALL) -> SmallErrors:
         """What small errors of the cameras the residuals look like, with a sparse prior."""
@@ -160,14 +264,22 @@ class Problem:
     @cached_property
     def singles(self) -> "list[tuple[float, int, Kind]]":
         """Each change of one camera alone, best first: the likelihood's logarithm less BIC's price; view; kind."""
-        price = 0.5 * np.log(max(_PRIOR * 2 * float(np.isfinite(self.structure.miss_px).sum()), 2.0))
         found = []
         for view in range(len(self.views)):
             for kind, parts in ONE.items():
                 columns = np.array(parts) + Q * view
                 gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
-                found.append((_PRIOR * gain - price * len(parts), view, kind))
+                found.append((_PRIOR * gain - self._price * len(parts), view, kind))
         return sorted(found, key=lambda each: -each[0])
+
+    def likely(self, view: int) -> float:
+        """How much likelier some mistake of one camera is than none: see `singles`."""
+        return max(gain for gain, of, _ in self.singles if of == view)
+
+    @property
+    def _price(self) -> float:
+        """What a parameter costs, by BIC."""
+        return 0.5 * float(np.log(max(_PRIOR * 2 * float(np.isfinite(self.structure.miss_px).sum()), 2.0)))
 
     @property
     def sure(self) -> float:
@@ -190,6 +302,11 @@ class Problem:
         turn, moved = difference(self.views.cTw[view], views.cTw[view])
         if kind == Kind.FOCAL:
             return Finding(kind, (view,), float(np.exp(-change[view, FOCAL[0]]))), cost
+        if kind == Kind.PRINCIPAL_POINT:
+            x, y = change[view, CENTRE].tolist()
+            return Finding(
+                kind, (view,), float(np.rad2deg(np.hypot(x, y) / views.focal_px[view])), ((x, y),)
+            ), cost
         return Finding(Kind.TURNED if turn > 1 else kind, (view,), turn, moved=moved), cost
 
     def _solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:

@@ -14,7 +14,8 @@ _WIDE = 12
 
 def setup_report(report: SetupReport) -> RenderableType:
     """All of a report."""
-    parts: list[RenderableType] = [_sentences(report), Text(), _cameras(report.cameras)]
+    parts: list[RenderableType] = [_sentences(report), *(Text(f"{each}.", style="dim") for each in report.notes)]
+    parts += [Text(), _cameras(report.cameras)]
     if len(report.cameras) > 2:
         parts += [Text(), _pairs(report.cameras, report.pairs)]
     return Group(*parts)

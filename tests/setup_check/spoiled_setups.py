@@ -97,6 +97,27 @@ def turning(detections: DetectionSequence, rig: Rig, view: int, degrees: Callabl
     return _seen_as(detections, view, change)
 
 
+def shifted(rig: Rig, view: int, right_px: float, down_px: float) -> Rig:
+    """One camera whose principal point is calibrated so many pixels right and down of where it is."""
+    by = np.zeros((3, 3))
+    by[:2, 2] = right_px, down_px
+    return _changed(rig, (view,), lambda camera: replace(camera, K=camera.K + by))
+
+
+def biased(
+    detections: DetectionSequence, rig: Rig, view: int, people: Array, person: int, shift: tuple[float, float]
+) -> Recording:
+    """One person of `people` (T, P, J, 3) seen beside where they are by one camera, by parts of their height."""
+    frames = []
+    for number in range(len(detections)):
+        found, at = detections[number], rig.project(people[number])[0][view]
+        xy, mine = found.xy.copy(), np.flatnonzero(found.view == view)
+        away = np.linalg.norm(at[:, found.joint[mine]] - xy[mine], axis=-1)
+        xy[mine[away.argmin(axis=0) == person]] += np.array(shift) * np.ptp(at[person, :, 1])
+        frames.append(replace(found, xy=xy))
+    return Recording(detections.skeleton, frames)
+
+
 def _seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]) -> Recording:
     frames = []
     for number in range(len(detections)):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.trust import Trust, Trusted
@@ -89,3 +89,11 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     (said,) = result_check(report, fast, recording, room, range(60)).warnings
     assert "m/s" in said and "--fps is probably wrong (1000 a second" in said
     assert np.isfinite(people.time_s).all()
+    none = np.zeros((0, 2), dtype=np.intp), np.zeros(0)
+    crowd = [
+        Detections(*(np.repeat(each, 12, axis=0) for each in (f.view, f.joint, f.xy, f.confidence)), *none)
+        for f in recording
+    ]
+    crowd = Recording(recording.skeleton, crowd)
+    (said,) = result_check(report, people, crowd, room, range(60)).warnings  # detections beside those of people
+    assert "people explain 8" in said and "surer ones" in said
