@@ -120,7 +120,7 @@ class Pairwise:
                 pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
                 both = np.where(known, np.clip(miss, -width, width), 0.0), np.where(known, change, 0.0)
                 smooth = FAST_S * self.fps / pace
-                miss, change = _fast(both, known, self.tracks[a].track[rows], track, smooth)
+                miss, change = fast_part(both, known, self.tracks[a].track[rows], track, smooth)
                 width = 3.8 * np.median(np.abs(miss[known]))
                 weight = np.where(known, 1 / (1 + (miss / width) ** 2), 0.0) / width**2
                 own, score = (weight * change**2).sum(), (weight * change * miss).sum(axis=1)
@@ -145,7 +145,7 @@ class Pairwise:
         return shift, covariance
 
 
-def _fast(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
+def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
     """Values (N, J) less their means over the time around, track by track: errors that last are in these."""
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
