@@ -12,6 +12,7 @@ from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
     RESULT,
+    TIME,
     RateOptions,
     grouped,
     json_option,
@@ -19,6 +20,7 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
+from shapepose_fg.cli.synchronise import check_most, show_clocks
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
@@ -71,38 +73,62 @@ def calibrate(
         _CAMERAS, "People's median stature in metres; without it that of adults, 1.70."
     ),
     output: Path = option(RESULT, "File for the cameras, our own JSON.", REQUIRED),
+    times: Path | None = option(
+        TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
+    ),
+    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", 60.0),
     as_json: bool = json_option(),
 ) -> None:
     """Find where cameras stand by the people whom they see; lenses must be known, or guessed.
 
-    Film a minute: cameras still and synchronised, each sharing part of its picture with another; two or more
-    people who walk through all views, near and far, arms raised at times, not on one line. Exit code 1 where
-    that does not determine the cameras; nothing is written then.
+    Film a minute: cameras still, each sharing part of its picture with another; two or more people who walk
+    through all views, near and far, arms raised at times, not on one line. Exit code 1 where that does not
+    determine the cameras; nothing is written then.
     """
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
+    from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
+    from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.calibration import write_rig
+    from shapepose_fg.io.timestamps import write_timestamps
 
     if stature is not None and not 0.5 <= stature <= 2.5:
         raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
+    check_most(most)
+    if times is not None and rate.timestamps is not None:
+        raise InputError("--times and --timestamps: when frames were taken is sought, or known; give one of them")
     off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
     rig = seen.rig()
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, times, span = rate.part(seen.detections, seen.skeleton, rig, Path(folder))
+        part = rate.part(seen.detections, seen.skeleton, rig, Path(folder), own_frames=times is not None)
+        recording, known, span = part
+        clocks = None
         try:
             with progress("calibrating", "steps") as done:
-                found = calibrate(recording, rig, times, span, off, stature, done)
+                if times is None:
+                    found = calibrate(recording, rig, known, span, off, stature, done)
+                else:
+                    fps = rate_of(known.frame_s)
+                    found, clocks = calibrate_unsynchronised(recording, rig, fps, span, most, off, stature, done)
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
     note(*found.notes)
     write_rig(found.rig, output)
+    if times is not None and clocks is not None:
+        write_timestamps(times, rig.names, known.of_views(len(rig)) + clocks.offset_s)
     if as_json:
-        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        told = found.as_dict() | ({} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]})
+        print(json.dumps(told, indent=2, allow_nan=False))
     else:
         _show(found, focal, stature)
+        given = rate.given()
+        if times is not None and clocks is not None:
+            show_clocks(clocks, rig)
+            print(f"{times}: times of {len(recording)} frames")
+            given = {"--timestamps": times}
         print(f"{output}: our own rig file")
         options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
-        print(next_reconstruct(options | rate.given() | {"--output": "results"}))
+        print(next_reconstruct(options | given | {"--output": "results"}))
 
 
 def _show(found: "Calibrated", focal: bool, stature: float | None) -> None:

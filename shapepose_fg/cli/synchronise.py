@@ -51,8 +51,7 @@ def synchronise(
     if fps is None:
         raise InputError("--fps: missing; say how many frames a second the cameras took")
     check_fps(fps)
-    if not 0 < most <= 600:
-        raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
+    check_most(most)
     rig = seen.still_rig("synchronise")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)), True)
@@ -66,7 +65,7 @@ def synchronise(
     if as_json:
         print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
     else:
-        _show(found, rig)
+        show_clocks(found, rig)
     note(*problems)
     if problems:
         raise typer.Exit(1)
@@ -85,7 +84,13 @@ def synchronise(
             print(next_reconstruct(options))
 
 
-def _show(found: "Synchronised", rig: "Rig") -> None:
+def check_most(most: float) -> None:
+    """Refuse a largest offset that makes no sense."""
+    if not 0 < most <= 600:
+        raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
+
+
+def show_clocks(found: "Synchronised", rig: "Rig") -> None:
     """The offsets."""
     rows = []
     for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
