@@ -1,10 +1,12 @@
 """Offsets of three cameras or more: where the others place a joint, and how it moves, against what each sees."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
@@ -39,8 +41,11 @@ class InSpace:
     """Frames a second."""
 
     @classmethod
-    def of(cls, tracks: list[Tracks], views: Views, shift: Array, fps: float) -> "InSpace":
-        """People at times one after the other, as many as pay."""
+    def of(cls, pairwise: Pairwise) -> "InSpace":
+        """People at times one after the other, as many as pay; tracks that most others of the person are not are
+        left out: two who dance are nearer to each other than what a camera sees of one may be.
+        """
+        tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))
         low = min(int((each.frame - at).min(initial=0)) for each, at in zip(tracks, shift, strict=True))
         high = max(int((each.frame - at).max(initial=0)) for each, at in zip(tracks, shift, strict=True))
@@ -66,6 +71,14 @@ class InSpace:
         seen, whose = seen.only(enough), whose[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
         member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
+        agree = np.zeros(member.shape)
+        for a, b in combinations(range(len(tracks)), 2):
+            same = np.zeros((len(tracks[a].first) + 1, len(tracks[b].first) + 1))
+            same[tuple(np.array(pairwise.same(a, b), dtype=np.intp).reshape(-1, 2).T)] = 1.0
+            both = same[member[:, a], member[:, b]]
+            agree[:, a] += both
+            agree[:, b] += both
+        member[2 * agree < (member >= 0).sum(axis=1, keepdims=True) - 1] = -1
         many = (member >= 0).sum(axis=1) >= 3
         return cls(tracks, views, shift, times[groups.frame[many]], member[many], step, fps)
 

@@ -31,8 +31,8 @@ class Pairwise:
     fps: float
     """Frames a second."""
 
-    def matched(self, a: int, b: int, gate: float = _GATE) -> tuple[Index, Index]:
-        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same person."""
+    def same(self, a: int, b: int, gate: float = _GATE) -> list[tuple[int, int]]:
+        """Tracks of camera a and of camera b that are one person, over all the time that both last."""
         one, other, apart = self.tracks[a], self.tracks[b], self.shift[b] - self.shift[a]
         stride = max(1, round(0.1 * self.fps))
         rows = np.arange(0, len(one.frame), stride)
@@ -60,7 +60,11 @@ class Pairwise:
                         return True
             return False
 
-        pairs = [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
+        return [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
+
+    def matched(self, a: int, b: int) -> tuple[Index, Index]:
+        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same person."""
+        one, pairs = self.tracks[a], self.same(a, b)
         stop = np.append(one.first[1:], len(one.frame))
         rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
         whom = [np.full(len(each), pair[1]) for each, pair in zip(rows, pairs, strict=True)]

@@ -149,7 +149,7 @@ def offsets(
     fine = fine.nearest(2.0 * step, 1.0).nearest(2.0, 0.25)
     shift, covariance = fine.solved()
     if len(rig) > 2:
-        shift, covariance = InSpace.of(tracks, views, shift, fps).settled()
+        shift, covariance = InSpace.of(replace(fine, shift=shift)).settled()
     offset = -(shift + start)
     offset = offset - offset[0]
     return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, sure
