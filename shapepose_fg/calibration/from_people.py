@@ -71,6 +71,8 @@ class Calibrated:
     """(V,) people, one per frame, by whom each camera was placed."""
     explained: Array
     """(V,) which part of the people that each saw another camera saw too."""
+    missed_px: Array
+    """(N, V) the same distances one by one; NaN where unknown."""
     notes: tuple[str, ...] = field(default=())
     """What is weak, a sentence each."""
 
@@ -142,9 +144,11 @@ def calibrate(
         half = how.settled(footage.at(used), adjusted.rig, _HALF_ROUNDS).rig
         away = missed_px(footage.at(left).people(half), half)
         halves.append(half)
-        missed.append(away[np.isfinite(away)])
+        missed.append(away.reshape(-1, len(rig)))
     new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, stature_m is not None)
-    return _judged(replace(adjusted, rig=new), world, halves, np.concatenate(missed), footage)
+    moved = new.cameras[0].wTc @ np.linalg.inv(adjusted.rig.cameras[0].wTc)
+    people = replace(adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3])
+    return _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
 
 
 def _pairs(
@@ -259,8 +263,8 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
     apart_deg, apart_m = _apart_by(*halves)
     counts = people.seen.any(axis=1).sum(axis=0)
     seen = np.bincount(footage.sightings.view, minlength=len(rig))
-    held = float(np.median(missed)) if len(missed) > 0 else np.nan
-    found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1))
+    held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan
+    found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed)
     sigma = np.degrees(adjusted.sigma(TURN))
     problems = list[str]()
     for view, name in enumerate(rig.names):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
 
 from shapepose_fg.cli.options import (
@@ -20,6 +21,7 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
+from shapepose_fg.cli.refine import report_option, write_page
 from shapepose_fg.cli.synchronise import check_most, show_clocks
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
@@ -77,6 +79,7 @@ def calibrate(
         TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
     ),
     most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", 60.0),
+    report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
     """Find where cameras stand by the people whom they see; lenses must be known, or guessed.
@@ -101,13 +104,12 @@ def calibrate(
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         part = rate.part(seen.detections, seen.skeleton, rig, Path(folder), own_frames=times is not None)
         recording, known, span = part
-        clocks = None
+        fps, clocks = rate_of(known.frame_s), None
         try:
             with progress("calibrating", "steps") as done:
                 if times is None:
                     found = calibrate(recording, rig, known, span, off, stature, done)
                 else:
-                    fps = rate_of(known.frame_s)
                     found, clocks = calibrate_unsynchronised(recording, rig, fps, span, most, off, stature, done)
         except Undetermined as error:
             note(*error.problems)
@@ -116,11 +118,19 @@ def calibrate(
     write_rig(found.rig, output)
     if times is not None and clocks is not None:
         write_timestamps(times, rig.names, known.of_views(len(rig)) + clocks.offset_s)
+    heads, rows = _figures(found, focal)
+    lines = [_CAPTION, *_world(found, stature)]
+    if report is not None:
+        people, figures = found.adjusted.people, (heads, rows, {"joint, px": found.missed_px})
+        # Moments of one clock that was found begin at 0.
+        time_s = known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps
+        write_page(report, found.rig, None, people, time_s, recording.skeleton, figures, lines, found.notes)
     if as_json:
         told = found.as_dict() | ({} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]})
         print(json.dumps(told, indent=2, allow_nan=False))
     else:
-        _show(found, focal, stature)
+        show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
+        print("\n".join(lines[1:]))
         given = rate.given()
         if times is not None and clocks is not None:
             show_clocks(clocks, rig)
@@ -131,8 +141,14 @@ def calibrate(
         print(next_reconstruct(options | given | {"--output": "results"}))
 
 
-def _show(found: "Calibrated", focal: bool, stature: float | None) -> None:
-    """The cameras, and how surely they are known."""
+_CAPTION = (
+    "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too; halves: how"
+    " far apart the two halves of the recording place it"
+)
+
+
+def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """The cameras, and how surely they are known: heads, and each camera's figures."""
     heads = ["people", "shared", "x y z, m", "turn ± °", "place ± mm", "halves, °"] + ["focal, px"] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
@@ -140,15 +156,17 @@ def _show(found: "Calibrated", focal: bool, stature: float | None) -> None:
         figures = [str(each["people"]), f"{each['shared']:.0%}", place, f"{each['sigma_turn_deg']:.2f}"]
         figures += [f"{each['sigma_move_mm']:.0f}", f"{each['halves_turn_deg']:.2f}"]
         figures += [f"{each['focal_px']:.0f} ± {each['sigma_focal_percent']:.1f} %"] * focal
-        rows.append((each["camera"], *figures))
-    caption = (
-        "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too;"
-        " halves: how far apart the two halves of the recording place it"
-    )
-    show(table(("camera", *heads), rows, caption=caption))
+        rows.append((each["camera"], figures))
+    return heads, rows
+
+
+def _world(found: "Calibrated", stature: float | None) -> list[str]:
+    """Scale, up and fit, a line each."""
     whose = f"people of {stature:g} m" if stature is not None else "adults of 1.70 m in the median"
     world = found.world
-    print(f"scale: {whose}, {world.persons} at once: ± {100 * world.sigma_scale:.1f} %, one sigma")
     level = "from feet on the floor" if world.floor is not None else "from bodies alone, no level floor was found"
-    print(f"up: z, {level}; the floor is at 0")
-    print(f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px")
+    return [
+        f"scale: {whose}, {world.persons} at once: ± {100 * world.sigma_scale:.1f} %, one sigma",
+        f"up: z, {level}; the floor is at 0",
+        f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px",
+    ]

@@ -2,9 +2,10 @@
 
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from shapepose_fg.cli.options import (
     REQUIRED,
@@ -20,7 +21,11 @@ from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
+    from shapepose_fg.calibration.people import People
     from shapepose_fg.calibration.refinement import Refinement
+    from shapepose_fg.core.arrays import Array
+    from shapepose_fg.core.camera import Rig
+    from shapepose_fg.core.skeleton import Skeleton
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
@@ -39,12 +44,40 @@ class FreedomOptions:
     stature: float | None = option(_CAMERAS, "People's mean stature in metres: it, not the rig, says the scale.")
 
 
+def report_option() -> Any:
+    """A page with pictures."""
+    return option(RESULT, "Page with the cameras in 3D and people over them, for the browser: FILE.html.")
+
+
+def write_page(
+    file: Path,
+    rig: "Rig",
+    before: "Rig | None",
+    people: "People",
+    time_s: "Array",
+    skeleton: "Skeleton",
+    figures: "tuple[list[str], list[tuple[str, list[str]]], dict[str, Array]]",
+    lines: Sequence[str],
+    remarks: Sequence[str],
+) -> None:
+    """The page of cameras, and those `before`: `figures` are heads, rows, and residuals; `lines` the caption, and
+    what is said above.
+    """
+    from shapepose_fg.viz.report.cameras import write_camera_page
+
+    joints = [skeleton.joints[joint] for joint in skeleton.core]
+    where = (people.points, people.frame, time_s[people.frame], joints)
+    write_camera_page(file, rig, before, *where, *figures, "; ".join(lines[1:]), f"{lines[0]}.", remarks)
+    note(f"{file}: the cameras in 3D and the people, to be opened in a browser")
+
+
 @grouped
 def refine_calibration(
     seen: DetectionOptions,
     rate: RateOptions,
     may: FreedomOptions,
     output: Path = option(RESULT, "File for the refined cameras, in the format they came in.", REQUIRED),
+    report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
     """Refine where cameras stand and look, and their lenses if asked, by the people of a recording.
@@ -82,10 +115,20 @@ def refine_calibration(
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
     form = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
+    heads, rows = _figures(found, may)
+    lines = _words(found, may)
+    if report is not None:
+        missed = dict(zip(("before, px", "after, px"), found.missed_px, strict=True))
+        before = found.given if found.better else None
+        people, figures = found.adjusted.people, (heads, rows, missed)
+        write_page(
+            report, new, before, people, times.frame_s, recording.skeleton, figures, lines, found.notes
+        )
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:
-        _show(found, may)
+        show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=lines[0]))
+        print("\n".join(lines[1:]))
         print(f"{output}: {form}")
         # Our own file says axis, unit and size itself.
         said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
@@ -94,22 +137,27 @@ def refine_calibration(
         print(next_reconstruct(options | rate.given() | {"--output": "results"}))
 
 
-def _show(found: "Refinement", may: FreedomOptions) -> None:
-    """What changed, by camera, and whether it is better."""
+def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """What changed, by camera: heads, and each camera's figures."""
     change, sigma = found.change(), found.sigma()
     parts = {"turn": "turn, °", "move": "move, mm"} | ({"focal": "focal, %"} if may.focal else {})
     parts |= {"centre": "centre, px"} if may.centre else {}
     rows = []
     for view, name in enumerate(found.given.names):
         figures = [f"{change[part][view]:.2f} ± {sigma[part][view]:.2f}" for part in parts]
-        rows.append((name, str(found.counts[view]), *figures))
+        rows.append((name, [str(found.counts[view]), *figures]))
+    return ["people", *parts.values()], rows
+
+
+def _words(found: "Refinement", may: FreedomOptions) -> list[str]:
+    """The table's caption, and whether cameras are better."""
     scale = (
         "the cameras' distances as they were" if may.stature is None else f"people's stature, {may.stature:g} m"
     )
     stays = "the rig as a whole" if may.reference is None else f"camera {may.reference}"
-    caption = f"± is one sigma, as against {stays}; scale: {scale}"
-    show(table(("camera", "people", *parts.values()), rows, caption=caption))
     figures = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
-    print(f"a joint as against the other cameras, on frames that were not used: {figures}")
-    if not found.better:
-        print("the people do not fit better: the cameras are left as they were")
+    return [
+        f"± is one sigma, as against {stays}; scale: {scale}",
+        f"a joint as against the other cameras, on frames that were not used: {figures}",
+        *(["the people do not fit better: the cameras are left as they were"] if not found.better else []),
+    ]
