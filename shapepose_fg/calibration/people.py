@@ -60,9 +60,7 @@ class Footage:
     """(J,) names of the joints."""
 
     @classmethod
-    def of(
-        cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range
-    ) -> "Footage":
+    def of(cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range) -> "Footage":
         """At frames spread over the recording, as many as tell something new."""
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])

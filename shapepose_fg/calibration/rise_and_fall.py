@@ -22,7 +22,7 @@ _STEP_S = 0.04
 _FASTEST = 2.0
 """Statures a second: joints that rise faster have changed their person."""
 _BRISK_S = 0.5
-"""What lasts longer is taken out: who walks towards a camera sinks in its picture, and rises in that of another."""
+"""What lasts longer is taken out: who walks towards one camera, and sinks in its picture, rises in another's."""
 _LEAST_S = 1.0
 """Seconds that two tracks must have in common."""
 _AROUND_S = 0.3
@@ -98,7 +98,10 @@ def _peaks(
         moved = np.arange(-most, most + 1) + other[b] - one[a]
         inside = np.abs(moved) <= most
         total[inside] += curves[a, b][moved[inside] + most]
-    usual, found = float(np.sqrt((total[total > 0] ** 2).mean())) if total.any() else 1.0, list[tuple[float, int]]()
+    usual, found = (
+        float(np.sqrt((total[total > 0] ** 2).mean())) if total.any() else 1.0,
+        list[tuple[float, int]](),
+    )
     for _ in range(_PEAKS):
         top = int(np.argmax(total))
         found.append((float(total[top]) / usual, top - most))

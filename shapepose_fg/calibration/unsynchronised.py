@@ -63,6 +63,7 @@ def calibrate_unsynchronised(
         before, shift = shift, -offset * fps
         if np.abs(shift - before).max() < _STILL_S * fps:
             break
+    assert found is not None
     progress(total, total)
     none, middle = np.zeros(V), (frames.start + frames.stop) / 2 / fps
     clocks = Synchronised(offset, sigma, sure, none, none, middle)

@@ -142,8 +142,8 @@ def calibrate(
 
 
 _CAPTION = (
-    "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too; halves: how"
-    " far apart the two halves of the recording place it"
+    "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too;"
+    " halves: how far apart the two halves of the recording place it"
 )
 
 

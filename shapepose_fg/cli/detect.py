@@ -152,9 +152,7 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
     return table("camera pictures size turned shown joints".split(), rows, caption=caption)
 
 
-def _next_command(
-    run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network"
-) -> str:
+def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network") -> str:
     """How to go on, as a line to copy, wherever it is pasted."""
     output = run.output
     if cameras.calibration is None:

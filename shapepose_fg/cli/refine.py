@@ -118,12 +118,10 @@ def refine_calibration(
     heads, rows = _figures(found, may)
     lines = _words(found, may)
     if report is not None:
-        missed = dict(zip(("before, px", "after, px"), found.missed_px, strict=True))
+        missed: dict[str, Array] = {"before, px": found.missed_px[0], "after, px": found.missed_px[1]}
         before = found.given if found.better else None
         people, figures = found.adjusted.people, (heads, rows, missed)
-        write_page(
-            report, new, before, people, times.frame_s, recording.skeleton, figures, lines, found.notes
-        )
+        write_page(report, new, before, people, times.frame_s, recording.skeleton, figures, lines, found.notes)
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:

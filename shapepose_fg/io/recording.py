@@ -48,7 +48,9 @@ def read_recording(
     InputError, one sentence that names file, place and cure.
     """
     file = times_beside(detections, fps, timestamps)
-    recording = read_detections(detections, rig, skeleton, InFolder(kept), own_frames=own_frames or file is not None)
+    recording = read_detections(
+        detections, rig, skeleton, InFolder(kept), own_frames=own_frames or file is not None
+    )
     count = len(recording)
     if file is None:
         return recording, None if fps is None else FrameTimes.from_fps(fps, count)

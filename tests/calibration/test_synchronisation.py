@@ -16,6 +16,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_association
 from tests.calibration.conftest import FPS, LATE_S, filmed, merged, moving
 
+
 @pytest.mark.slow
 def test_offsets_of_any_size_are_found_to_milliseconds(rig, late):
     found = synchronise(late, rig, FPS, range(300), 8.0)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,9 +78,9 @@ def test_the_command_writes_cameras_times_and_a_page(rig, late, tmp_path, capsys
         out, error = capsys.readouterr()
         assert ended.value.code == code and said in " ".join((out + error).split())
     assert off_after_growing(read_rig("new.json"), rig)[0].max() < 0.4
-    rows = np.array([line.split(",")[1:] for line in open("times.csv").read().splitlines()[1:]], dtype=float)
+    rows = np.array([line.split(",")[1:] for line in Path("times.csv").read_text().splitlines()[1:]], dtype=float)
     assert rows.shape == (300, 4) and np.abs(rows[7] - rows[7, 0] - LATE_S).max() < 0.005
-    page = open("page.html").read()
+    page = Path("page.html").read_text()
     scene = re.search(r'id="scene-data">(.*?)</script>', page, re.S)
     assert scene is not None and len(json.loads(scene[1])["cameras"]) == 4
-    assert page.count("px<span class=\"range\"") == 4 and "before" not in json.loads(scene[1])
+    assert page.count('px<span class="range"') == 4 and "before" not in json.loads(scene[1])

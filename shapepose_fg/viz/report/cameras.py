@@ -1,4 +1,4 @@
-"""The page of cameras that were calibrated or refined: where they stand, stood before, and the people over them."""
+"""The page of cameras that were calibrated or refined: where they stand, stood before, and people over them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -44,20 +44,21 @@ def write_camera_page(
     """
     scene = None
     if np.isfinite(points).all(axis=-1).any():
-        people = Reconstruction.without_rows(joint_names=np.array(joints))
         P, J = points.shape[:2]
-        unknown = {name: np.full((P, *shape), np.nan) for name, shape in _NO_BODY.items()}
         people = Reconstruction(
             frame=frame.astype(np.int64),
             person=_followed(points, frame),
-            joint_names=people.joint_names,
+            joint_names=np.array(joints),
             joints=points,
             covariance=np.full((P, J, 3, 3), np.nan),
             confidence=np.ones((P, J)),
             status=np.full(P, str(Status.OK)),
             time_s=time_s,
             known=np.where(np.isfinite(points[..., 0]), Known.SEEN, Known.UNKNOWN).astype(np.uint8),
-            **unknown,
+            betas=np.full((P, 10), np.nan),
+            global_orient=np.full((P, 3), np.nan),
+            body_pose=np.full((P, 23, 3), np.nan),
+            transl=np.full((P, 3), np.nan),
         )
         scene = scene_of(Take.of(people, rig.up, rig=rig), None, _SCENE_BYTES)
         if before is not None:
@@ -83,14 +84,11 @@ def write_camera_page(
     write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
 
 
-_NO_BODY = {"betas": (10,), "global_orient": (3,), "body_pose": (23, 3), "transl": (3,)}
-
-
 def _followed(points: Array, frame: Index) -> Index:
     """(P,) a number for each person, kept from look to look where somebody is near."""
     person, at, free = np.zeros(len(points), dtype=np.int64), dict[int, Array](), 0
-    middle = np.stack([np.mean(each[np.isfinite(each[:, 0])], axis=0) if np.isfinite(each).any() else np.zeros(3)
-                       for each in points])
+    known = np.isfinite(points[..., :1])
+    middle = np.where(known, points, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     for now in np.unique(frame):
         rows, numbers = np.flatnonzero(frame == now), list(at)
         new = {int(row): -1 for row in rows}
