@@ -133,8 +133,8 @@ def adjust(
     moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
     placed = replace(people, points=moved)
     # A joint that went behind a camera tells nothing, not even where it is.
-    behind = (people.seen & (np.moveaxis(rig.project(moved)[1], 0, 2) <= 0)).any(axis=-1)[person, joint]
-    for each in dict.fromkeys(each for each, lost in zip(joints, behind.tolist(), strict=True) if lost):
+    depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
+    for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
         graph.addPriorPoint3(each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M))
     information = _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
     covariance = _covariance(information, rig, freedom.sigmas, reference, scaled)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
+from shapepose_fg.cli.found_cameras import check_most, report_option, show_clocks, write_page
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
@@ -21,8 +22,6 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
-from shapepose_fg.cli.refine import report_option, write_page
-from shapepose_fg.cli.synchronise import check_most, show_clocks
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 

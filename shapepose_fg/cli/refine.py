@@ -2,11 +2,11 @@
 
 import json
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
+from shapepose_fg.cli.found_cameras import report_option, write_page
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
@@ -21,11 +21,8 @@ from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from shapepose_fg.calibration.people import People
     from shapepose_fg.calibration.refinement import Refinement
     from shapepose_fg.core.arrays import Array
-    from shapepose_fg.core.camera import Rig
-    from shapepose_fg.core.skeleton import Skeleton
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
@@ -42,33 +39,6 @@ class FreedomOptions:
     lens: bool = option(_CAMERAS, "Refine k1 k2 p1 p2 too (0.02).", False, "--distortion")
     reference: str | None = option(_CAMERAS, "This camera stays; else the rig as a whole.", metavar="CAMERA")
     stature: float | None = option(_CAMERAS, "People's mean stature in metres: it, not the rig, says the scale.")
-
-
-def report_option() -> Any:
-    """A page with pictures."""
-    return option(RESULT, "Page with the cameras in 3D and people over them, for the browser: FILE.html.")
-
-
-def write_page(
-    file: Path,
-    rig: "Rig",
-    before: "Rig | None",
-    people: "People",
-    time_s: "Array",
-    skeleton: "Skeleton",
-    figures: "tuple[list[str], list[tuple[str, list[str]]], dict[str, Array]]",
-    lines: Sequence[str],
-    remarks: Sequence[str],
-) -> None:
-    """The page of cameras, and those `before`: `figures` are heads, rows, and residuals; `lines` the caption, and
-    what is said above.
-    """
-    from shapepose_fg.viz.report.cameras import write_camera_page
-
-    joints = [skeleton.joints[joint] for joint in skeleton.core]
-    where = (people.points, people.frame, time_s[people.frame], joints)
-    write_camera_page(file, rig, before, *where, *figures, "; ".join(lines[1:]), f"{lines[0]}.", remarks)
-    note(f"{file}: the cameras in 3D and the people, to be opened in a browser")
 
 
 @grouped
