@@ -28,7 +28,7 @@ def test_offsets_of_any_size_are_found_to_milliseconds(rig, late):
 
 @pytest.mark.slow
 def test_clocks_that_run_apart(rig, two_people, monkeypatch):
-    monkeypatch.setattr(synchronisation, "_WHOLE_S", 6.0)
+    monkeypatch.setattr(synchronisation, "WHOLE_S", 6.0)
     monkeypatch.setattr(synchronisation, "_END_S", 5.0)
     drift = np.array([0.0, 0.0, 0.003, 0.0])
     seen = merged(rig, [filmed(two_people[0], *each) for each in zip([0, 0.7, -0.3, 0.2], drift, strict=True)])
