@@ -4,13 +4,10 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from shapepose_fg.core.moved import install
-
 # Or MKL, which torch brings, rounds by where in memory an array happens to lie, and the last digits of a result
 # depend on the number of processes.
 os.environ.setdefault("MKL_CBWR", "AUTO")
 
-install()
 
 if TYPE_CHECKING:
     from shapepose_fg.core.errors import InputError as InputError

@@ -12,6 +12,8 @@ def main() -> None:
     garbage, and not taken apart at the end.
     """
     gc.set_threshold(50_000, 20, 100)
+    # NumPy's matrices are small here: its threads wait for each other, a tenth of all processor time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     from shapepose_fg.cli.main import main as run

@@ -39,7 +39,8 @@ def live(
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
         for view in views(detections, rig, joints, note):
-            people.push_view(*view)
+            with naming(detections or "standard input"):
+                people.push_view(*view)
             if people.report().frames > frames:
                 frames = people.report().frames
                 publish("now", people.people())

@@ -328,7 +328,7 @@ class Views:
     @cached_property
     def focal(self) -> Array:
         """(1, V) or (N, V), as many rows as `projection` has, the same as `focal_px`."""
-        return np.ascontiguousarray(np.broadcast_to(self.focal_px, self.projection.shape[:2]))
+        return np.array(np.broadcast_to(self.focal_px, self.projection.shape[:2]), order="C")
 
     def rows(self, index: Index) -> "Views":
         """The cameras of some of the rows."""

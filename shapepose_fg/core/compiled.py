@@ -21,9 +21,10 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, UserWideCacheLocator
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
+from numba.misc.appdirs import AppDirs
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -82,12 +83,37 @@ def is_kept(kernel: Any) -> bool:
     return kernel._cache.keeps(signature(kernel), kernel.targetctx.codegen())
 
 
+class _Shared(UserWideCacheLocator):
+    """A user's folder for all installations and checkouts: what is in files decides, not where they are."""
+
+    def __init__(self, py_func: Any, py_file: str):
+        super().__init__(py_func, py_file)
+        folder = os.environ.get("NUMBA_CACHE_DIR") or AppDirs("shapepose-fg", appauthor=False).user_cache_dir
+        self._module, self._cache_path = py_func.__module__, str(Path(folder) / "kernels")
+
+    def get_source_stamp(self) -> str:
+        """None: `_Cache` has the files in its keys."""
+        return ""
+
+    def get_disambiguator(self) -> str:
+        """Numba names a file by the last part of the module."""
+        return self._module
+
+
+class _Place(CompileResultCacheImpl):
+    """Where compiled kernels are kept: beside the bytecode if the user has no folder for such things."""
+
+    _locator_classes = (_Shared, InTreeCacheLocator)
+
+
 class _Cache(FunctionCache):
     """Numba compiles a function anew when its own file has changed; here also when one has that it calls into.
 
     What is compiled is loaded without what only compiling needs, which takes a fifth of a second. What is not sets
     off that all kernels which are not are compiled, side by side.
     """
+
+    _impl_class = _Place
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)  # for kernels that make arrays

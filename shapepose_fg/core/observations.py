@@ -45,12 +45,12 @@ class Observations(Table):
         super().__post_init__()
 
     @classmethod
-    def of(cls, candidate: Index, detections: Detections, initial: Array) -> "Observations":
-        """The detections `candidate` (N, J, V) of one frame, -1 for none, as observations."""
+    def of(cls, candidate: Index, detections: Detections, initial: Array, **others: Any) -> "Observations":
+        """The detections `candidate` (N, J, V) of one frame, -1 for none, as observations; with other columns."""
         seen = candidate >= 0
         xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
         xy[seen], confidence[seen] = detections.xy[candidate[seen]], detections.confidence[candidate[seen]]
-        return cls(xy, confidence, initial, candidate=candidate)
+        return cls(xy, confidence, initial, candidate=candidate, **others)
 
     @property
     def seen(self) -> Mask:

@@ -15,7 +15,8 @@ _OVER_S = 1.0
 _SILENT_S = 0.5
 """A camera that gives nothing for longer is silent."""
 _NEAREST = 0.25
-"""A camera sees people as near to where they are as the nearest quarter of their joints: others may be hidden."""
+"""A camera sees people as near to where they are as the nearest quarter of their joints, or of its detections:
+others may be hidden from it, and it may see others."""
 _OFF_M, _TIMES = 0.06, 2.5
 """It contradicts the others where that is farther, three times a detector's error, and so many times as far as in
 the median camera."""
@@ -90,15 +91,18 @@ class CameraWatch:
         uv, depth = rig.project(places)
         sizes = np.array([camera.image_size for camera in rig.cameras])[:, None, None]
         inside = (depth > 0) & (uv >= 0).all(axis=-1) & (uv < sizes).all(axis=-1)
+        px_m = np.where(depth > 0, depth, np.nan) / rig.focal_px[:, None, None]
         away = np.linalg.norm(uv[given.view, :, given.joint] - given.xy[:, None], axis=-1)
-        nearest = np.full((len(rig), places.shape[1], len(places)), np.inf)
-        np.fmin.at(nearest, (given.view, given.joint), np.nan_to_num(away, nan=np.inf))
-        metres = np.minimum(nearest.swapaxes(1, 2) * depth / rig.focal_px[:, None, None], _CAP_M)
+        away = np.nan_to_num(away * px_m[given.view, :, given.joint], nan=_CAP_M)
+        nearest = np.full((len(rig), places.shape[1], len(places)), _CAP_M)
+        np.fmin.at(nearest, (given.view, given.joint), away)
+        metres, of_detections = nearest.swapaxes(1, 2), np.minimum(away.min(axis=1), _CAP_M)
         apart_m, fresh = self.apart_m.copy(), min(lasts_s / _OVER_S, 1.0)
         counts = np.bincount(given.view, minlength=len(rig))
         for view in np.flatnonzero((inside.sum(axis=(1, 2)) >= _LEAST) & (counts >= _LEAST)).tolist():
             if self.state[view] != CameraState.FROZEN:
-                now, last = float(np.quantile(metres[view][inside[view]], _NEAREST)), apart_m[view]
+                both = metres[view][inside[view]], of_detections[given.view == view]
+                now, last = min(float(np.quantile(each, _NEAREST)) for each in both), apart_m[view]
                 apart_m[view] = now if np.isnan(last) else last + fresh * (now - last)
         return replace(self, apart_m=apart_m)
 

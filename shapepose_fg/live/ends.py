@@ -17,14 +17,14 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.detections.lines import read_view_line
 from shapepose_fg.io.ros.mcap_files import McapWriter, read_views
 
-View = tuple[str, Detections, float]
+View = tuple[Any, ...]
+"""What `OnlineReconstructor.push_view` takes."""
 Publish = Callable[[str, Reconstruction], None]
 """Of a kind, `now` or `settled`, and its rows."""
 _LONGEST_LINE, _MOST_WAITING = 2**20, 2**23

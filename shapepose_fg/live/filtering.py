@@ -16,7 +16,6 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.following import observed
-from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import APPEARS_S, LEAST_S, own_evidence, weighed
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.tracker import Tracker, Tracks
@@ -56,8 +55,6 @@ class Moment:
     """Where they are."""
     views: Whole
     """(A, J) how many views' detections of each joint the last frame had."""
-    of_body: Mask
-    """(A, J) joints that are where the refined body has them, moved on: none of their detections came since."""
     identity: Whole
     """(A,) who each is for good; `ON_TRIAL` for whom too little speaks yet."""
     running_s: Array
@@ -92,7 +89,7 @@ class Moment:
         return replace(self, tracks=self.tracks.rows(index), **own)
 
 
-OF_TRACKS = ("views", "of_body", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
+OF_TRACKS = ("views", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
 """What a `Moment` has a row of for each track."""
 
 
@@ -112,16 +109,7 @@ class Filter:
         whole, real = np.zeros(0, np.int64), np.zeros(0)
         gone = Gone(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
         per_bone = np.zeros((0, B)), np.zeros((0, B))
-        own = (
-            np.zeros((0, J), np.int64),
-            np.zeros((0, J), dtype=bool),
-            whole,
-            real,
-            real,
-            real,
-            np.zeros((0, 3)),
-            *per_bone,
-        )
+        own = np.zeros((0, J), np.int64), whole, real, real, real, np.zeros((0, 3)), *per_bone
         return Moment(self.tracker.nobody(), *own, gone)
 
     def step(self, before: Moment, given: Input) -> tuple[Moment, Index]:
@@ -165,7 +153,6 @@ class Filter:
         return replace(
             now,
             views=views,
-            of_body=now.of_body & (views == 0),
             running_s=running_s,
             peak_s=np.maximum(now.peak_s, running_s),
             length_m=now.length_m + np.where(known, bones, 0.0),
@@ -208,7 +195,6 @@ class Filter:
         running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
         columns: dict[str, Any] = {
             "views": (own >= 0).sum(axis=2),
-            "of_body": np.zeros(own.shape[:2], dtype=bool),
             "identity": np.full(count, ON_TRIAL),
             "running_s": running_s,
             "peak_s": running_s,
@@ -270,9 +256,3 @@ class Filter:
     def _trace(self, places: Array) -> Trace:
         """Centres and bones of people at `places` (A, J, 3)."""
         return Trace.of(0, np.zeros(len(places)), places, self.tracker.skeleton)
-
-
-def replaced(joints: JointStates, by: JointStates, where: Mask) -> JointStates:
-    """States of which some (A, J) are others'."""
-    mean = np.where(where[..., None], by.mean, joints.mean)
-    return JointStates(mean, np.where(where[..., None, None], by.covariance, joints.covariance))

@@ -22,11 +22,11 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.cameras import CameraState, CameraWatch
-from shapepose_fg.live.filtering import Filter, Moment
-from shapepose_fg.live.now import Bodies, fed_back, people_at
+from shapepose_fg.live.filtering import Filter
+from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
-from shapepose_fg.live.views import ViewsInStep, joined
+from shapepose_fg.live.views import ViewsInStep, joined, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.workers import Workers
@@ -39,9 +39,14 @@ _ROUNDS = 1
 rounds take a seventh to a fifth more for the same figures (Shelf, crossing)."""
 _KEPT_S = 10.0
 """What is settled and nobody takes is kept for so long."""
+_BEFORE = 7.0
+"""A window has the lag over this before what it settles: a frame or two. With a third of the lag it takes an
+eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
 _BEHIND = 3.0
 """Frames older than so many lags are settled as they are, where solving does not keep up."""
 _MOST_SAID = 1000
+_BACK_S = 1.0
+"""Poses of cameras that move are kept for so much longer than a frame can wait to be solved."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +125,9 @@ class OnlineReconstructor:
         self._workers = Workers(workers, setup).__enter__()
         self._most_waiting = 1 if workers == 1 else 2 * workers
         self._refinery = Refinery(self._workers, self._filter)
-        self._state = LiveState(CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
+        self._state = LiveState(rig, CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
         self._said = deque[Said](maxlen=_MOST_SAID)
-        self._now: tuple[int, Moment, Bodies | None] = 0, self._filter.nobody, None
+        self._now = Newest(0, self._filter.nobody, fitter)
 
     @classmethod
     def load(
@@ -164,22 +169,36 @@ class OnlineReconstructor:
 
         A camera that gave nothing has no detections in it. Frames may come late or out of order by up to the lag:
         everything after them is followed once more. Older ones, and a second one of the same time, are counted and
-        left out. ValueError where a detection is of a camera or joint that there is not, or not finite.
+        left out. ValueError where a detection is of a camera or joint that there is not, or not finite, or of a
+        camera that moves (`push_view`) and nothing says where it was.
         """
         times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
         if not np.isfinite(times).all():
             raise ValueError("time_s must be finite")
         self._check(detections)
         with self._lock:
+            self._check_places(detections, times)
             self._take(detections, times)
 
-    def push_view(self, camera: str, detections: Detections, time_s: float) -> None:
+    def push_view(
+        self,
+        camera: str,
+        detections: Detections,
+        time_s: float,
+        pose: Array | None = None,
+        pose_covariance: Array | None = None,
+    ) -> None:
         """Take in what one camera saw at `time_s`, seconds, on the clock that all share.
 
         Views make a frame: it is complete when every camera that was heard in the last half second is in it (the
         first one: every camera), or when one comes again. What comes for a frame that was complete joins it where
         it is within half a frame of it and within the lag; else it is counted and left out. `detections` are of
-        this camera whatever their `view` says. ValueError as `push`, and for a camera that there is not.
+        this camera whatever their `view` says.
+
+        `pose` (4, 4) is world from camera then, or from what carries it (`Camera.carrier`), metres;
+        `pose_covariance` (6, 6) how surely, turn then way along its own axes, rad² and m² (GTSAM's order); without
+        it, exactly. Between poses at most half a second apart they are interpolated. ValueError as `push`, and
+        for a camera that there is not.
         """
         if camera not in self.rig.names:
             raise ValueError(f"there is no camera {camera}; there are {', '.join(self.rig.names)}")
@@ -189,6 +208,10 @@ class OnlineReconstructor:
         own = replace(detections, view=np.full(len(detections), view))
         self._check(own)
         with self._lock:
+            if pose is not None:
+                since_s = max(self._state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - _BACK_S
+                self._state.rig = with_pose(self._state.rig, view, time_s, pose, pose_covariance, since_s)
+            self._check_places(own, np.full(len(self.rig), time_s))
             if self._state.views.is_late(view, time_s):
                 self._state.views.heard(view, time_s)
                 self._join(view, own, time_s)
@@ -200,18 +223,18 @@ class OnlineReconstructor:
         """The people at `time_s`, from the newest frame's time (the default) to a second after it.
 
         A row per person, of the newest frame's number. Joints are predicted by the model of motion, and their
-        covariances grow with the time ahead. Bodies are the last refined ones, moved along with the joints.
-        ValueError for another time.
+        covariances grow with the time ahead. Bodies are fitted to the newest joints when somebody asks first, and
+        moved along with them; joints that no two views see are the body's. ValueError for another time.
         """
-        frame, moment, bodies = self._now
-        newest_s = moment.tracks.time_s
+        newest = self._now
+        newest_s = newest.moment.tracks.time_s
         ahead_s = 0.0 if time_s is None or not np.isfinite(newest_s) else time_s - newest_s
         if not -1e-9 <= ahead_s <= AHEAD_S + 1e-9:
             raise ValueError(
                 f"people are known from {newest_s:g} s, the newest frame, to {AHEAD_S:g} s later, not at"
                 f" {time_s:g} s; what was before is in settled()"
             )
-        return people_at(self._filter.tracker, self._motion, frame, moment, bodies, max(ahead_s, 0.0))
+        return people_at(newest, self._setup.skeleton, self._motion, max(ahead_s, 0.0))
 
     def settled(self, *, wait: bool = False) -> Reconstruction:
         """The refined rows of all frames that have settled since this was asked last; with `wait`, until all that
@@ -269,6 +292,13 @@ class OnlineReconstructor:
         if not (np.isfinite(detections.xy).all() and np.isfinite(detections.confidence).all()):
             raise ValueError("xy and confidence must be finite")
 
+    def _check_places(self, detections: Detections, times: Array) -> None:
+        """ValueError where nothing says where a camera was that moves and has detections."""
+        rig = self._state.rig
+        for view in np.flatnonzero(rig.carrier >= 0).tolist():
+            if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(times[view]):
+                raise ValueError(f"{rig.names[view]} moves: give a pose with what it sees at {times[view]:g} s")
+
     def _take(self, detections: Detections, times: Array) -> None:
         """A frame, in its place among those that came."""
         time_s, slots = float(times.mean()), self._state.slots
@@ -277,15 +307,15 @@ class OnlineReconstructor:
             self._insert(detections, times, time_s)
             return
         last_s = slots[-1].time_s if len(slots) > 0 else time_s
-        before = self._state.watch
-        watch, rig = before.seen(detections, self._state.before, self.rig, time_s)
+        before, stands = self._state.watch, self._state.rig.at(times)
+        watch, rig = before.seen(detections, self._state.before, stands, time_s)
         given = Input(self._state.frames, times, _without(detections, rig), rig)
         moment, candidate = self._filter.step(slots[-1].moment if len(slots) > 0 else self._filter.nobody, given)
         self._state.frames += 1
         self._state.before = detections
         seen = (moment.views >= 2) & moment.named[:, None]
         shown = np.where(seen[..., None], moment.tracks.joints.position, np.nan)
-        self._state.watch = watch.compared(detections, shown, self.rig, time_s - last_s)
+        self._state.watch = watch.compared(detections, shown, stands, time_s - last_s)
         for view in np.flatnonzero(watch.state != before.state).tolist():
             self._said.append(Said(time_s, self.rig.names[view], CameraState(watch.state[view])))
         slots.append(Slot(given, moment, candidate))
@@ -299,7 +329,7 @@ class OnlineReconstructor:
         if at == 0 or slots[-1].time_s - time_s > self.lag_s or slots[at].time_s == time_s:
             self._state.dropped += 1
             return
-        rig = self._state.watch.believed(detections, self.rig)
+        rig = self._state.watch.believed(detections, self._state.rig.at(times))
         given = Input(self._state.frames, times, _without(detections, rig), rig)
         slots.insert(at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled))
         self._state.frames, self._state.late = self._state.frames + 1, self._state.late + 1
@@ -320,7 +350,8 @@ class OnlineReconstructor:
         at_s = slot.given.time_s.copy()
         at_s[view] = time_s
         both = joined([slot.given.detections, detections])
-        rig = replace(slot.given.rig, dark=tuple(each for each in slot.given.rig.dark if each != view))
+        dark = tuple(each for each in slot.given.rig.dark if each != view)
+        rig = replace(self._state.rig.at(at_s), dark=dark, doubted=slot.given.rig.doubted)
         slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)
         self._state.late += 1
         self._again(at)
@@ -332,11 +363,22 @@ class OnlineReconstructor:
             slot.moment, slot.candidate = self._filter.step(self._state.slots[at - 1].moment, slot.given)
         self._show()
 
+    def _restart(self, refined: Reconstruction) -> None:
+        """Follow anew from a frame on whose people are refined: they know better where joints are. Not where it is
+        older than the lag: the frames since take too long.
+        """
+        slots = self._state.slots
+        frames = [slot.given.frame for slot in slots if slots[-1].time_s - slot.time_s < self.lag_s]
+        if refined.frame[0] in frames:
+            at = len(slots) - len(frames) + frames.index(refined.frame[0])
+            slots[at].moment = fed_back(self._filter.tracker, slots[at].moment, refined)
+            self._again(at + 1)
+
     def _refine(self, *, last: bool = False) -> None:
         """Send what is due, forget what is done.
 
-        A window settles what is older than a third of the lag as soon as something is as old as the lag, with a
-        third of the lag before and after it.
+        A window settles what is older than a third of the lag as soon as something is as old as the lag, with the
+        third after it and a little before it.
         """
         slots, around_s = self._state.slots, self.lag_s / 3
         if len(slots) == 0:
@@ -347,8 +389,8 @@ class OnlineReconstructor:
         if first < len(slots) and (last or age_s[first] >= self.lag_s):
             stop = len(slots) if last else int((age_s >= around_s).sum())
             if last or self._refinery.waiting < self._most_waiting:
-                begin = int((age_s > age_s[first] + around_s).sum())
-                self._refinery.send(slots[begin:], first - begin, stop - first)
+                begin = int((age_s > age_s[first] + self.lag_s / _BEFORE).sum())
+                self._refinery.send(slots[begin:], first - begin, stop - first, self._state.rig)
                 for slot in slots[first:stop]:
                     slot.settled = True
                 first = stop
@@ -365,10 +407,7 @@ class OnlineReconstructor:
             if len(refined.rows) > 0:
                 self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
-                self._state.bodies = Bodies.of(refined.newest, self._setup.skeleton)
-                self._state.slots[-1].moment = fed_back(
-                    self._filter.tracker, self._state.slots[-1].moment, refined.newest
-                )
+                self._restart(refined.newest)
         newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
         while len(self._state.settled) > 0 and newest_s - float(self._state.settled[0].time_s.max()) > _KEPT_S:
             self._state.not_taken += len(self._state.settled.popleft())
@@ -377,8 +416,12 @@ class OnlineReconstructor:
     def _show(self) -> None:
         """From now on `people` is asked of the newest moment as it is."""
         if len(self._state.slots) > 0:
-            newest = self._state.slots[-1]
-            self._now = newest.given.frame, newest.moment, self._state.bodies
+            newest, rig, carried = self._state.slots[-1], self._state.rig, None
+            if rig.moves:
+                rows = self._filter.observations(newest.moment, newest.candidate, newest.given)
+                carried = of_poses(rows, newest.moment.tracks.joints, rig, self._setup.estimator)
+            doubted = len(newest.given.rig.doubted) > 0
+            self._now = Newest(newest.given.frame, newest.moment, self._setup.fitter, doubted, carried)
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Index, Whole
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.live.cameras import CameraWatch
 from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
-from shapepose_fg.live.now import Bodies
 from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.setup import Setup
@@ -43,6 +43,8 @@ class Slot:
 class LiveState:
     """All that changes while frames come in, but for windows that are under way."""
 
+    rig: Rig
+    """The cameras; of those that move, where they were lately."""
     watch: CameraWatch
     """Which cameras are believed."""
     views: ViewsInStep
@@ -53,8 +55,6 @@ class LiveState:
     """The newest frame's detections, all of them."""
     settled: deque[Reconstruction] = field(default_factory=deque)
     """Rows that nobody has taken yet."""
-    bodies: Bodies | None = None
-    """The newest refined ones."""
     frames: int = 0
     """How many frames were taken in, and so on (`LiveReport`)."""
     late: int = 0
@@ -99,8 +99,8 @@ class Refinery:
         """How many windows are under way."""
         return len(self._sent)
 
-    def send(self, window: list[Slot], start: int, own: int) -> None:
-        """Have the `own` slots from `start` on solved with those around them."""
+    def send(self, window: list[Slot], start: int, own: int, rig: Rig) -> None:
+        """Have the `own` slots from `start` on solved with those around them, before the cameras of `rig`."""
         names = dict[int, int]()
         for slot in window:
             ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
@@ -115,7 +115,9 @@ class Refinery:
         if len(rows) == 0:
             return
         frames = np.array([slot.given.frame for slot in window])
-        part = self._workers.submit(Setup.solve, Span(tuple(decided), start, len(decided)))
+        part = self._workers.submit(
+            Setup.solve, Span(tuple(decided), start, len(decided), rig=rig if rig.moves else None)
+        )
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:
@@ -123,7 +125,7 @@ class Refinery:
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()
-            rows, at = sent.part.result().rows, 0
+            rows = sent.part.result().rows
             at = rows.frame
             person = np.array([sent.names[track] for track in rows.person.tolist()], dtype=np.int64)
             # Of two tracks of one identity in a frame, who came back while they were still followed, one stays.

@@ -18,9 +18,9 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import read_npz, write_npz
 from shapepose_fg.core.storage.schema import Column
+from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.filtering import OF_TRACKS, Filter, Gone, Moment
-from shapepose_fg.live.now import Bodies
 from shapepose_fg.live.refining import LiveState, Slot
 from shapepose_fg.live.views import ViewsInStep, joined
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -32,6 +32,8 @@ _CURE = "begin without it"
 _WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """The columns of detections."""
+_POSES = ("time_s", "wTb", "covariance")
+"""The columns of poses of cameras that move, beside the carrier's name."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken")
 """The counts of a state."""
 _COLUMNS = {
@@ -46,7 +48,6 @@ _COLUMNS = {
     "covariance": Column("A J S S", most=1e18),
     "evident_s": Column("A", most=1e12),
     "views": Column("A J", _WHOLE),
-    "of_body": Column("A J", np.bool_),
     "identity": Column("A", _WHOLE),
     "running_s": Column("A", most=1e9),
     "peak_s": Column("A", most=1e9),
@@ -113,6 +114,20 @@ def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
     return arrays
 
 
+def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
+    """The cameras of a state, those that move where they were lately."""
+    if "pose.carrier" not in arrays:
+        return rig
+    found = []
+    for name in np.unique(arrays["pose.carrier"]).tolist():
+        own = arrays["pose.carrier"] == name
+        time_s, wTb, covariance = (arrays[f"pose.{each}"][own] for each in _POSES)
+        found.append(Trajectory(name, time_s, wTb, covariance))
+    known = {each.name for each in found}
+    cameras = [replace(each, carrier=each.carrier or each.name * (each.name in known)) for each in rig.cameras]
+    return replace(rig, cameras=tuple(cameras), trajectories=tuple(found))
+
+
 def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> list[Slot]:
     """The frames that `slot_arrays` made the arrays of; ValueError where they are not of these cameras, or of no
     run.
@@ -140,7 +155,9 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
             pairs=found["seen.pairs"][e],
             affinity=found["seen.affinity"][e],
         )
-        given = Input(frame, found["time_s"][n], seen, replace(rig, dark=dark, doubted=doubted))
+        given = Input(
+            frame, found["time_s"][n], seen, replace(rig.at(found["time_s"][n]), dark=dark, doubted=doubted)
+        )
         candidate = found["candidate"][a].astype(np.intp)
         _check(seen, candidate, len(rig), J)
         time_s, sought_s = found["times"][n].tolist()
@@ -178,11 +195,14 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
     waiting = joined([each for each, _ in state.views.waiting.values()] or [Detections.empty()])
     for name, seen in (("waiting", waiting), ("before", state.before or Detections.empty())):
         arrays |= {f"{name}.{each}": getattr(seen, each) for each in _DETECTIONS}
+    for each in sorted(state.rig.trajectories, key=lambda each: each.name):
+        known = np.full(len(each), each.name), each.time_s, each.wTb, each.covariance_at(each.time_s)
+        for name, values in zip(("carrier", *_POSES), known, strict=True):
+            before = [arrays[f"pose.{name}"]] if f"pose.{name}" in arrays else []
+            arrays[f"pose.{name}"] = np.concatenate([*before, values])
     if len(state.settled) > 0:
         settled = Reconstruction.concatenate(list(state.settled))
         arrays |= {f"settled.{each}": getattr(settled, each) for each in Reconstruction.ROWS}
-    if state.bodies is not None:
-        arrays |= {f"bodies.{each}": getattr(state.bodies.rows, each) for each in Reconstruction.ROWS}
     return arrays | (slot_arrays(state.slots) if len(state.slots) > 0 else {"slots": np.zeros((0, 8), np.int64)})
 
 
@@ -196,7 +216,8 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
     """A state. InputError where it is none, or of another set-up."""
     names = ["counts", "cameras", "clock", "waiting_s"]
     names += [f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS]
-    optional = [f"{name}.{each}" for name in ("settled", "bodies") for each in Reconstruction.ROWS]
+    optional = [f"settled.{each}" for each in Reconstruction.ROWS]
+    optional += [f"pose.{each}" for each in ("carrier", *_POSES)]
     arrays = read_npz(path, ("format", "setup", *_COLUMNS, *names, *optional), _CURE)
     if str(arrays.get("format", "")) != FORMAT:
         raise InputError(f"{path}: is no state of a live reconstruction; {_CURE}")
@@ -230,13 +251,12 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     if not np.isin(code, list(CameraState)).all():
         raise ValueError("cameras must have states that there are")
     watch = CameraWatch(apart_m, heard_s, code.astype(np.int64))
-    state = LiveState(watch, ViewsInStep(V, waiting, last_s, *arrays["clock"].tolist()))
+    rig = _carried(arrays, rig)
+    state = LiveState(rig, watch, ViewsInStep(V, waiting, last_s, *arrays["clock"].tolist()))
     for name, value in zip(_COUNTS, arrays["counts"].tolist(), strict=True):
         setattr(state, name, int(value))
     if "settled.frame" in arrays:
         state.settled.append(_rows(arrays, "settled", skeleton))
-    if "bodies.frame" in arrays:
-        state.bodies = Bodies.of(_rows(arrays, "bodies", skeleton), skeleton)
     if len(arrays["slots"]) > 0:
         state.slots, state.before = slots_of(arrays, rig, following.nobody), seen["before"]
     return state

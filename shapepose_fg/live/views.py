@@ -5,7 +5,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.trajectory import Trajectory
 
 _HEARD_S = 0.5
 """A frame waits for cameras that were heard so lately."""
@@ -13,6 +15,9 @@ _ASSUMED_S = 1 / 30
 """Between a camera's pictures, until it has given two."""
 _FRESH = 0.05
 """How much of a camera's period its last step is."""
+
+_BEFORE_S = 0.4
+"""A camera was so long where its first pose has it."""
 
 Frame = tuple[Detections, Array]
 """What all cameras saw, and (V,) when."""
@@ -80,3 +85,28 @@ def joined(parts: list[Detections]) -> Detections:
     }
     pairs = np.concatenate([part.pairs + n for part, n in zip(parts, first, strict=False)])
     return replace(parts[0], pairs=pairs, **columns)
+
+
+def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array | None, since_s: float) -> Rig:
+    """The rig in which a camera, or what carries it, has a pose (4, 4) with its covariance (6, 6) at `time_s`,
+    too; those before `since_s` are forgotten but for one. ValueError where it is no pose.
+    """
+    camera = rig.cameras[view]
+    name = camera.carrier or camera.name
+    others = tuple(each for each in rig.trajectories if each.name != name)
+    known = [each for each in rig.trajectories if each.name == name]
+    pose = np.asarray(pose, dtype=np.float64)
+    covariance = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, dtype=np.float64)
+    if pose.shape != (4, 4) or covariance.shape != (6, 6):
+        raise ValueError(
+            f"pose must be (4, 4) and pose_covariance (6, 6), got {pose.shape} and {covariance.shape}"
+        )
+    times, poses, surely = np.array([time_s - _BEFORE_S]), pose[None], covariance[None]
+    if len(known) > 0:
+        times, poses, surely = known[0].time_s, known[0].wTb, known[0].covariance_at(known[0].time_s)
+    stays = (times != time_s) & (times >= times[times <= since_s].max(initial=-np.inf))
+    times, poses = np.append(times[stays], time_s), np.append(poses[stays], pose[None], axis=0)
+    order, surely = np.argsort(times), np.append(surely[stays], covariance[None], axis=0)
+    goes = Trajectory(name, times[order], poses[order], surely[order])
+    cameras = [replace(each, carrier=name) if each is camera else each for each in rig.cameras]
+    return replace(rig, cameras=tuple(cameras), trajectories=(*others, goes))

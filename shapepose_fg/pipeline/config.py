@@ -120,7 +120,7 @@ class PipelineConfig(Settings):
     """Stage II: where the detector puts its joints on the body."""
     temporal: bool = True
     """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
-    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 96
+    batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 128
     """Frames that are solved together and returned: bodies are fitted fastest by the hundred. Fewer need less
     memory."""
 

@@ -1,9 +1,8 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -41,23 +40,7 @@ from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.presence import probability
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 
-P = ParamSpec("P")
-R = TypeVar("R")
 
-
-def _with_execution(function: Callable[P, R]) -> Callable[P, R]:
-    """`function`, which names `Execution` where it is given an argument that went there."""
-
-    @wraps(function)
-    def called(*arguments: P.args, **options: P.kwargs) -> R:
-        for name in {"workers", "cluster", "chunk_frames", "progress"} & options.keys():
-            raise TypeError(f"{name} is a part of what runs it now: give execution=Execution({name}=...)")
-        return function(*arguments, **options)
-
-    return called
-
-
-@_with_execution
 def reconstruct(
     detections: DetectionSequence,
     rig: Rig,

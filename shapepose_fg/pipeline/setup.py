@@ -64,11 +64,11 @@ class Setup:
         every = [frame for frame, _ in span.decided]
         given = [frame for frame in every if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
-        windows = self.config.windows
+        windows, rig = self.config.windows, self.rig if span.rig is None else span.rig
         rounds = windows.again_alone if span.alone else windows.again_over_time
         solution = solve_window(
             rows,
-            Views.of(self.rig, rows.time_s),
+            Views.of(rig, rows.time_s),
             self.fitter,
             self.estimator,
             assigning=Assigning(given, self.skeleton, rounds, over_time=not span.alone),
@@ -99,14 +99,14 @@ class Setup:
         else:
             notes.probable = Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
         if len(given) == len(every):
-            return Part(self._result(solution, given), notes)
+            return Part(self._result(solution, given, rig), notes)
         frame, time_s = np.array([each.frame for each in every]), np.array([each.time_s.mean() for each in every])
         key = np.array([each.key for each in every])
         motion = MotionModel.load(self.skeleton.joints, self.config.motion)
-        carried = with_rows_between(self._result(whole, given), frame, time_s, key, motion)
+        carried = with_rows_between(self._result(whole, given, rig), frame, time_s, key, motion)
         return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
 
-    def _result(self, solution: WindowSolution, given: Sequence[Input]) -> Reconstruction:
+    def _result(self, solution: WindowSolution, given: Sequence[Input], rig: Rig) -> Reconstruction:
         """The rows of a solution, which detections they are made of by their places in `given`."""
         frame, candidate = solution.observations.frame, solution.observations.candidate
         detections = {each.frame: each.detections for each in given}
@@ -114,7 +114,7 @@ class Setup:
         for number in np.unique(frame).tolist():
             of_frame = frame == number
             place[of_frame] = np.append(detections[number].place, -1)[candidate[of_frame]]
-        return solution.result(place, self.rig, self.skeleton.joints)
+        return solution.result(place, rig, self.skeleton.joints)
 
     def engine(self, book: Notebook) -> Engine:
         """Follows people; what it has to say goes into `book`."""

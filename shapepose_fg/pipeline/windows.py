@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Input
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
@@ -43,6 +44,8 @@ class Span:
     """The one after the last."""
     alone: bool = False
     """Whether every frame is a recording of its own."""
+    rig: Rig | None = None
+    """The cameras, where these are not known beforehand: they move, and it is said as it comes where to."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.pieces import project
 from shapepose_fg.core.skeleton import Skeleton
@@ -256,27 +256,44 @@ def claim(
         while end < first[slot + 1]:  # worlds stand one after the other, and do not compete
             of, length = world[person[end]], 0
             while end < first[slot + 1] and world[person[end]] == of:
-                taken[detection[end]] = -1
                 if likely[end]:
                     queue[length] = end
                     length += 1
                 end += 1
-            gap = length // 2
-            while gap > 0:  # sorted in Shell's way
-                for n in range(gap, length):
-                    moved, place = queue[n], n
-                    while place >= gap:
-                        e = queue[place - gap]
-                        if key[e] > key[moved] or (key[e] == key[moved] and e < moved):
-                            break
-                        queue[place] = e
-                        place -= gap
-                    queue[place] = moved
-                gap //= 2
-            for n in range(length):
-                a, d = person[queue[n]], detection[queue[n]]
-                if chosen[a, j, v] < 0 and taken[d] < 0:
-                    chosen[a, j, v], taken[d] = d, a
+            while length > 0:  # who are each other's best come together, and then who are of the rest
+                length = _together(queue, length, person, detection, key, taken, chosen, j, v)
+
+
+@part
+def _together(queue, length, person, detection, key, taken, chosen, j, v):
+    """Give each person whose best detection has nobody better that detection; returns how many of the `queue`,
+    rising, are left of others.
+
+    `taken` is the best for each detection, and -2 for those that are given.
+    """
+    for n in range(length):
+        taken[detection[queue[n]]] = -1
+    for n in range(length):
+        e, d = queue[n], detection[queue[n]]
+        if taken[d] < 0 or key[e] > key[taken[d]]:
+            taken[d] = e
+    n = 0
+    while n < length:
+        a, best = person[queue[n]], queue[n]
+        while n < length and person[queue[n]] == a:
+            if key[queue[n]] > key[best]:
+                best = queue[n]
+            n += 1
+        if taken[detection[best]] == best:
+            chosen[a, j, v] = detection[best]
+            taken[detection[best]] = -2
+    left = 0
+    for n in range(length):
+        e = queue[n]
+        if chosen[person[e], j, v] < 0 and taken[detection[e]] != -2:
+            queue[left] = e
+            left += 1
+    return left
 
 
 @kernel("i1 i1 i1 f1 f1 i3")

@@ -135,17 +135,16 @@ def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Ind
     who = chosen.hypothesis[here]
     own = found.candidate[who, t].astype(np.intp)
     evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
-    return replace(observed(given, own, found.places[who, t], identity[here]), evidence=evidence)
+    return observed(given, own, found.places[who, t], identity[here], evidence)
 
 
-def observed(given: Input, candidate: Index, places: Array, track: Index) -> Observations:
+def observed(
+    given: Input, candidate: Index, places: Array, track: Index, evidence: Array | None = None
+) -> Observations:
     """People at `places` (P, J, 3), metres, with their detections (P, J, V) as rows of a frame; -1 for none."""
-    return replace(
-        Observations.of(candidate, given.detections, places),
-        track=track,
-        frame=np.full(len(track), given.frame),
-        time_s=np.repeat(given.time_s[None], len(track), axis=0),
-    )
+    frame, time_s = np.full(len(track), given.frame), np.repeat(given.time_s[None], len(track), axis=0)
+    told = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
+    return Observations.of(candidate, given.detections, places, **told)
 
 
 def _identities(

@@ -1,7 +1,6 @@
 """Detections are reassociated, once it is known where people's joints are."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -53,9 +52,9 @@ def reassociate(
                 break
             index, evidence = index[~gone], evidence[~gone]
             candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
-        part = Observations.of(candidate, frame.detections, joints[index])
         who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
-        parts.append(replace(part, probability=probability, evidence=evidence, **who))
+        sure = {"probability": probability, "evidence": evidence}
+        parts.append(Observations.of(candidate, frame.detections, joints[index], **who, **sure))
     return Observations.concatenate(parts)
 
 

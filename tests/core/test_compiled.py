@@ -1,6 +1,7 @@
 """Kernels: compiled anew when they change, and said so when they are."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -28,26 +29,32 @@ for score in ([0.5, 0.2], [0.1, 0.2]):
 
 
 def test_a_kernel_is_compiled_anew_when_a_file_has_changed_that_it_calls_into(tmp_path):
-    """Its own file, or one whose part it calls by way of another; else it is read from the cache."""
+    """Its own file, or one whose part it calls by way of another; else it is read from the cache, wherever it
+    stands.
+    """
     compiled = "from shapepose_fg.core.compiled import kernel, part\n"
     files = {
         "inner": compiled + "@part\ndef twice(x):\n    return 2 * x\n",
         "outer": compiled + "from inner import twice\n@part\ndef more(x):\n    return twice(x) + 1\n",
         "own": compiled + "from outer import more\n@kernel('f0')\ndef run(x):\n    return more(x)\n",
     }
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
     for name, text in files.items():
-        (tmp_path / f"{name}.py").write_text(text)
+        (here / f"{name}.py").write_text(text)
     program = "from own import run; print(run(10.0), sum(run.stats.cache_hits.values()))"
-    where = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
 
-    def said() -> str:
+    def said(folder: Path = here) -> str:
+        where = {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
         run = [sys.executable, "-B", "-c", program]
         done = subprocess.run(run, capture_output=True, text=True, timeout=120, check=True, env=os.environ | where)
         return done.stdout.strip()
 
     assert [said(), said()] == ["21.0 0", "21.0 1"]
-    (tmp_path / "inner.py").write_text(files["inner"].replace("2 * x", "3 * x"))
+    shutil.copytree(here, there)
+    (here / "inner.py").write_text(files["inner"].replace("2 * x", "3 * x"))
     assert [said(), said()] == ["31.0 0", "31.0 1"]
+    assert said(there) == "21.0 1"
 
 
 def test_compiling_is_logged_once_and_not_when_it_is_read_from_the_cache(tmp_path):

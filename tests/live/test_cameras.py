@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.live.cameras import CameraState
+from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.online import OnlineReconstructor
 from shapepose_fg.live.views import joined
 
@@ -89,3 +89,18 @@ def test_who_leaves_and_comes_back_is_the_same_person(five_cameras, steps):
     assert people.person.tolist() == [0, 1]
     # Away for 1.5 s; known again when ten frames have shown how long their bones are.
     assert there[45] == [0, 1] and sum(2 in each for each in there) == 0
+
+
+def test_a_camera_that_sees_one_of_five_people_or_somebody_else_agrees(five_cameras, two_people, seen_exactly):
+    others = [two_people[:1] + np.array([x, y, 0.0]) for x, y in ((0.9, 0.9), (-0.9, 0.9), (0.2, -0.9))]
+    places, watch = np.concatenate([two_people, *others]), CameraWatch.of(len(five_cameras))
+    every, one = seen_exactly(five_cameras, places), seen_exactly(five_cameras, two_people[:1])
+    few = joined([every.only(every.view != 2), one.only(one.view == 2)])
+    apart_m = watch.compared(few, places, five_cameras, 0.1).apart_m
+    assert (apart_m < 0.005).all()
+    # A fifth of the detections are of the one who is known.
+    apart_m = watch.compared(every, two_people[:1], five_cameras, 0.1).apart_m
+    assert (apart_m < 0.005).all()
+    bumped = replace(few, xy=few.xy + np.where(few.view == 2, 80.0, 0.0)[:, None])
+    apart_m = watch.compared(bumped, places, five_cameras, 0.1).apart_m
+    assert apart_m[2] > 0.1 and (np.delete(apart_m, 2) < 0.005).all()

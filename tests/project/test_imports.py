@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.compiled core.errors core.moved",
+    "factors core.arrays core.compiled core.errors",
     "core.skeleton core.pieces core.assignment core.lens core.trajectory",
     "core.camera",
     "core.drawing",

@@ -50,7 +50,8 @@ def settle(monkeypatch):
     """Sets constants by the names that they have in `DEFAULTS`."""
 
     def settle(**settings):
-        for module, name in ((view_assignment, "_assign"), (view_assignment, "claim"), (view_assignment, "share")):
+        kernels = [(view_assignment, name) for name in ("_assign", "claim", "share")]
+        for module, name in [*kernels, (nearby, "_together")]:
             # As Python runs it: constants are compiled in.
             monkeypatch.setattr(module, name, getattr(getattr(module, name), "py_func", getattr(module, name)))
         for name, value in settings.items():

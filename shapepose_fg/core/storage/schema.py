@@ -5,7 +5,7 @@ made: `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, ClassVar, Self, cast, get_type_hints
 
 import numpy as np
@@ -40,11 +40,16 @@ class Column:
     @property
     def has_rows(self) -> bool:
         """Whether it has an entry per row."""
-        return self.axes.split()[0] == "N"
+        return self._lengths[0] == "N"
+
+    @cached_property
+    def _lengths(self) -> tuple[int | str, ...]:
+        """A number or a letter for each axis."""
+        return tuple(int(axis) if axis.isdecimal() else axis for axis in self.axes.split())
 
     def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
         """Its shape where letters have these lengths."""
-        return tuple(int(axis) if axis.isdecimal() else sizes.get(axis, 0) for axis in self.axes.split())
+        return tuple(sizes.get(each, 0) if isinstance(each, str) else each for each in self._lengths)
 
     def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
         """`value` as an array of the column's shape and type; ValueError naming the column where it is not.
@@ -56,10 +61,13 @@ class Column:
         if value is None and self.missing is not None:
             value = np.full(self.shape(sizes), self.missing, dtype=wanted)
         array = np.asarray(value)
-        for axis, length in zip(self.axes.split(), array.shape, strict=False):
-            sizes.setdefault(axis, length)
+        for axis, length in zip(self._lengths, array.shape, strict=False):
+            if isinstance(axis, str):
+                sizes.setdefault(axis, length)
         if array.shape != self.shape(sizes):
             raise ValueError(f"{name} must be {self.shape(sizes)}, got {array.shape}")
+        if array.dtype == wanted and self.codes is None:
+            return array
         if array.dtype.kind not in _ALLOWED[wanted.kind] and array.size > 0:
             raise ValueError(f"{name} must hold {wanted} values, got {array.dtype}")
         if wanted.kind in "iu" and array.size > 0 and array.dtype != wanted:

@@ -1,21 +1,28 @@
 """What one camera saw in one picture as a line of JSON: OpenPose's frame, with camera and time beside it."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Len
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import parse_json
+from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.detections.people import OVERSHOOT, joints_of_people
 from shapepose_fg.io.detections.view_streams import undistorted
 from shapepose_fg.io.validation import validated
 
-_CURE = 'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}'
+_CURE = (
+    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and of a'
+    ' camera that moves "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
+)
+_Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
+_Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
 
 
 class _Person(BaseModel):
@@ -28,15 +35,24 @@ class _Line(BaseModel):
     camera: str
     time_s: Annotated[FiniteFloat, Field(ge=-1e12, le=1e12)]
     people: list[_Person]
+    pose: Annotated[list[_Row4], Len(4, 4)] | None = None
+    pose_covariance: Annotated[list[_Row6], Len(6, 6)] | None = None
 
 
-def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[str, Detections, float]:
-    """The camera, what it saw, undistorted, and when, seconds; joints far outside the picture are left out.
+def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[Any, ...]:
+    """What `OnlineReconstructor.push_view` takes: the camera, what it saw, undistorted, when, seconds, and its
+    pose with covariance, None where the line has none. Joints far outside the picture are left out.
 
     InputError naming the `place` of a line that is none.
     """
     line = validated(_Line, parse_json(text.strip(), Path(place)), place, _CURE)
-    return view_of(line.camera, line.time_s, [one.pose_keypoints_2d for one in line.people], place, rig, skeleton)
+    people = [one.pose_keypoints_2d for one in line.people]
+    pose, surely = (None if each is None else np.array(each) for each in (line.pose, line.pose_covariance))
+    if pose is not None:
+        with naming(place, _CURE):
+            both = None if surely is None else np.stack([surely, surely])
+            Trajectory(line.camera, np.arange(2.0), np.stack([pose, pose]), both)
+    return *view_of(line.camera, line.time_s, people, place, rig, skeleton), pose, surely
 
 
 def view_of(
