@@ -23,6 +23,7 @@ _HELD = 1e-6
 """Sigma of what must not change, as a part of what it would be."""
 _HELD_PX = 0.1
 """The same of what lenses hold, pixels; tighter constraints of single numbers would damp what they share."""
+_ANYWHERE_M = 10.0
 _STEPS = 6
 _ENOUGH = 1e-4
 _PRIOR_WIDTH = 4.0
@@ -131,6 +132,10 @@ def adjust(
     moved = np.full_like(people.points, np.nan)
     moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
     placed = replace(people, points=moved)
+    # A joint that went behind a camera tells nothing, not even where it is.
+    depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
+    for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
+        graph.addPriorPoint3(each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M))
     information = _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
     covariance = _covariance(information, rig, freedom.sigmas, reference, scaled)
     return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))

@@ -17,7 +17,7 @@ from shapepose_fg.calibration.levelling import World, levelled, scale_of, scaled
 from shapepose_fg.calibration.people import Footage, People, missed_px
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.calibration.relative import Relative, relative
-from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.calibration.tracks import OneClock, Tracks, seen_at
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -71,6 +71,8 @@ class Calibrated:
     """(V,) people, one per frame, by whom each camera was placed."""
     explained: Array
     """(V,) which part of the people that each saw another camera saw too."""
+    missed_px: Array
+    """(N, V) the same distances one by one; NaN where unknown."""
     notes: tuple[str, ...] = field(default=())
     """What is weak, a sentence each."""
 
@@ -103,18 +105,20 @@ class Calibrated:
 
 
 def calibrate(
-    detections: DetectionSequence,
+    detections: DetectionSequence | OneClock,
     rig: Rig,
     times: FrameTimes,
     frames: range,
     focal: float = 0.0,
     stature_m: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    start: Rig | None = None,
 ) -> Calibrated:
     """Where the cameras of `rig` stand, whose poses are not looked at, by the people whom `detections` show.
 
     `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The people's median stature is
-    `stature_m`, or that of adults. Undetermined where cameras share too little, or motion does not tell.
+    `stature_m`, or that of adults. Cameras that are about as in `start` are not sought. Undetermined where cameras
+    share too little, or motion does not tell.
     """
     views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
     done = 0
@@ -124,28 +128,31 @@ def calibrate(
         done += more
         progress(done, total)
 
-    pairs = _pairs(detections, rig, times, frames, told)
-    if len(connected := parts(pairs, views)) > 1:
-        raise Undetermined(tuple(_apart(rig, connected)))
-    edges = {pair: _edge(each, detections.skeleton, stature_m) for pair, each in pairs.items()}
-    now = _posed(rig, arranged(edges, views))
     footage, freedom = Footage.of(detections, rig, times, frames), replace(_FREE, focal=focal)
     taken = np.unique(footage.sightings.frame)
     how = _How(rig, times, freedom, detections.skeleton, stature_m, told)
-    few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
-    adjusted = how.settled(footage, how.settled(few, now, _ROUGH).rig, _ROUNDS)
+    if start is None:
+        pairs = _pairs(detections, rig, times, frames, told)
+        if len(connected := parts(pairs, views)) > 1:
+            raise Undetermined(tuple(_apart(rig, connected)))
+        edges = {pair: _edge(each, detections.skeleton, stature_m) for pair, each in pairs.items()}
+        few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
+        start = how.settled(few, _posed(rig, arranged(edges, views)), _ROUGH).rig
+    adjusted = how.settled(footage, start, _ROUNDS)
     halves, missed = list[Rig](), list[Array]()
     for used, left in (both := np.array_split(taken, 2)), both[::-1]:
         half = how.settled(footage.at(used), adjusted.rig, _HALF_ROUNDS).rig
         away = missed_px(footage.at(left).people(half), half)
         halves.append(half)
-        missed.append(away[np.isfinite(away)])
+        missed.append(away.reshape(-1, len(rig)))
     new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, stature_m is not None)
-    return _judged(replace(adjusted, rig=new), world, halves, np.concatenate(missed), footage)
+    moved = new.cameras[0].wTc @ np.linalg.inv(adjusted.rig.cameras[0].wTc)
+    people = replace(adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3])
+    return _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
 
 
 def _pairs(
-    detections: DetectionSequence, rig: Rig, times: FrameTimes, frames: range, told: Callable[[], None]
+    detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range, told: Callable[[], None]
 ) -> dict[tuple[int, int], Relative]:
     """How cameras stand to each other, of pairs that tell."""
     taken = times.frame_s[frames.start : frames.stop]
@@ -153,7 +160,18 @@ def _pairs(
     fps = (len(taken) - 1) / max(lasts, 1e-6)
     after = taken[:, None] - taken[0] - np.linspace(0.0, max(lasts - _BURST_S, 0.0), _BURSTS)
     wanted = frames.start + np.flatnonzero(((after >= 0) & (after <= _BURST_S)).any(axis=1))
-    sightings = Sightings.of(detections, wanted.tolist())
+    tracks = own_tracks(seen_at(detections, wanted.tolist()), rig, fps)
+    found = dict[tuple[int, int], Relative]()
+    for a, b in combinations(range(len(rig)), 2):
+        each = relative(tracks[a], tracks[b], fps)
+        told()
+        if each is not None and each.score >= _LEAST_SCORE and each.seconds >= _LEAST_S:
+            found[a, b] = each
+    return found
+
+
+def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
+    """The tracks of each camera, in its own frame; Undetermined where one sees hardly anybody."""
     problems = [
         f"camera {name}: it sees {count} people, one per frame, {_LEAST_SEEN} are the least; {_FILM}"
         for view, name in enumerate(rig.names)
@@ -162,14 +180,7 @@ def _pairs(
     if problems:
         raise Undetermined(tuple(problems))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
-    tracks = [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
-    found = dict[tuple[int, int], Relative]()
-    for a, b in combinations(range(len(rig)), 2):
-        each = relative(tracks[a], tracks[b], fps)
-        told()
-        if each is not None and each.score >= _LEAST_SCORE and each.seconds >= _LEAST_S:
-            found[a, b] = each
-    return found
+    return [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
 
 
 def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
@@ -252,8 +263,8 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
     apart_deg, apart_m = _apart_by(*halves)
     counts = people.seen.any(axis=1).sum(axis=0)
     seen = np.bincount(footage.sightings.view, minlength=len(rig))
-    held = float(np.median(missed)) if len(missed) > 0 else np.nan
-    found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1))
+    held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan
+    found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed)
     sigma = np.degrees(adjusted.sigma(TURN))
     problems = list[str]()
     for view, name in enumerate(rig.names):

@@ -1,10 +1,12 @@
 """Offsets of three cameras or more: where the others place a joint, and how it moves, against what each sees."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
@@ -15,6 +17,7 @@ _MOST_PLACED = 20_000
 """Rows of tracks of all cameras that are placed in space."""
 _LEAST_MISS = 0.004
 """No detector misses by less than this part of a person's size: 7 mm."""
+_REWEIGHED = 10
 _FASTEST = 2.5
 """Statures a second: joints that move faster have changed their person."""
 
@@ -39,8 +42,11 @@ class InSpace:
     """Frames a second."""
 
     @classmethod
-    def of(cls, tracks: list[Tracks], views: Views, shift: Array, fps: float) -> "InSpace":
-        """People at times one after the other, as many as pay."""
+    def of(cls, pairwise: Pairwise) -> "InSpace":
+        """People at times one after the other, as many as pay; tracks that most others of the person are not are
+        left out: two who dance are nearer to each other than what a camera sees of one may be.
+        """
+        tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))
         low = min(int((each.frame - at).min(initial=0)) for each, at in zip(tracks, shift, strict=True))
         high = max(int((each.frame - at).max(initial=0)) for each, at in zip(tracks, shift, strict=True))
@@ -66,6 +72,14 @@ class InSpace:
         seen, whose = seen.only(enough), whose[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
         member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
+        agree = np.zeros(member.shape)
+        for a, b in combinations(range(len(tracks)), 2):
+            same = np.zeros((len(tracks[a].first) + 1, len(tracks[b].first) + 1))
+            same[tuple(np.array(pairwise.same(a, b), dtype=np.intp).reshape(-1, 2).T)] = 1.0
+            both = same[member[:, a], member[:, b]]
+            agree[:, a] += both
+            agree[:, b] += both
+        member[2 * agree < (member >= 0).sum(axis=1, keepdims=True) - 1] = -1
         many = (member >= 0).sum(axis=1) >= 3
         return cls(tracks, views, shift, times[groups.frame[many]], member[many], step, fps)
 
@@ -124,7 +138,7 @@ class InSpace:
         order = np.lexsort((self.time, self.member[:, view]))
         order = order[self.member[order, view] >= 0]
         starts = np.flatnonzero(np.diff(self.member[order, view])) + 1
-        off, change, own, now, weights = [], [], [], [], []
+        off, change, own, now, weights, whom = [], [], [], [], [], []
         for rows in np.split(order, starts):
             at = (self.time[rows] - self.time[rows[0]]) // self.step if len(rows) > 0 else rows
             if len(rows) < 6:
@@ -149,6 +163,7 @@ class InSpace:
             change.append(np.nan_to_num(calm))
             own.append(np.nan_to_num(fast))
             now.append(self.time[rows])
+            whom.append(self.member[rows, view])
         if not off:
             return 0.0, np.inf
         miss, calm, fast, time = (np.concatenate(each) for each in (off, change, own, now))
@@ -158,10 +173,17 @@ class InSpace:
         if (gain := float(gains.sum())) <= 0:
             return 0.0, np.inf
         score = (weight * (calm * miss).sum(axis=-1)).sum(axis=1)
-        late = score.sum() / gain
-        score = score - late * gains
         block = block_frames(self.fps, float(np.ptp(time)))
-        sums = np.bincount(((time - time.min()) // block).astype(np.intp), score)
+        when = ((time - time.min()) // block).astype(np.intp)
+        (when, _), each = np.unique(np.stack([when, np.concatenate(whom)]), axis=1, return_inverse=True)
+        score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
+        late, trust = score.sum() / gain, np.ones(len(score))
+        for _ in range(_REWEIGHED):
+            away = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
+            trust = 1 / (1 + (away / (2.0 * max(1.5 * float(np.median(away)), 1e-12))) ** 2)
+            late = (trust * score).sum() / (trust * gains).sum()
+        sums = np.bincount(when, trust * (score - late * gains))
+        sums, gain = sums[np.unique(when)], float((trust * gains).sum())
         return float(late), float((sums**2).sum() / gain**2 * len(sums) / max(len(sums) - 1, 1))
 
 

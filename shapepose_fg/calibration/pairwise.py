@@ -31,8 +31,8 @@ class Pairwise:
     fps: float
     """Frames a second."""
 
-    def matched(self, a: int, b: int, gate: float = _GATE) -> tuple[Index, Index]:
-        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same person."""
+    def same(self, a: int, b: int, gate: float = _GATE) -> list[tuple[int, int]]:
+        """Tracks of camera a and of camera b that are one person, over all the time that both last."""
         one, other, apart = self.tracks[a], self.tracks[b], self.shift[b] - self.shift[a]
         stride = max(1, round(0.1 * self.fps))
         rows = np.arange(0, len(one.frame), stride)
@@ -60,7 +60,11 @@ class Pairwise:
                         return True
             return False
 
-        pairs = [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
+        return [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
+
+    def matched(self, a: int, b: int) -> tuple[Index, Index]:
+        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same person."""
+        one, pairs = self.tracks[a], self.same(a, b)
         stop = np.append(one.first[1:], len(one.frame))
         rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
         whom = [np.full(len(each), pair[1]) for each, pair in zip(rows, pairs, strict=True)]
@@ -120,7 +124,7 @@ class Pairwise:
                 pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
                 both = np.where(known, np.clip(miss, -width, width), 0.0), np.where(known, change, 0.0)
                 smooth = FAST_S * self.fps / pace
-                miss, change = _fast(both, known, self.tracks[a].track[rows], track, smooth)
+                miss, change = fast_part(both, known, self.tracks[a].track[rows], track, smooth)
                 width = 3.8 * np.median(np.abs(miss[known]))
                 weight = np.where(known, 1 / (1 + (miss / width) ** 2), 0.0) / width**2
                 own, score = (weight * change**2).sum(), (weight * change * miss).sum(axis=1)
@@ -145,7 +149,7 @@ class Pairwise:
         return shift, covariance
 
 
-def _fast(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
+def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
     """Values (N, J) less their means over the time around, track by track: errors that last are in these."""
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1

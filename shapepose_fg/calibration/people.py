@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shapepose_fg.calibration.tracks import OneClock, seen_at
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -59,14 +60,14 @@ class Footage:
     """(J,) names of the joints."""
 
     @classmethod
-    def of(cls, detections: DetectionSequence, rig: Rig, times: FrameTimes, frames: range) -> "Footage":
+    def of(cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range) -> "Footage":
         """At frames spread over the recording, as many as tell something new."""
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])
         count = max(2, min(_MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
         wanted = np.searchsorted(taken, taken[0] + np.linspace(0.0, lasts, count)).clip(0, len(taken) - 1)
         chosen = frames.start + np.unique(wanted)
-        sightings = Sightings.of(detections, chosen.tolist())
+        sightings = seen_at(detections, chosen.tolist())
         thin = -(-len(sightings) // _MOST_SIGHTINGS)
         sightings = sightings.only(np.isin(sightings.frame, chosen[::thin]))
         xy = sightings.xy.copy()

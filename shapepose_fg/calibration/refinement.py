@@ -58,6 +58,10 @@ class Refinement:
     """(V,) people, one per frame, by whom each camera was adjusted."""
     notes: tuple[str, ...] = field(default=())
     """What motion does not determine, a sentence each."""
+    missed_px: tuple[Array, Array] = (np.zeros((0, 1)), np.zeros((0, 1)))
+    """(N, V) how far detections on frames that were not used are from where the other cameras put the joint, with
+    the given cameras and the refined; NaN where unknown.
+    """
     stature_m: float = float("nan")
     """Median of the people's statures as their bones say, in the adjusted cameras' metres."""
 
@@ -144,17 +148,18 @@ def refine(
             people = footage.at(left).people(found[-1].rig)
             both = [missed_px(people, each) for each in (rig, found[-1].rig)]
             known = np.isfinite(both[0]) & np.isfinite(both[1])
-            before.append(both[0][known])
-            after.append(both[1][known])
-    if sum(map(len, before)) == 0:
+            for kept, each in zip((before, after), both, strict=True):
+                kept.append(np.where(known, each, np.nan).reshape(-1, len(rig)))
+    missed = (np.concatenate(before), np.concatenate(after))
+    if not np.isfinite(missed[0]).any():
         raise InputError(
             "no joint is seen by three cameras, on frames that were not used; refining cannot be tried"
         )
-    was, now = (float(np.median(np.concatenate(each))) for each in (before, after))
+    was, now = (float(np.nanmedian(each)) for each in missed)
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
     stature = build_of(found[0].people.points, detections.skeleton).stature
     notes = tuple(_undetermined(found[0], freedom, counts))
-    return Refinement(rig, found[0], freedom, was, now, counts, notes, stature)
+    return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature)
 
 
 def _found_again(detections: DetectionSequence, rig: Rig, frames: range) -> Rig:

@@ -37,7 +37,7 @@ _WORST_S = 0.05
 """An offset that is not known to this is not known."""
 _WIDER = 1.5
 """Sigmas are multiplied by this: as they come, fewer than 90 % of 95 % regions hold, on Shelf and simulated."""
-_WHOLE_S, _END_S, _DRIFT_S = 180.0, 60.0, 2.0
+WHOLE_S, _END_S, _DRIFT_S = 180.0, 60.0, 2.0
 """Of longer recordings the first seconds are looked at; and the last, for a drift of up to so many."""
 
 
@@ -100,21 +100,23 @@ def synchronise(
 
     In recordings of over four minutes the drift, too. InputError where a camera sees nobody.
     """
-    whole, end = round(_WHOLE_S * fps), round(_END_S * fps)
+    whole, end = round(WHOLE_S * fps), round(_END_S * fps)
     first = frames if len(frames) <= whole + end else frames[:whole]
-    offset, sigma, sure = _offsets(detections, rig, fps, first, most_s, np.zeros(len(rig)), progress)
+    seen = Sightings.of(detections, first)
+    offset, sigma, sure = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
     middle, none = (first.start + first.stop) / 2 / fps, np.zeros(len(rig))
     if len(first) == len(frames):
         return Synchronised(offset, sigma, sure, none, none, middle)
-    later, later_sigma, _ = _offsets(detections, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
+    seen = Sightings.of(detections, frames[-end:])
+    later, later_sigma, _ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
     lasts = (frames.stop - end / 2) / fps - middle
     return Synchronised(
         offset, sigma, sure, (later - offset) / lasts, np.hypot(sigma, later_sigma) / lasts, middle
     )
 
 
-def _offsets(
-    detections: DetectionSequence,
+def offsets(
+    sightings: Sightings,
     rig: Rig,
     fps: float,
     frames: range,
@@ -122,9 +124,10 @@ def _offsets(
     around_s: Array,
     progress: Callable[[int, int], None],
 ) -> tuple[Array, Array, Array]:
-    """Offsets (V,) within `most_s` of those `around_s`, their sigmas, and how far they stand out."""
+    """Offsets (V,) within `most_s` of those `around_s`, their sigmas, and how far they stand out, from all that
+    was seen in `frames`.
+    """
     views = Views.of(rig)
-    sightings = Sightings.of(detections, frames)
     for view, name in enumerate(rig.names):
         if (sightings.view == view).sum() < _LEAST_SEEN:
             raise InputError(f"camera {name}: hardly anybody is seen: nothing says when it exposed its frames")
@@ -146,7 +149,7 @@ def _offsets(
     fine = fine.nearest(2.0 * step, 1.0).nearest(2.0, 0.25)
     shift, covariance = fine.solved()
     if len(rig) > 2:
-        shift, covariance = InSpace.of(tracks, views, shift, fps).settled()
+        shift, covariance = InSpace.of(replace(fine, shift=shift)).settled()
     offset = -(shift + start)
     offset = offset - offset[0]
     return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, sure

@@ -1,5 +1,6 @@
 """People of one camera followed from frame to frame in its picture, before anything is known of other cameras."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,8 @@ from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, median_of, rays_of
 
 _SAME = 0.08
@@ -81,6 +84,58 @@ class Tracks:
             np.concatenate([none, *(change for _, change in every)]),
             np.concatenate([np.zeros(0), *sizes]),
         )
+
+
+@dataclass(frozen=True)
+class OneClock:
+    """What cameras saw that were started at different times, at moments of one clock."""
+
+    skeleton: Skeleton
+    """The detector's."""
+    sightings: Sightings
+    """`frame` is a moment of the common clock, 0 or later."""
+    frames: range
+    """Moments at which two cameras run, or more."""
+
+    def at(self, frames: Iterable[int]) -> Sightings:
+        """What was seen at some moments."""
+        return self.sightings.only(np.isin(self.sightings.frame, np.fromiter(frames, np.intp)))
+
+
+def on_one_clock(sightings: Sightings, following: Index, shift: Array, skeleton: Skeleton) -> OneClock:
+    """The sightings at moments: camera v's frame of moment t is t + shift[v], on a line between its two frames.
+
+    `following` (S,) is the sighting of the same person in the next frame (`next_of`).
+    """
+    whole = np.floor(shift).astype(np.intp)
+    part = (shift - whole)[sightings.view]
+    rows = np.flatnonzero((part == 0) | (following >= 0))
+    far, part = np.where(part == 0, np.arange(len(part)), following)[rows], part[rows, None]
+    xy = (1 - part)[..., None] * sightings.xy[rows] + part[..., None] * sightings.xy[far]
+    confidence = np.minimum(sightings.confidence[rows], sightings.confidence[far])
+    view, frame = sightings.view[rows], sightings.frame[rows] - whole[sightings.view[rows]]
+    frame = frame - frame.min(initial=np.iinfo(np.intp).max)
+    ends = [(int(frame[view == v].min()), int(frame[view == v].max())) for v in np.unique(view)]
+    begin, end = sorted(first for first, _ in ends)[1:2], sorted(last for _, last in ends)[-2:-1]
+    span = range(begin[0], end[0] + 1) if begin else range(0)
+    return OneClock(skeleton, Sightings(frame, view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0)), span)
+
+
+def next_of(sightings: Sightings) -> Index:
+    """(S,) the sighting of the same person in the camera's next frame; -1 for none."""
+    following = np.full(len(sightings), -1, dtype=np.intp)
+    for view in np.unique(sightings.view):
+        rows = np.flatnonzero(sightings.view == view)
+        for track in _followed(sightings.only(rows)):
+            one, other = rows[track[:-1]], rows[track[1:]]
+            near = sightings.frame[other] - sightings.frame[one] == 1
+            following[one[near]] = other[near]
+    return following
+
+
+def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -> Sightings:
+    """The 2D people of some frames, or moments."""
+    return detections.at(frames) if isinstance(detections, OneClock) else Sightings.of(detections, frames)
 
 
 def _followed(seen: Sightings) -> list[Index]:

@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
 
+from shapepose_fg.cli.found_cameras import check_most, report_option, show_clocks, write_page
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
     RESULT,
+    TIME,
     RateOptions,
     grouped,
     json_option,
@@ -71,42 +74,80 @@ def calibrate(
         _CAMERAS, "People's median stature in metres; without it that of adults, 1.70."
     ),
     output: Path = option(RESULT, "File for the cameras, our own JSON.", REQUIRED),
+    times: Path | None = option(
+        TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
+    ),
+    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", 60.0),
+    report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
     """Find where cameras stand by the people whom they see; lenses must be known, or guessed.
 
-    Film a minute: cameras still and synchronised, each sharing part of its picture with another; two or more
-    people who walk through all views, near and far, arms raised at times, not on one line. Exit code 1 where
-    that does not determine the cameras; nothing is written then.
+    Film a minute: cameras still, each sharing part of its picture with another; two or more people who walk
+    through all views, near and far, arms raised at times, not on one line. Exit code 1 where that does not
+    determine the cameras; nothing is written then.
     """
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
+    from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
+    from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.calibration import write_rig
+    from shapepose_fg.io.timestamps import write_timestamps
 
     if stature is not None and not 0.5 <= stature <= 2.5:
         raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
+    check_most(most)
+    if times is not None and rate.timestamps is not None:
+        raise InputError("--times and --timestamps: when frames were taken is sought, or known; give one of them")
     off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
     rig = seen.rig()
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, times, span = rate.part(seen.detections, seen.skeleton, rig, Path(folder))
+        part = rate.part(seen.detections, seen.skeleton, rig, Path(folder), own_frames=times is not None)
+        recording, known, span = part
+        fps, clocks = rate_of(known.frame_s), None
         try:
             with progress("calibrating", "steps") as done:
-                found = calibrate(recording, rig, times, span, off, stature, done)
+                if times is None:
+                    found = calibrate(recording, rig, known, span, off, stature, done)
+                else:
+                    found, clocks = calibrate_unsynchronised(recording, rig, fps, span, most, off, stature, done)
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
     note(*found.notes)
     write_rig(found.rig, output)
+    if times is not None and clocks is not None:
+        write_timestamps(times, rig.names, known.of_views(len(rig)) + clocks.offset_s)
+    heads, rows = _figures(found, focal)
+    lines = [_CAPTION, *_world(found, stature)]
+    if report is not None:
+        people, figures = found.adjusted.people, (heads, rows, {"joint, px": found.missed_px})
+        # Moments of one clock that was found begin at 0.
+        time_s = known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps
+        write_page(report, found.rig, None, people, time_s, recording.skeleton, figures, lines, found.notes)
     if as_json:
-        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        told = found.as_dict() | ({} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]})
+        print(json.dumps(told, indent=2, allow_nan=False))
     else:
-        _show(found, focal, stature)
+        show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
+        print("\n".join(lines[1:]))
+        given = rate.given()
+        if times is not None and clocks is not None:
+            show_clocks(clocks, rig)
+            print(f"{times}: times of {len(recording)} frames")
+            given = {"--timestamps": times}
         print(f"{output}: our own rig file")
         options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
-        print(next_reconstruct(options | rate.given() | {"--output": "results"}))
+        print(next_reconstruct(options | given | {"--output": "results"}))
 
 
-def _show(found: "Calibrated", focal: bool, stature: float | None) -> None:
-    """The cameras, and how surely they are known."""
+_CAPTION = (
+    "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too;"
+    " halves: how far apart the two halves of the recording place it"
+)
+
+
+def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """The cameras, and how surely they are known: heads, and each camera's figures."""
     heads = ["people", "shared", "x y z, m", "turn ± °", "place ± mm", "halves, °"] + ["focal, px"] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
@@ -114,15 +155,17 @@ def _show(found: "Calibrated", focal: bool, stature: float | None) -> None:
         figures = [str(each["people"]), f"{each['shared']:.0%}", place, f"{each['sigma_turn_deg']:.2f}"]
         figures += [f"{each['sigma_move_mm']:.0f}", f"{each['halves_turn_deg']:.2f}"]
         figures += [f"{each['focal_px']:.0f} ± {each['sigma_focal_percent']:.1f} %"] * focal
-        rows.append((each["camera"], *figures))
-    caption = (
-        "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too;"
-        " halves: how far apart the two halves of the recording place it"
-    )
-    show(table(("camera", *heads), rows, caption=caption))
+        rows.append((each["camera"], figures))
+    return heads, rows
+
+
+def _world(found: "Calibrated", stature: float | None) -> list[str]:
+    """Scale, up and fit, a line each."""
     whose = f"people of {stature:g} m" if stature is not None else "adults of 1.70 m in the median"
     world = found.world
-    print(f"scale: {whose}, {world.persons} at once: ± {100 * world.sigma_scale:.1f} %, one sigma")
     level = "from feet on the floor" if world.floor is not None else "from bodies alone, no level floor was found"
-    print(f"up: z, {level}; the floor is at 0")
-    print(f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px")
+    return [
+        f"scale: {whose}, {world.persons} at once: ± {100 * world.sigma_scale:.1f} %, one sigma",
+        f"up: z, {level}; the floor is at 0",
+        f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px",
+    ]

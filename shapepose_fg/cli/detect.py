@@ -1,5 +1,6 @@
-"""The command `detect`: videos or pictures of calibrated cameras to 2D detections."""
+"""The command `detect`: videos or pictures of cameras, calibrated or not yet, to 2D detections."""
 
+import shlex
 import time
 from dataclasses import dataclass, replace
 from functools import partial
@@ -87,8 +88,8 @@ def detect(
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: by RTMPose, or another network in ONNX.
 
-    Pictures of rolled cameras are turned upright first; the calibration knows how. A run that is stopped goes on
-    where it was when it is started again.
+    Pictures of rolled cameras are turned upright first; the calibration knows how. Without one the cameras are
+    called as their videos, for `calibrate`. A run that is stopped goes on where it was when it is started again.
     """
     if project is not None:
         from shapepose_fg.io.pose2sim_project import footage_of
@@ -103,11 +104,13 @@ def detect(
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
     from shapepose_fg.io.footage.placement import placements_of
+    from shapepose_fg.io.lenses import pictures_only
 
-    rig = cameras.rig()
+    known = cameras.rig() if cameras.calibration is not None else None
     loaded = network.load()
-    footage = pictures.opened(rig)
-    sizes = {name: each.size for name, each in zip(rig.names, footage, strict=True)}
+    opened = pictures.opened(None if known is None else known.names)
+    footage, sizes = list(opened.values()), {name: each.size for name, each in opened.items()}
+    rig = known or pictures_only(list(sizes), list(sizes.values()))
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     note(*concluded)
     moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
@@ -131,7 +134,7 @@ def detect(
         if failed > 0:
             note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; nothing is detected there")
     show(_summary(run, joints, unreadable, time.perf_counter() - begin))
-    print(_next_command(output, cameras, project, loaded))
+    print(_next_command(run, cameras, project, loaded))
 
 
 def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "RenderableType":
@@ -149,8 +152,18 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
     return table("camera pictures size turned shown joints".split(), rows, caption=caption)
 
 
-def _next_command(output: Path, cameras: CameraOptions, project: Path | None, network: "Network") -> str:
+def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network") -> str:
     """How to go on, as a line to copy, wherever it is pasted."""
+    output = run.output
+    if cameras.calibration is None:
+        folder, sizes = output.resolve(), {each.camera.name: each.footage.size for each in run.cameras}
+        # A phone sees 65 degrees along the longer side of a video.
+        wide = {name: "65" if width >= height else "40" for name, (width, height) in sizes.items()}
+        fields = list(wide.values())[:1] if len(set(wide.values())) == 1 else [f"{n}={d}" for n, d in wide.items()]
+        words = ["shapepose-fg", "calibrate", "--detections", folder, "--focal"]
+        words += [word for field in fields for word in ("--field-of-view", field)]
+        words += ["--times", folder.parent / "times.csv", "--output", folder.parent / "calibration.json"]
+        return f"next: {shlex.join(map(str, words))}"
     results = output.resolve().parent / "results"
     files = {"--calibration": cameras.calibration, "--detections": output, "--output": results}
     if project is not None and output.resolve().parent == project.resolve():

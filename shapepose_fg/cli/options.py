@@ -188,7 +188,7 @@ class TimeOptions:
     timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
 
     def read(
-        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path
+        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path, own_frames: bool = False
     ) -> "tuple[DetectionTable, FrameTimes | None]":
         """The recording, and the times of its frames where something says them (`read_recording`); what is odd is
         said.
@@ -196,7 +196,9 @@ class TimeOptions:
         from shapepose_fg.io.recording import read_recording
 
         check_fps(self.fps)
-        recording, times = read_recording(detections, rig, skeleton, kept, self.fps, self.timestamps)
+        recording, times = read_recording(
+            detections, rig, skeleton, kept, self.fps, self.timestamps, own_frames=own_frames
+        )
         note(*recording.notes)
         return recording, times
 
@@ -208,12 +210,12 @@ class RateOptions(TimeOptions):
     frames: str | None = frames_option()
 
     def part(
-        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path
+        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path, own_frames: bool = False
     ) -> "tuple[DetectionTable, FrameTimes, range]":
         """The recording, its times, 30 frames a second where nothing says them, and the frames that are used."""
         from shapepose_fg.core.frame_times import FrameTimes
 
-        recording, times = self.read(detections, skeleton, rig, kept)
+        recording, times = self.read(detections, skeleton, rig, kept, own_frames)
         count = len(recording)
         span = frame_range(self.frames, count, recording.first)
         return recording, FrameTimes.assumed(count) if times is None else times, span

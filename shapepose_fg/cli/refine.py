@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from shapepose_fg.cli.found_cameras import report_option, write_page
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
@@ -21,6 +22,7 @@ from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
+    from shapepose_fg.core.arrays import Array
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
@@ -45,6 +47,7 @@ def refine_calibration(
     rate: RateOptions,
     may: FreedomOptions,
     output: Path = option(RESULT, "File for the refined cameras, in the format they came in.", REQUIRED),
+    report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
     """Refine where cameras stand and look, and their lenses if asked, by the people of a recording.
@@ -82,10 +85,18 @@ def refine_calibration(
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
     form = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
+    heads, rows = _figures(found, may)
+    lines = _words(found, may)
+    if report is not None:
+        missed: dict[str, Array] = {"before, px": found.missed_px[0], "after, px": found.missed_px[1]}
+        before = found.given if found.better else None
+        people, figures = found.adjusted.people, (heads, rows, missed)
+        write_page(report, new, before, people, times.frame_s, recording.skeleton, figures, lines, found.notes)
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:
-        _show(found, may)
+        show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=lines[0]))
+        print("\n".join(lines[1:]))
         print(f"{output}: {form}")
         # Our own file says axis, unit and size itself.
         said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
@@ -94,22 +105,27 @@ def refine_calibration(
         print(next_reconstruct(options | rate.given() | {"--output": "results"}))
 
 
-def _show(found: "Refinement", may: FreedomOptions) -> None:
-    """What changed, by camera, and whether it is better."""
+def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """What changed, by camera: heads, and each camera's figures."""
     change, sigma = found.change(), found.sigma()
     parts = {"turn": "turn, °", "move": "move, mm"} | ({"focal": "focal, %"} if may.focal else {})
     parts |= {"centre": "centre, px"} if may.centre else {}
     rows = []
     for view, name in enumerate(found.given.names):
         figures = [f"{change[part][view]:.2f} ± {sigma[part][view]:.2f}" for part in parts]
-        rows.append((name, str(found.counts[view]), *figures))
+        rows.append((name, [str(found.counts[view]), *figures]))
+    return ["people", *parts.values()], rows
+
+
+def _words(found: "Refinement", may: FreedomOptions) -> list[str]:
+    """The table's caption, and whether cameras are better."""
     scale = (
         "the cameras' distances as they were" if may.stature is None else f"people's stature, {may.stature:g} m"
     )
     stays = "the rig as a whole" if may.reference is None else f"camera {may.reference}"
-    caption = f"± is one sigma, as against {stays}; scale: {scale}"
-    show(table(("camera", "people", *parts.values()), rows, caption=caption))
     figures = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
-    print(f"a joint as against the other cameras, on frames that were not used: {figures}")
-    if not found.better:
-        print("the people do not fit better: the cameras are left as they were")
+    return [
+        f"± is one sigma, as against {stays}; scale: {scale}",
+        f"a joint as against the other cameras, on frames that were not used: {figures}",
+        *(["the people do not fit better: the cameras are left as they were"] if not found.better else []),
+    ]

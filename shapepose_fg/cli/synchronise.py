@@ -1,7 +1,6 @@
 """The command `synchronise`: when each camera began, from the people; and detections of the same moments."""
 
 import json
-import math
 import shlex
 import tempfile
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
+from shapepose_fg.cli.found_cameras import check_most, show_clocks
 from shapepose_fg.cli.options import (
     RESULT,
     TIME,
@@ -22,12 +22,11 @@ from shapepose_fg.cli.options import (
     next_reconstruct,
     option,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from shapepose_fg.calibration.synchronisation import Synchronised
-    from shapepose_fg.core.camera import Rig
+    pass
 
 
 @grouped
@@ -51,8 +50,7 @@ def synchronise(
     if fps is None:
         raise InputError("--fps: missing; say how many frames a second the cameras took")
     check_fps(fps)
-    if not 0 < most <= 600:
-        raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
+    check_most(most)
     rig = seen.still_rig("synchronise")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)), True)
@@ -66,7 +64,7 @@ def synchronise(
     if as_json:
         print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
     else:
-        _show(found, rig)
+        show_clocks(found, rig)
     note(*problems)
     if problems:
         raise typer.Exit(1)
@@ -83,13 +81,3 @@ def synchronise(
             options |= {"--image-size": seen.image_size, "--timestamps": output, "--output": "results"}
             print(f"{output}: times of {len(recording)} frames")
             print(next_reconstruct(options))
-
-
-def _show(found: "Synchronised", rig: "Rig") -> None:
-    """The offsets."""
-    rows = []
-    for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
-        known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"
-        rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
-    caption = "began: its frame 0, on the first camera's clock; stands out: the offset of all others"
-    show(table(("camera", "began, s", "± ms", "stands out"), rows, caption=caption))

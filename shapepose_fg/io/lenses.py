@@ -12,6 +12,8 @@ from shapepose_fg.io.footage.placement import read_used_footage
 
 _NARROWEST, _WIDEST = 5.0, 150.0
 """Degrees from left to right that a lens without distortion can see."""
+_USUAL = 65.0
+"""What phones see, about."""
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
@@ -35,13 +37,23 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
             raise InputError(
                 f"camera {name}: nothing says how large its pictures are; pass --image-size WIDTHxHEIGHT"
             )
-        width, height = picture
-        f = width / 2 / np.tan(np.radians(degrees[name]) / 2)
-        K = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
         with naming(detections):
-            cameras.append(Camera(name, K, np.eye(4), (width, height)))
+            cameras.append(_camera(name, picture, degrees[name]))
     with naming(detections):
         return Rig(tuple(cameras), "z")
+
+
+def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:
+    """Cameras of which nothing is known but their pictures' sizes (width, height), without poses, upright."""
+    return Rig(tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z")
+
+
+def _camera(name: str, size: tuple[int, int], degrees: float) -> Camera:
+    """A camera without a pose that sees so many degrees from left to right."""
+    width, height = size
+    f = width / 2 / np.tan(np.radians(degrees) / 2)
+    K = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    return Camera(name, K, np.eye(4), size)
 
 
 def camera_names(detections: Path) -> list[str]:

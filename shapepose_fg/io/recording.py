@@ -38,15 +38,19 @@ def read_recording(
     kept: Path,
     fps: float | None = None,
     timestamps: Path | None = None,
+    own_frames: bool = False,
 ) -> tuple[DetectionTable, FrameTimes | None]:
     """What the cameras saw, in the empty folder `kept`, and the times of its frames; None where nothing says them.
 
     `timestamps` is a file that `read_timestamps` reads, times.csv beside the detections by default. Cameras that
-    began at other times, or run at other rates, are put together by it: frames are moments then.
+    began at other times, or run at other rates, are put together by it: frames are moments then. Cameras may have
+    taken different numbers of frames if `own_frames`.
     InputError, one sentence that names file, place and cure.
     """
     file = times_beside(detections, fps, timestamps)
-    recording = read_detections(detections, rig, skeleton, InFolder(kept), own_frames=file is not None)
+    recording = read_detections(
+        detections, rig, skeleton, InFolder(kept), own_frames=own_frames or file is not None
+    )
     count = len(recording)
     if file is None:
         return recording, None if fps is None else FrameTimes.from_fps(fps, count)

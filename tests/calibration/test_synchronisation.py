@@ -14,51 +14,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_association
-from tests.calibration.conftest import FPS
-from tests.setup_check.conftest import seen_by
-
-LATE_S = np.array([0.0, 2.513, -1.22, 4.0])
-"""When the four cameras began."""
-
-
-@pytest.fixture(scope="module")
-def late(rig, two_people) -> Recording:
-    """Twelve seconds of each camera, of people whom the others saw earlier or later."""
-    return merged(rig, [filmed(two_people[0], offset) for offset in LATE_S])
-
-
-def filmed(body: np.ndarray, offset: float, drift: float = 0.0) -> np.ndarray:
-    """(300, 3, 25, 3) people before a camera that began so late, and falls behind."""
-    times = np.arange(300) / FPS
-    return np.stack([moving(body + np.array([0.45, 0.0, 0.0]), t) for t in offset + times * (1 + drift)])
-
-
-def moving(body: np.ndarray, time: float) -> np.ndarray:
-    """(3, 25, 3) three people on ways that never come again, waving at rates of their own."""
-    people = []
-    for number in range(3):
-        place = [np.sin(0.31 * time + 2 * number) + 0.4 * np.sin(0.83 * time), np.cos(0.23 * time + number), 0.0]
-        turn = 0.5 * time + 0.7 * np.sin(0.6 * time + number)
-        R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
-        one = body * (0.94 + 0.05 * number)
-        one = one.copy()
-        one[4, 2] += 0.3 * (1 + np.sin(4.1 * time + number + np.sin(0.9 * time)))
-        one[7, 1] += 0.25 * np.sin(3.3 * time + 2 * number)
-        people.append(one @ R.T + place)
-    return np.stack(people)
-
-
-def merged(rig: Rig, parts: list[np.ndarray]) -> Recording:
-    """Each camera's own recording of its people (T, 3, 25, 3) as one."""
-    seen = [seen_by(rig, people, seed=view) for view, people in enumerate(parts)]
-    frames = []
-    for each in zip(*(one.frames for one in seen), strict=True):
-        chosen = [part.only(part.view == view) for view, part in enumerate(each)]
-        begin = np.cumsum([0, *(len(part) for part in chosen)])[:-1]
-        columns = [np.concatenate([getattr(p, n) for p in chosen]) for n in ("view", "joint", "xy", "confidence")]
-        pairs = np.concatenate([part.pairs + at for part, at in zip(chosen, begin, strict=True)])
-        frames.append(type(chosen[0])(*columns, pairs, np.concatenate([part.affinity for part in chosen])))
-    return Recording(seen[0].skeleton, frames)
+from tests.calibration.conftest import FPS, LATE_S, filmed, merged, moving
 
 
 @pytest.mark.slow
@@ -72,7 +28,7 @@ def test_offsets_of_any_size_are_found_to_milliseconds(rig, late):
 
 @pytest.mark.slow
 def test_clocks_that_run_apart(rig, two_people, monkeypatch):
-    monkeypatch.setattr(synchronisation, "_WHOLE_S", 6.0)
+    monkeypatch.setattr(synchronisation, "WHOLE_S", 6.0)
     monkeypatch.setattr(synchronisation, "_END_S", 5.0)
     drift = np.array([0.0, 0.0, 0.003, 0.0])
     seen = merged(rig, [filmed(two_people[0], *each) for each in zip([0, 0.7, -0.3, 0.2], drift, strict=True)])

@@ -16,6 +16,7 @@ from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.lenses import lenses_of
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.simulation.scene import ring_of_cameras
 
@@ -226,3 +227,28 @@ def test_four_people_around_a_pizza(shared_data, network, tmp_path):
     # They stand around a table of a metre, on one floor, apart.
     apart = np.linalg.norm(hips[:, None] - hips[None], axis=2)[np.triu_indices(len(hips), 1)]
     assert np.ptp(hips[:, 2]) < 0.2 and apart.min() > 0.4
+
+
+def test_without_a_calibration_cameras_are_called_as_their_videos(kitchen, capsys):
+    """Pixels are the pictures' own, and the next command is the one that finds where cameras stand."""
+    rig = read_rig("calibration.json")
+    Path("videos").mkdir()
+    for name in rig.names:
+        film(Path("videos") / f"phone {name}.avi", rig, name, range(6), 25)
+    assert run("--videos", "videos", "--network", "network.onnx", "--output", "out") == 0
+    said = capsys.readouterr()
+    (command,) = re.findall("next: (.*)", said.out)
+    words = shlex.split(command)
+    assert words[:2] == ["shapepose-fg", "calibrate"] and words[words.index("--field-of-view") + 1] == "65"
+    assert {"--focal", f"{kitchen}/out", f"{kitchen}/times.csv", f"{kitchen}/calibration.json"} <= set(words)
+    seen = lenses_of(Path("out"), ["65"], None)
+    assert list(seen.names) == [f"phone {name}" for name in rig.names]
+    assert {camera.image_size for camera in seen.cameras} == {(640, 360)}
+    table = read_detections("out", seen)
+    for view, camera in enumerate(rig.cameras):
+        whole, _ = camera.project(np.array([[0.02 * t, 0.0, 1.0] for t in range(6)]))
+        found = np.array([table[t].xy[table[t].view == view][0] for t in range(6)])
+        np.testing.assert_allclose(found, (whole + 0.5) / 2 - 0.5, atol=3)
+    Path("nothing").mkdir()
+    assert run("--videos", "nothing", "--network", "network.onnx", "--output", "other") == 2
+    assert "no videos or pictures here" in " ".join(capsys.readouterr().err.split())

@@ -54,7 +54,7 @@ LEVELS = (
     "viz.report",
     "evaluation",
     "cli.options",
-    "cli.pictures",
+    "cli.pictures cli.found_cameras",
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"

@@ -61,6 +61,21 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
     return [Path(path or "") for path in named.values()], []
 
 
+def names_of_footage(given: Sequence[str]) -> list[str]:
+    """What cameras are called by what `find_footage` takes alone: a folder's videos, or else its other footage, or
+    the names before `=`. InputError where there is nothing.
+    """
+    if len(given) > 1 or ("=" in given[0] and not Path(given[0]).exists()):
+        return [text.partition("=")[0] for text in given]
+    folder = Path(given[0])
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    offered = [each for each in entries if not each.name.startswith(".") and _is_footage(each)]
+    videos = [each for each in offered if each.suffix.lower() in VIDEOS] or offered
+    if len(videos) == 0:
+        raise InputError(f"{folder}: no videos or pictures here; give the folder with those of all cameras")
+    return [each.name if each.is_dir() else each.stem for each in videos]
+
+
 def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
     """What a folder holds of each camera, told by the names: videos, pictures, and folders that hold pictures."""
     if folder.is_file():

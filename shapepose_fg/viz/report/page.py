@@ -24,26 +24,15 @@ def page_text(
 ) -> str:
     """The page of a result as HTML: self-contained, with no address of anything else in it.
 
-    `tracks` are its identities, `scene` is drawn where there is one, and `remarks` say what the page lacks. Texts
-    of the input are escaped, and the page's own policy forbids every script but those that are part of it.
+    `tracks` are its identities, `scene` is drawn where there is one, and `remarks` say what the page lacks.
     """
-    from jinja2 import Environment, StrictUndefined
-
-    page = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, extensions=["jinja2.ext.do"])
-    page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    page.filters |= {"dash": _dash, "share": _share, "percent": _percent, "count": _count, "path": _path}
-    scripts = [_asset(name) for name in _SCRIPTS] if scene is not None else []
-    digests = (base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii") for text in scripts)
-    hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
     by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
     by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
-    return page.from_string(_asset("page.html")).render(
+    return filled(
+        "page.html",
+        scene,
         Gate=Gate,
-        policy=f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:",
         title=title,
-        style=_asset("report.css"),
-        scripts=scripts,
-        scene=scene,
         remarks=[*remarks],
         run=told_by(people.run),
         overall=overall(people),
@@ -57,6 +46,31 @@ def page_text(
             (name, dict(zip(kinds, counts, strict=True)))
             for name, counts in zip(people.joint_names.tolist(), by_joint.tolist(), strict=True)
         ],
+    )
+
+
+def filled(name: str, scene: Scene | None, **values: object) -> str:
+    """One of the pages in data/, with the `scene` that is drawn and everything that it needs in it.
+
+    Texts of the input are escaped, and the page's own policy forbids every script but those that are part of it.
+    """
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    page = Environment(
+        loader=FunctionLoader(_asset),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        extensions=["jinja2.ext.do"],
+    )
+    page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    page.filters |= {"dash": _dash, "share": _share, "percent": _percent, "count": _count, "path": _path}
+    scripts = [_asset(name) for name in _SCRIPTS] if scene is not None else []
+    digests = (base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii") for text in scripts)
+    hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:"
+    return page.get_template(name).render(
+        policy=policy, style=_asset("report.css"), scripts=scripts, scene=scene, **values
     )
 
 

@@ -80,7 +80,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
         "joint_names": take.people.joint_names.tolist(),
         "bones": bones_of(tuple(take.people.joint_names.tolist())).tolist(),
         "people": [{"id": int(who), "colour": PALETTE[who % len(PALETTE)]} for who in take.persons],
-        "cameras": [_camera(camera, axes) for camera in cameras],
+        "cameras": [camera_of(camera, axes) for camera in cameras],
         "floor": _floor(joints),
         "view": _view(joints, centres),
     }
@@ -155,7 +155,7 @@ def _view(joints: Array, centres: Array) -> dict[str, Any]:
     return box | {"reach": max(reach, 1.0), "cameras": float(away)}
 
 
-def _camera(camera: Camera, axes: Array) -> dict[str, Any]:
+def camera_of(camera: Camera, axes: Array) -> dict[str, Any]:
     """A camera in the page's axes; the columns of `turn` point right, down and forward."""
     width, height = camera.image_size
     return {

@@ -61,6 +61,7 @@ class Painter {
       this.label(items, row, person);
     }
     if (show.cameras) this.recording.cameras.forEach((camera, index) => this.camera(items, camera, index));
+    if (show.before) this.recording.before.forEach((camera) => this.camera(items, camera, null));
     items.sort((a, b) => b.depth - a.depth);
     for (const item of items) {
       if (item.paint) item.paint();
@@ -274,10 +275,10 @@ class Painter {
       ctx.fillText(text, p[0], p[1] + 0.5);
     } });
   }
-  /** A camera as the pyramid that it sees. */
+  /** A camera as the pyramid that it sees; without an index as it was before, dashed and without a name. */
   camera(items, camera, index) {
     const { ctx, eye } = this;
-    if (eye.through === index) return;
+    if (index !== null && eye.through === index) return;
     const [fx, fy, cx, cy] = camera.K, [w, h] = camera.size;
     const deep = Math.min(0.5, 0.07 * this.recording.view.reach + 0.18);
     const corners = [[0, 0], [w, 0], [w, h], [0, h]].map(([x, y]) => {
@@ -287,8 +288,9 @@ class Painter {
     const centre = eye.project(camera.centre), depth = eye.depth(camera.centre);
     if (!centre) return;
     items.push({ depth, paint: () => {
-      ctx.strokeStyle = this.theme.soft;
+      ctx.strokeStyle = index === null ? "#c8513f" : this.theme.soft;
       ctx.lineWidth = 1.2;
+      ctx.setLineDash(index === null ? [5, 4] : []);
       const points = corners.map((corner) => eye.project(corner));
       if (points.every(Boolean)) {
         ctx.beginPath();
@@ -308,6 +310,8 @@ class Painter {
         ctx.lineTo(ends[1][0], ends[1][1]);
       }
       ctx.stroke();
+      ctx.setLineDash([]);
+      if (index === null) return;
       ctx.font = "11px system-ui, sans-serif";
       ctx.textAlign = "center";
       ctx.textBaseline = "bottom";

@@ -7,7 +7,7 @@
   const eye = new Eye(recording.view, recording.cameras);
   const painter = new Painter(find("canvas"), recording, eye);
   const slider = find("frame"), clock = find("clock"), play = find("play"), strip = find("strip");
-  const layers = ["bodies", "bones", "sigma", "trails", "cameras"];
+  const layers = ["bodies", "bones", "sigma", "trails", "cameras", "before"];
   const show = {};
   let at = 0, playing = false, clockStart = 0, timeStart = 0, waiting = false;
 

@@ -1,0 +1,168 @@
+"""Offsets of cameras that stand nobody knows where: joints rise and fall at the same times in all of them.
+
+Each track of one camera may be the person of any track of the other: how fast their joints rise, as parts of the
+people's size, is correlated at all offsets, and what is improbable by chance is summed. People who walk or dance
+repeat themselves: of the offsets that stand out those are taken at which one pose of the cameras fits.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations, product
+
+import numpy as np
+
+from shapepose_fg.calibration.pairwise import fast_part
+from shapepose_fg.calibration.relative import relative
+from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.compiled import kernel
+
+_STEP_S = 0.04
+"""Between frames that are compared."""
+_FASTEST = 2.0
+"""Statures a second: joints that rise faster have changed their person."""
+_BRISK_S = 0.5
+"""What lasts longer is taken out: who walks towards one camera, and sinks in its picture, rises in another's."""
+_LEAST_S = 1.0
+"""Seconds that two tracks must have in common."""
+_AROUND_S = 0.3
+"""Offsets that are nearer than this to each other are one answer."""
+_LEAST_ALIKE = 0.1
+"""Correlations below are those of strangers."""
+_PEAKS, _PAIRS = 8, 3
+"""Offsets of two cameras, or groups of cameras, that are looked at; and by so many pairs of these."""
+_SURE = 2.0
+"""Offsets are right that stand out so far, times how well one pose fits (`Relative.score`): wrong ones stay below
+1.6, four in five right ones are above, on Shelf and simulated."""
+_FITS_S = 5.0
+"""Person-seconds below which a fit counts for less."""
+
+
+def offsets_without_poses(
+    tracks: list[Tracks], fps: float, most_s: float, told: Callable[[], None] = lambda: None
+) -> Array:
+    """(V,) shifts in frames: frame f of the first camera is frame f + shift of another, to a few frames.
+
+    `tracks` are in their cameras' own frames, y down. Cameras were started up to `most_s` apart. Those that are
+    surest of each other come together first, one or several at a time.
+    """
+    step = max(1, round(_STEP_S * fps))
+    parts = [_rises(each, step, fps) for each in tracks]
+    last = max(int(each.frame.max(initial=0)) for each in tracks) // step
+    most = min(round(most_s * fps / step), last)
+    curves = dict[tuple[int, int], Array]()
+    for a, b in product(range(len(tracks)), repeat=2):
+        if a < b:
+            curves[a, b] = np.zeros(2 * most + 1)
+            _alike(*parts[a], *parts[b], round(_LEAST_S * fps / step), _LEAST_ALIKE, curves[a, b])
+            curves[b, a] = curves[a, b][::-1]
+    fits = dict[tuple[int, int, int], float]()
+
+    def fit(a: int, b: int, apart: int) -> float:
+        """How well two cameras see the same people, one so many steps later."""
+        if (a, b, apart) not in fits:
+            moved = replace(tracks[b], frame=tracks[b].frame - apart * step)
+            found = relative(tracks[a], moved, fps)
+            fits[a, b, apart] = 0.0 if found is None else found.score * min(1.0, found.seconds / _FITS_S)
+        return fits[a, b, apart]
+
+    groups = [{view: 0} for view in range(len(tracks))]
+    while len(groups) > 1:
+        offers = [
+            (worth, one, other, apart)
+            for one, other in combinations(range(len(groups)), 2)
+            for worth, apart in _peaks(groups[one], groups[other], curves, most, round(_AROUND_S * fps / step))
+        ]
+        best = (-1.0, 0, 1, 0)
+        for worth, one, other, apart in sorted(offers, reverse=True):
+            pairs = [(a, b, apart + groups[other][b] - groups[one][a]) for a in groups[one] for b in groups[other]]
+            pairs.sort(key=lambda pair: -curves[pair[:2]][np.clip(pair[2] + most, 0, 2 * most)])
+            merit = worth * float(np.mean([fit(*pair) for pair in pairs[:_PAIRS]]))
+            best = max(best, (merit, one, other, apart))
+            if merit > _SURE:
+                break
+        _, one, other, apart = best
+        groups[one] |= {view: at + apart for view, at in groups[other].items()}
+        del groups[other]
+        told()
+    shift = np.array([groups[0][view] for view in range(len(tracks))])
+    return (shift - shift[0]) * float(step)
+
+
+def _peaks(
+    one: dict[int, int], other: dict[int, int], curves: dict[tuple[int, int], Array], most: int, around: int
+) -> list[tuple[float, int]]:
+    """Offsets between two groups of cameras that stand out, and how far, the best first."""
+    total = np.zeros(2 * most + 1)
+    for a, b in product(one, other):
+        moved = np.arange(-most, most + 1) + other[b] - one[a]
+        inside = np.abs(moved) <= most
+        total[inside] += curves[a, b][moved[inside] + most]
+    usual, found = (
+        float(np.sqrt((total[total > 0] ** 2).mean())) if total.any() else 1.0,
+        list[tuple[float, int]](),
+    )
+    for _ in range(_PEAKS):
+        top = int(np.argmax(total))
+        found.append((float(total[top]) / usual, top - most))
+        total[max(0, top - around) : top + around + 1] = 0.0
+    return found
+
+
+def _rises(tracks: Tracks, step: int, fps: float) -> tuple[Array, Index, Index]:
+    """How joints rise (N, J), one sample every `step` frames, 0 where unknown; where tracks begin in it, and its
+    end (K + 1,); and the number of the sample at which each begins (K,).
+    """
+    values = tracks.speed[:, :, 1] / tracks.size[:, None]
+    known = np.abs(values) < _FASTEST / fps  # nor NaN
+    (values,) = fast_part((np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps)
+    kept = np.flatnonzero(tracks.frame % step == 0)
+    _, first = np.unique(tracks.track[kept], return_index=True)
+    begins = (tracks.frame[kept] // step)[first]
+    return np.ascontiguousarray(values[kept]), np.append(first, len(kept)).astype(np.intp), begins
+
+
+@kernel("f2 i1 i1 f2 i1 i1 i0 f0 f1")
+def _alike(
+    a: Array,
+    first_a: Index,
+    begin_a: Index,
+    b: Array,
+    first_b: Index,
+    begin_b: Index,
+    least: int,
+    least_alike: float,
+    worth: Array,
+) -> None:
+    """Adds to `worth` (2 L + 1,), at offsets -L to L of b against a, how improbable by chance tracks are alike."""
+    middle, joints = len(worth) // 2, a.shape[1]
+    power_a, power_b = np.zeros(len(a) + 1), np.zeros(len(b) + 1)
+    for n in range(len(a)):
+        power_a[n + 1] = power_a[n]
+        for j in range(joints):
+            power_a[n + 1] += a[n, j] ** 2
+    for n in range(len(b)):
+        power_b[n + 1] = power_b[n]
+        for j in range(joints):
+            power_b[n + 1] += b[n, j] ** 2
+    for i in range(len(begin_a)):
+        for k in range(len(begin_b)):
+            many, other = first_a[i + 1] - first_a[i], first_b[k + 1] - first_b[k]
+            dots = np.zeros(many + other)
+            for t in range(many):
+                for u in range(other):
+                    dot = 0.0
+                    for j in range(joints):
+                        dot += a[first_a[i] + t, j] * b[first_b[k] + u, j]
+                    dots[u - t + many] += dot
+            for n in range(1, many + other):
+                apart = n - many
+                place = begin_b[k] - begin_a[i] + apart + middle
+                begin, end = max(0, -apart), min(many, other - apart)
+                if end - begin < least or place < 0 or place >= len(worth) or dots[n] <= 0:
+                    continue
+                energy = power_a[first_a[i] + end] - power_a[first_a[i] + begin]
+                energy *= power_b[first_b[k] + end + apart] - power_b[first_b[k] + begin + apart]
+                square = dots[n] ** 2 / max(energy, 1e-12)
+                if square > least_alike**2:
+                    worth[place] -= (end - begin) * np.log(max(1 - square, 1e-6))

@@ -1,0 +1,72 @@
+"""Where cameras stand that were also started by hand: rough offsets, then poses and offsets in turns."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from shapepose_fg.calibration.from_people import Calibrated, Undetermined, calibrate, own_tracks
+from shapepose_fg.calibration.rise_and_fall import offsets_without_poses
+from shapepose_fg.calibration.synchronisation import WHOLE_S, Synchronised, offsets
+from shapepose_fg.calibration.tracks import next_of, on_one_clock
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.setup_check.matching import Sightings
+
+_ROUNDS = 4
+_STILL_S = 0.001
+"""Offsets that change by less from round to round have settled."""
+
+
+def calibrate_unsynchronised(
+    detections: DetectionSequence,
+    rig: Rig,
+    fps: float,
+    frames: range,
+    most_s: float = 60.0,
+    focal: float = 0.0,
+    stature_m: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Calibrated, Synchronised]:
+    """Where the cameras of `rig` stand, as `calibrate` says, and when each was started, up to `most_s` apart.
+
+    Undetermined where the people do not tell the poses, or when cameras were started.
+    """
+    V = len(rig)
+    frames = frames[: round(WHOLE_S * fps)]
+    sightings = Sightings.of(detections, frames)
+    total, done = V - 1 + 100 * _ROUNDS, 0
+
+    def told() -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    shift = offsets_without_poses(own_tracks(sightings, rig, fps), fps, most_s, told)
+    following, found, problems = next_of(sightings), None, tuple[str, ...]()
+    for turn in range(_ROUNDS):
+        seen = on_one_clock(sightings, following, shift, detections.skeleton)
+        times = FrameTimes.from_fps(fps, seen.frames.stop)
+        begin = V - 1 + 100 * turn
+        start = None if found is None else found.rig
+
+        def part(step: int, steps: int, begin: int = begin) -> None:
+            progress(begin + round(100 * step / steps), total)
+
+        try:
+            found, problems = calibrate(seen, rig, times, seen.frames, focal, stature_m, part, start), ()
+        except Undetermined as refused:
+            if refused.found is None:
+                raise
+            found, problems = refused.found, refused.problems
+        offset, sigma, sure = offsets(sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None)
+        before, shift = shift, -offset * fps
+        if np.abs(shift - before).max() < _STILL_S * fps:
+            break
+    assert found is not None
+    progress(total, total)
+    none, middle = np.zeros(V), (frames.start + frames.stop) / 2 / fps
+    clocks = Synchronised(offset, sigma, sure, none, none, middle)
+    if problems := (*problems, *clocks.undetermined(rig)):
+        raise Undetermined(problems, found)
+    return found, clocks

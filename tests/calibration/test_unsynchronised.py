@@ -1,0 +1,86 @@
+"""Cameras of unknown poses that were started by hand: when and where, from the people alone, or refused."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapepose_fg.calibration.from_people import Undetermined, own_tracks
+from shapepose_fg.calibration.rise_and_fall import offsets_without_poses
+from shapepose_fg.calibration.tracks import next_of, on_one_clock
+from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
+from shapepose_fg.cli.main import main
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.io.calibration import read_rig, write_rig
+from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.setup_check.matching import Sightings
+from tests.calibration.conftest import FPS, LATE_S, merged, moving
+from tests.calibration.test_from_people import off_after_growing, unposed
+
+
+def test_rough_offsets_need_no_poses(rig, late):
+    tracks = own_tracks(Sightings.of(late, range(300)), unposed(rig), FPS)
+    shift = offsets_without_poses(tracks, FPS, 8.0)
+    # Frame f of the first camera is frame f + shift of one that began later by so many.
+    assert np.abs(shift + LATE_S * FPS).max() < 3
+
+
+def test_moments_of_one_clock():
+    """Two cameras, one person each who moves by 4 px a frame; the second began 2.25 frames late."""
+    frame = np.tile(np.arange(20), 2)
+    view = np.repeat([0, 1], 20)
+    joints = np.linspace(0, 300, 15)[:, None] * [0.3, 1.0]
+    time = frame + 2.25 * view
+    xy = joints + 4.0 * time[:, None, None]
+    seen = Sightings(frame, view, xy, np.full((40, 15), 0.8))
+    following = next_of(seen)
+    assert (following[frame < 19] == np.flatnonzero(frame < 19) + 1).all() and (following[frame == 19] == -1).all()
+    one = on_one_clock(seen, following, np.array([0.0, -2.25]), BODY_25)
+    both = [one.at([moment]) for moment in one.frames]
+    assert len(one.frames) == 17 and all(len(each) == 2 for each in both)
+    assert max(np.abs(each.xy[0] - each.xy[1]).max() for each in both) < 1e-9
+
+
+@pytest.mark.slow
+def test_poses_and_times_from_people_alone(rig, late):
+    steps = list[tuple[int, int]]()
+    found, clocks = calibrate_unsynchronised(
+        late, unposed(rig), FPS, range(300), 8.0, progress=lambda *each: steps.append(each)
+    )
+    assert np.abs(clocks.offset_s - LATE_S).max() < 0.005
+    turn, move, _ = off_after_growing(found.rig, rig)
+    assert turn.max() < 0.4 and move.max() < 0.03
+    assert steps[-1][0] == steps[-1][1] and steps == sorted(steps)
+
+
+@pytest.mark.slow
+def test_people_who_stand_are_refused(rig, two_people):
+    still = np.repeat(moving(two_people[0], 0.0)[None], 150, axis=0)
+    with pytest.raises(Undetermined, match="camera cam0: "):
+        calibrate_unsynchronised(merged(rig, [still] * 4), unposed(rig), FPS, range(150), 3.0)
+
+
+@pytest.mark.slow
+def test_the_command_writes_cameras_times_and_a_page(rig, late, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_rig(rig, tmp_path / "lenses.json")
+    write_association(late, rig, tmp_path)
+    base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
+    for more, code, said in (
+        (["--times", "times.csv", "--most", "8", "--report", "page.html"], 0, "--timestamps times.csv"),
+        (["--times", "times.csv", "--timestamps", "lenses.json"], 2, "give one of them"),
+        (["--times", "times.csv", "--most", "0"], 2, "must be above 0"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([*base, "--output", "new.json", *more])
+        out, error = capsys.readouterr()
+        assert ended.value.code == code and said in " ".join((out + error).split())
+    assert off_after_growing(read_rig("new.json"), rig)[0].max() < 0.4
+    rows = np.array([line.split(",")[1:] for line in Path("times.csv").read_text().splitlines()[1:]], dtype=float)
+    assert rows.shape == (300, 4) and np.abs(rows[7] - rows[7, 0] - LATE_S).max() < 0.005
+    page = Path("page.html").read_text()
+    scene = re.search(r'id="scene-data">(.*?)</script>', page, re.S)
+    assert scene is not None and len(json.loads(scene[1])["cameras"]) == 4
+    assert page.count('px<span class="range"') == 4 and "before" not in json.loads(scene[1])
