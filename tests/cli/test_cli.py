@@ -510,7 +510,7 @@ def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkey
     for words, said in (
         (("--config", str(tmp_path / "typo.toml")), "typo.toml: batch_frame"),
         (("--shapes", str(tmp_path / "s.npz"), "--no-temporal"), "--shapes: a person's shape is known over time"),
-        (("--chunk-frames", "20"), "--chunk-frames 20: must be 96"),
+        (("--chunk-frames", "20"), "--chunk-frames 20: must be 128"),
     ):
         assert run(*recording, *words) == 2
         assert said in capsys.readouterr().err
@@ -528,7 +528,7 @@ def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     assert (pipeline["chunk_frames"], pipeline["cluster"]) == (200, "tcp://host:8786")
     capsys.readouterr()
     assert run(*recording, "--chunk-frames", "20", "--overwrite") == 2
-    assert "--chunk-frames 20: must be 96" in capsys.readouterr().err
+    assert "--chunk-frames 20: must be 128" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
