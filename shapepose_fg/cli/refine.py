@@ -112,7 +112,8 @@ def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[
     parts |= {"centre": "centre, px"} if may.centre else {}
     rows = []
     for view, name in enumerate(found.given.names):
-        figures = [f"{change[part][view]:.2f} ± {sigma[part][view]:.2f}" for part in parts]
+        digits = {part: 0 if part == "move" else 2 for part in parts}
+        figures = [f"{change[part][view]:.{n}f} ± {sigma[part][view]:.{n}f}" for part, n in digits.items()]
         rows.append((name, [str(found.counts[view]), *figures]))
     return ["people", *parts.values()], rows
 
@@ -123,7 +124,7 @@ def _words(found: "Refinement", may: FreedomOptions) -> list[str]:
         "the cameras' distances as they were" if may.stature is None else f"people's stature, {may.stature:g} m"
     )
     stays = "the rig as a whole" if may.reference is None else f"camera {may.reference}"
-    figures = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
+    figures = f"{found.before_px:.1f} px before, {found.after_px:.1f} px after"
     return [
         f"± is one sigma, as against {stays}; scale: {scale}",
         f"a joint as against the other cameras, on frames that were not used: {figures}",
