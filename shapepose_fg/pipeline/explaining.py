@@ -1,16 +1,17 @@
 """Why a joint is where it is: what each view, the body and motion say of it, and what speaks against them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factors import kernel_weight
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.estimation.linearisation import inverses, observation_sigmas, weakest_sigma
 from shapepose_fg.estimation.motion_model import LOST_M
@@ -25,6 +26,9 @@ OFF_SIGMA = 3.0
 chance."""
 _WINDOW_FRAMES = 48
 """Frames before and after, whose detections tell whether a camera is wrong."""
+_ASTRAY_RAD, _BESIDE_RAD, _BIN_RAD = 0.15, 0.03, 0.01
+"""How far detections that were given to nobody are looked for around joints; and how far from there once the
+commonest of these ways, found in bins so wide, is gone: a camera that rolled moves some parts of its picture."""
 _APART = 0.5
 """A detection is somebody else's where it lies in less than this share of the distance from theirs."""
 
@@ -57,14 +61,11 @@ def explain(
     solver = Solver.of(people, rig)
     graph = solved_around(people, solver, person, frame)
     near = np.abs(people.frame - frame) <= (_WINDOW_FRAMES if solver.config.temporal else 0)
-    around = _Detections.of(people.rows(near), rig, solver.config)
+    around = _Detections.of(people.rows(near), rig, solver.config, detections)
     views, shares = _view_reasons(around, graph, person, frame, number, solver.config)
     here, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
-    seen = Seen(
-        around.table.residual_px.astype(np.float64), around.sigmas_px, around.there, around.table.gate == Gate.USED
-    )
-    wrong = wrong_view(seen, around.people.joints, around.views, solver.config.estimator.observations)
+    wrong = wrong_view(around.seen, around.people.joints, around.views, solver.config.estimator.observations)
     refused = _refused(around, person, frame, number, detections)
     findings = _findings(people, row, number, views, shares, wrong, refused)
     return Explanation(
@@ -101,20 +102,75 @@ class _Detections:
     people: Reconstruction
     table: ObservationTable
     views: Views
-    sigmas_px: Array
-    """(N, J, V); 0 where there are none."""
-    there: Mask
-    """(N, J, V) which there are of joints that have a place."""
+    seen: Seen
+    """Those, and what cameras saw beside joints and nobody was given."""
 
     @classmethod
-    def of(cls, people: Reconstruction, rig: Rig, config: PipelineConfig) -> "_Detections":
+    def of(
+        cls, people: Reconstruction, rig: Rig, config: PipelineConfig, detections: DetectionSequence | None
+    ) -> "_Detections":
         table = people.observations
         assert table is not None
         rows = table.observations(people.joints, np.nan_to_num(people.time_s))
         views, names = Views.of(rig, rows.time_s), people.joint_names.tolist()
+        pixels = views.pixels(people.joints)[0]
+        if detections is not None:
+            rows = _with_strays(rows, table, views, pixels, detections)
         sigmas = observation_sigmas(rows, people.joints, views, config.estimator.observations, names)
         placed = np.asarray(np.isfinite(people.joints).all(axis=-1))[..., None]
-        return cls(people, table, views, sigmas, np.asarray((table.gate != Gate.NOT_SEEN) & placed))
+        seen = Seen(pixels - rows.xy, sigmas, np.asarray(rows.seen & placed), table.used)
+        return cls(people, table, views, seen)
+
+
+def _with_strays(
+    rows: Observations, table: ObservationTable, views: Views, pixels: Array, detections: DetectionSequence
+) -> Observations:
+    """The rows with detections given to nobody, where a camera has none of a joint: of those of its name the
+    nearest to where it would be if the camera was turned as most of them have it. A camera that is off has few
+    others, or none.
+    """
+    found, spots = list[tuple[Array, ...]](), pixels / views.focal[:, None, :, None]
+    for frame in np.unique(table.frame).tolist():
+        if not 0 <= frame < len(detections):
+            continue
+        seen, here = detections[frame], np.flatnonzero(table.frame == frame)
+        free = np.flatnonzero(_owner(seen, table, here, here) < 0)
+        view, joint = seen.view[free], seen.joint[free]
+        row, k = np.nonzero(table.gate[here][:, joint, view] == Gate.NOT_SEEN)
+        row, view, joint, free = here[row], view[k], joint[k], free[k]
+        away = seen.xy[free] / views.focal[row % len(views.focal), view][:, None] - spots[row, joint, view]
+        near = np.linalg.norm(away, axis=-1) < _ASTRAY_RAD
+        found.append(tuple(c[near] for c in (row, joint, view, away, seen.xy[free], seen.confidence[free])))
+    if len(found) == 0:
+        return rows
+    row, joint, view, away, at, score = (np.concatenate(column) for column in zip(*found, strict=True))
+    xy, confidence = rows.xy.copy(), rows.confidence.copy()
+    for v in np.unique(view).tolist():
+        mine = np.flatnonzero(view == v)
+        off = np.linalg.norm(away[mine] - _commonest(away[mine]), axis=-1)
+        mine = mine[np.argsort(-off)][-int((off < _BESIDE_RAD).sum()) :] if (off < _BESIDE_RAD).any() else mine[:0]
+        place = row[mine], joint[mine], v  # the nearest is written last
+        xy[place], confidence[place] = at[mine], score[mine]
+    return replace(rows, xy=xy, confidence=confidence)
+
+
+def _commonest(ways: Array) -> Array:
+    """(2,) where ways (M, 2), radians, are densest."""
+    edges = np.arange(-_ASTRAY_RAD, _ASTRAY_RAD + _BIN_RAD, _BIN_RAD)
+    count = np.histogram2d(*ways.T, bins=(edges, edges))[0]
+    window = np.lib.stride_tricks.sliding_window_view(np.pad(count, 1), (3, 3)).sum(axis=(-1, -2))
+    return edges[np.array(np.unravel_index(window.argmax(), window.shape))] + _BIN_RAD / 2
+
+
+def _owner(seen: Detections, table: ObservationTable, rows: Index, names: Index) -> Index:
+    """(D,) to which of some `rows` of one frame each detection was given, by its name there; -1 for nobody."""
+    owner = np.full(len(seen), -1)
+    places = {at: k for k, at in enumerate(zip(seen.view.tolist(), seen.place.tolist(), strict=True))}
+    for n, name in zip(rows.tolist(), names.tolist(), strict=True):
+        _, view = np.nonzero(table.candidate[n] >= 0)
+        given = zip(view.tolist(), table.candidate[n][table.candidate[n] >= 0].tolist(), strict=True)
+        owner[[places[at] for at in given if at in places]] = name
+    return owner
 
 
 def _view_reasons(
@@ -134,7 +190,7 @@ def _view_reasons(
     people, table = all_of_it.people, all_of_it.table
     row = int(np.flatnonzero((people.person == person) & (people.frame == frame))[0])
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
-    sigma, seen = all_of_it.sigmas_px[row, joint], gates != Gate.NOT_SEEN
+    sigma, seen = all_of_it.seen.sigmas_px[row, joint], gates != Gate.NOT_SEEN
     place, whole, of_body = people.joints[row, joint], None, np.zeros((3, 3))
     solved = [] if graph is None else np.flatnonzero(graph.frames == frame).tolist()
     if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
@@ -194,7 +250,7 @@ def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, off_px:
     if off_sigma <= OFF_SIGMA:
         return ""
     people, table, names = all_of_it.people, all_of_it.table, all_of_it.people.joint_names.tolist()
-    at, sigma = table.xy[row, joint, view], all_of_it.sigmas_px[row, joint, view]
+    at, sigma = table.xy[row, joint, view], all_of_it.seen.sigmas_px[row, joint, view]
     mine, other = names[joint], _mirrored(names[joint])
     best, found = off_sigma, ""
     for n in np.flatnonzero(people.frame == people.frame[row]).tolist():
@@ -224,12 +280,7 @@ def _refused(
     if detections is None or not 0 <= frame < len(detections):
         return []
     seen, here = detections[frame], np.flatnonzero(people.frame == frame)
-    owner = np.full(len(seen), -1)
-    places = {at: k for k, at in enumerate(zip(seen.view.tolist(), seen.place.tolist(), strict=True))}
-    for n in here.tolist():
-        _, view = np.nonzero(table.candidate[n] >= 0)
-        given = zip(view.tolist(), table.candidate[n][table.candidate[n] >= 0].tolist(), strict=True)
-        owner[[places[at] for at in given if at in places]] = people.person[n]
+    owner = _owner(seen, table, here, people.person[here])
     row = int(here[people.person[here] == person][0])
     xy, found = all_of_it.views.rows(np.array([row])).pixels(people.joints[row, joint][None, None])[0][0, 0], []
     begin, other, affinity = seen.ties
