@@ -29,6 +29,8 @@ _WINDOW_FRAMES = 48
 _ASTRAY_RAD, _BESIDE_RAD, _BIN_RAD = 0.15, 0.03, 0.01
 """How far detections that were given to nobody are looked for around joints; and how far from there once the
 commonest of these ways, found in bins so wide, is gone: a camera that rolled moves some parts of its picture."""
+_NEAR_M = 0.5
+"""A detection that nobody was given is named so far from a joint that its camera has none of."""
 _APART = 0.5
 """A detection is somebody else's where it lies in less than this share of the distance from theirs."""
 
@@ -227,7 +229,8 @@ def _view_reasons(
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
             off_px = float(np.linalg.norm(away))
             off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
-            like = _looks_like(all_of_it, row, joint, v, off_px, off_sigma)
+            if off_sigma > OFF_SIGMA:
+                like = _looks_like(all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px)
         reason = ViewReason(
             camera=name,
             gate=GATES[Gate(gates[v])],
@@ -245,36 +248,31 @@ def _view_reasons(
     return tuple(reasons), (known[-2], known[-1])
 
 
-def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, off_px: float, off_sigma: float) -> str:
-    """Whose joint a detection that is off rather is: another's of the same name, or one of the other side."""
-    if off_sigma <= OFF_SIGMA:
-        return ""
-    people, table, names = all_of_it.people, all_of_it.table, all_of_it.people.joint_names.tolist()
-    at, sigma = table.xy[row, joint, view], all_of_it.seen.sigmas_px[row, joint, view]
-    mine, other = names[joint], _mirrored(names[joint])
-    best, found = off_sigma, ""
-    for n in np.flatnonzero(people.frame == people.frame[row]).tolist():
-        for name in {mine, other} & {*names}:
-            j = names.index(name)
-            point, covariance = people.joints[n, j], people.covariance[n, j]
-            if (n == row and j == joint) or not (np.isfinite(point).all() and np.isfinite(covariance).all()):
-                continue
-            xy, _, slope = (
-                each[0, 0, view] for each in all_of_it.views.rows(np.array([n])).project(point[None, None])
-            )
-            away = np.asarray(xy - at)
-            spread = sigma**2 * np.eye(2) + slope @ covariance @ slope.T
-            sigmas = float(np.sqrt(away @ np.linalg.solve(spread, away)))
-            if sigmas < min(best, OFF_SIGMA) and np.linalg.norm(away) < _APART * off_px:
-                best, found = sigmas, f"person {people.person[n]}'s {name}"
-    return found
+def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, at: Array, sigma: float, off: float) -> str:
+    """Whose joint a detection at `at`, known to `sigma` and `off` from where it should be, pixels, rather is:
+    another's of the same name, or one of the other side.
+    """
+    people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
+    here = np.flatnonzero(people.frame == people.frame[row])
+    alike = np.array([j for j, name in enumerate(names) if name in (names[joint], _mirrored(names[joint]))])
+    xy, _, slope = (
+        each[:, :, view] for each in all_of_it.views.rows(here).project(people.joints[here][:, alike])
+    )
+    away = xy - at
+    spread = sigma**2 * np.eye(2) + slope @ people.covariance[here][:, alike] @ slope.mT
+    known = np.isfinite(away).all(axis=-1) & np.isfinite(spread).all(axis=(-1, -2))
+    known &= ~((here == row)[:, None] & (alike == joint)) & (np.linalg.norm(away, axis=-1) < _APART * off)
+    away, spread = np.where(known[..., None], away, 0.0)[..., None], np.where(known[..., None, None], spread, np.eye(2))
+    sigmas = np.where(known, np.sqrt((away.mT @ np.linalg.solve(spread, away))[..., 0, 0]), np.inf)
+    n, j = np.unravel_index(sigmas.argmin(), sigmas.shape)
+    return f"person {people.person[here[n]]}'s {names[alike[j]]}" if sigmas[n, j] < OFF_SIGMA else ""
 
 
 def _refused(
     all_of_it: _Detections, person: int, frame: int, joint: int, detections: DetectionSequence | None
 ) -> list[Finding]:
-    """Detections of a joint that the detector joins with the person's own in a camera, and that are not theirs:
-    given to somebody else, or to nobody.
+    """Detections of a joint in cameras that have none of it, which the detector joins with the person's own or
+    which lie about there, and that are not theirs: given to somebody else, or to nobody.
     """
     people, table = all_of_it.people, all_of_it.table
     if detections is None or not 0 <= frame < len(detections):
@@ -282,21 +280,28 @@ def _refused(
     seen, here = detections[frame], np.flatnonzero(people.frame == frame)
     owner = _owner(seen, table, here, people.person[here])
     row = int(here[people.person[here] == person][0])
-    xy, found = all_of_it.views.rows(np.array([row])).pixels(people.joints[row, joint][None, None])[0][0, 0], []
+    views = all_of_it.views.rows(np.array([row]))
+    xy, depth = (each[0, 0] for each in views.pixels(people.joints[row, joint][None, None]))
     begin, other, affinity = seen.ties
+    found = list[tuple[float, Finding]]()
     for k in np.flatnonzero((seen.joint == joint) & (owner != person)).tolist():
         view, ends = int(seen.view[k]), slice(begin[k], begin[k + 1])
-        with_whom = owner[other[ends]]
-        theirs, others = (affinity[ends][chosen].sum() for chosen in (with_whom == person, with_whom == owner[k]))
-        if table.gate[row, joint, view] != Gate.NOT_SEEN or theirs <= (others if owner[k] >= 0 else 0.0):
+        if table.gate[row, joint, view] != Gate.NOT_SEEN:
             continue
-        name, off = str(table.view_names[view]), float(np.linalg.norm(seen.xy[k] - xy[view]))
-        cause, whose = Cause.GATED, "nobody's"
-        if owner[k] >= 0:
-            cause, whose = Cause.FOREIGN, f"person {owner[k]}'s"
-        words = f"Camera {name} joins a detection with theirs that is {whose}, {off:.0f} px off. It was not taken."
-        found.append(Finding(cause, (name,), words))
-    return found
+        with_whom, off = owner[other[ends]], float(np.linalg.norm(seen.xy[k] - xy[view]))
+        theirs, others = (affinity[ends][chosen].sum() for chosen in (with_whom == person, with_whom == owner[k]))
+        sigmas, whose = all_of_it.seen.sigmas_px[:, joint, view], f"person {owner[k]}'s"
+        if owner[k] < 0:
+            usual, others = sigmas.sum() / max((sigmas > 0).sum(), 1), 0.0
+            whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off) or "nobody's"
+        name, cause = str(table.view_names[view]), Cause.GATED if whose == "nobody's" else Cause.FOREIGN
+        if theirs > others:
+            words = f"Camera {name} joins a detection with theirs that is {whose}, {off:.0f} px off. It was not taken."
+            found.append((-1.0, Finding(cause, (name,), words)))
+        elif whose == "nobody's" and off * depth[view] < _NEAR_M * views.focal[0, view]:
+            words = f"Camera {name} has a detection {off:.0f} px off that nobody was given."
+            found.append((off, Finding(cause, (name,), words)))
+    return [each for _, each in sorted(found, key=lambda one: one[0])]
 
 
 def _findings(
