@@ -64,11 +64,12 @@ def explain(
     graph = solved_around(people, solver, person, frame)
     near = np.abs(people.frame - frame) <= (_WINDOW_FRAMES if solver.config.temporal else 0)
     around = _Detections.of(people.rows(near), rig, solver.config, detections)
-    views, shares = _view_reasons(around, graph, person, frame, number, solver.config)
+    at = int(near[:row].sum())
+    views, shares = _view_reasons(around, graph, at, number, solver.config)
     here, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
     wrong = wrong_view(around.seen, around.people.joints, around.views, solver.config.estimator.observations)
-    refused = _refused(around, person, frame, number, detections)
+    refused = _refused(around, at, number, detections)
     findings = _findings(people, row, number, views, shares, wrong, refused)
     return Explanation(
         person, joint, frame, when if np.isfinite(when) else None,
@@ -131,55 +132,53 @@ def _with_strays(
     nearest to where it would be if the camera was turned as most of them have it. A camera that is off has few
     others, or none.
     """
-    found, spots = list[tuple[Array, ...]](), pixels / views.focal[:, None, :, None]
-    for frame in np.unique(table.frame).tolist():
-        if not 0 <= frame < len(detections):
-            continue
+    parts, focal = list[tuple[Array | Index, ...]](), np.broadcast_to(views.focal, (len(table), len(views)))
+    for frame in np.unique(table.frame[(table.frame >= 0) & (table.frame < len(detections))]).tolist():
         seen, here = detections[frame], np.flatnonzero(table.frame == frame)
-        free = np.flatnonzero(_owner(seen, table, here, here) < 0)
-        view, joint = seen.view[free], seen.joint[free]
-        row, k = np.nonzero(table.gate[here][:, joint, view] == Gate.NOT_SEEN)
-        row, view, joint, free = here[row], view[k], joint[k], free[k]
-        away = seen.xy[free] / views.focal[row % len(views.focal), view][:, None] - spots[row, joint, view]
+        free = np.flatnonzero(_owner(seen, table, here) < 0)
+        n, k = np.nonzero(table.gate[here][:, seen.joint[free], seen.view[free]] == Gate.NOT_SEEN)
+        row, free = here[n], free[k]
+        place = row, seen.joint[free], seen.view[free]
+        away = (seen.xy[free] - pixels[place]) / focal[row, seen.view[free]][:, None]
         near = np.linalg.norm(away, axis=-1) < _ASTRAY_RAD
-        found.append(tuple(c[near] for c in (row, joint, view, away, seen.xy[free], seen.confidence[free])))
-    if len(found) == 0:
+        parts.append(tuple(column[near] for column in (*place, away, seen.xy[free], seen.confidence[free])))
+    if len(parts) == 0:
         return rows
-    row, joint, view, away, at, score = (np.concatenate(column) for column in zip(*found, strict=True))
+    row, joint, view, away, at, score = (np.concatenate(column) for column in zip(*parts, strict=True))
     xy, confidence = rows.xy.copy(), rows.confidence.copy()
     for v in np.unique(view).tolist():
         mine = np.flatnonzero(view == v)
         off = np.linalg.norm(away[mine] - _commonest(away[mine]), axis=-1)
-        mine = mine[np.argsort(-off)][-int((off < _BESIDE_RAD).sum()) :] if (off < _BESIDE_RAD).any() else mine[:0]
-        place = row[mine], joint[mine], v  # the nearest is written last
-        xy[place], confidence[place] = at[mine], score[mine]
+        order = np.argsort(-off)  # the nearest is written last
+        mine = mine[order[off[order] < _BESIDE_RAD]]
+        xy[row[mine], joint[mine], v], confidence[row[mine], joint[mine], v] = at[mine], score[mine]
     return replace(rows, xy=xy, confidence=confidence)
 
 
 def _commonest(ways: Array) -> Array:
     """(2,) where ways (M, 2), radians, are densest."""
     edges = np.arange(-_ASTRAY_RAD, _ASTRAY_RAD + _BIN_RAD, _BIN_RAD)
-    count = np.histogram2d(*ways.T, bins=(edges, edges))[0]
-    window = np.lib.stride_tricks.sliding_window_view(np.pad(count, 1), (3, 3)).sum(axis=(-1, -2))
-    return edges[np.array(np.unravel_index(window.argmax(), window.shape))] + _BIN_RAD / 2
+    count = np.pad(np.histogram2d(*ways.T, bins=(edges, edges))[0], 1)
+    around = np.lib.stride_tricks.sliding_window_view(count, (3, 3)).sum(axis=(-1, -2))
+    return edges[np.array(np.unravel_index(around.argmax(), around.shape))] + _BIN_RAD / 2
 
 
-def _owner(seen: Detections, table: ObservationTable, rows: Index, names: Index) -> Index:
-    """(D,) to which of some `rows` of one frame each detection was given, by its name there; -1 for nobody."""
-    owner = np.full(len(seen), -1)
-    places = {at: k for k, at in enumerate(zip(seen.view.tolist(), seen.place.tolist(), strict=True))}
-    for n, name in zip(rows.tolist(), names.tolist(), strict=True):
-        _, view = np.nonzero(table.candidate[n] >= 0)
-        given = zip(view.tolist(), table.candidate[n][table.candidate[n] >= 0].tolist(), strict=True)
-        owner[[places[at] for at in given if at in places]] = name
-    return owner
+def _owner(seen: Detections, table: ObservationTable, rows: Index) -> Index:
+    """(D,) to which of some `rows` of one frame each detection was given, counted among them; -1 for nobody."""
+    given = table.candidate[rows]
+    n, joint, view = np.nonzero(given >= 0)
+    most = max(seen.place.max(initial=0), given.max(initial=0))
+    at = np.full((len(table.view_names), most + 1), len(seen))
+    at[seen.view, seen.place] = np.arange(len(seen))
+    owner = np.full(len(seen) + 1, -1)  # the last for those that are not in the recording
+    owner[at[view, given[n, joint, view]]] = n
+    return owner[:-1]
 
 
 def _view_reasons(
     all_of_it: _Detections,
     graph: PersonGraph | None,
-    person: int,
-    frame: int,
+    row: int,
     joint: int,
     config: PipelineConfig,
 ) -> tuple[tuple[ViewReason, ...], tuple[float, float]]:
@@ -190,11 +189,10 @@ def _view_reasons(
     as it would be without it: one Gauss-Newton step from where it is.
     """
     people, table = all_of_it.people, all_of_it.table
-    row = int(np.flatnonzero((people.person == person) & (people.frame == frame))[0])
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
     sigma, seen = all_of_it.seen.sigmas_px[row, joint], gates != Gate.NOT_SEEN
     place, whole, of_body = people.joints[row, joint], None, np.zeros((3, 3))
-    solved = [] if graph is None else np.flatnonzero(graph.frames == frame).tolist()
+    solved = [] if graph is None else np.flatnonzero(graph.frames == people.frame[row]).tolist()
     if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
         t, estimator = solved[0], config.estimator
         place, whole = graph.solved[t, joint], np.linalg.inv(graph.solved_covariance[t, joint])
@@ -248,60 +246,59 @@ def _view_reasons(
     return tuple(reasons), (known[-2], known[-1])
 
 
-def _looks_like(all_of_it: _Detections, row: int, joint: int, view: int, at: Array, sigma: float, off: float) -> str:
+def _looks_like(
+    all_of_it: _Detections, row: int, joint: int, view: int, at: Array, sigma: float, off: float
+) -> str:
     """Whose joint a detection at `at`, known to `sigma` and `off` from where it should be, pixels, rather is:
     another's of the same name, or one of the other side.
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
     here = np.flatnonzero(people.frame == people.frame[row])
     alike = np.array([j for j, name in enumerate(names) if name in (names[joint], _mirrored(names[joint]))])
-    xy, _, slope = (
-        each[:, :, view] for each in all_of_it.views.rows(here).project(people.joints[here][:, alike])
-    )
-    away = xy - at
-    spread = sigma**2 * np.eye(2) + slope @ people.covariance[here][:, alike] @ slope.mT
-    known = np.isfinite(away).all(axis=-1) & np.isfinite(spread).all(axis=(-1, -2))
-    known &= ~((here == row)[:, None] & (alike == joint)) & (np.linalg.norm(away, axis=-1) < _APART * off)
-    away, spread = np.where(known[..., None], away, 0.0)[..., None], np.where(known[..., None, None], spread, np.eye(2))
-    sigmas = np.where(known, np.sqrt((away.mT @ np.linalg.solve(spread, away))[..., 0, 0]), np.inf)
-    n, j = np.unravel_index(sigmas.argmin(), sigmas.shape)
-    return f"person {people.person[here[n]]}'s {names[alike[j]]}" if sigmas[n, j] < OFF_SIGMA else ""
+    points, covariance = people.joints[here][:, alike], people.covariance[here][:, alike]
+    xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(here).project(points))
+    away, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
+    known = np.isfinite(away).all(axis=(-1, -2)) & np.isfinite(spread).all(axis=(-1, -2))
+    known &= ~((here == row)[:, None] & (alike == joint))
+    squared = np.full(known.shape, np.inf)
+    squared[known] = (away[known].mT @ np.linalg.solve(spread[known], away[known]))[..., 0, 0]
+    squared[np.linalg.norm(away[..., 0], axis=-1) >= _APART * off] = np.inf
+    n, j = np.unravel_index(squared.argmin(), squared.shape)
+    return f"person {people.person[here[n]]}'s {names[alike[j]]}" if squared[n, j] < OFF_SIGMA**2 else ""
 
 
-def _refused(
-    all_of_it: _Detections, person: int, frame: int, joint: int, detections: DetectionSequence | None
-) -> list[Finding]:
+def _refused(all_of_it: _Detections, row: int, joint: int, detections: DetectionSequence | None) -> list[Finding]:
     """Detections of a joint in cameras that have none of it, which the detector joins with the person's own or
     which lie about there, and that are not theirs: given to somebody else, or to nobody.
     """
     people, table = all_of_it.people, all_of_it.table
+    frame = int(people.frame[row])
     if detections is None or not 0 <= frame < len(detections):
         return []
     seen, here = detections[frame], np.flatnonzero(people.frame == frame)
-    owner = _owner(seen, table, here, people.person[here])
-    row = int(here[people.person[here] == person][0])
+    owner, me = _owner(seen, table, here), int((here < row).sum())
     views = all_of_it.views.rows(np.array([row]))
     xy, depth = (each[0, 0] for each in views.pixels(people.joints[row, joint][None, None]))
     begin, other, affinity = seen.ties
-    found = list[tuple[float, Finding]]()
-    for k in np.flatnonzero((seen.joint == joint) & (owner != person)).tolist():
+    joined, beside = list[Finding](), list[tuple[float, Finding]]()
+    missed = table.gate[row, joint, seen.view] == Gate.NOT_SEEN
+    for k in np.flatnonzero((seen.joint == joint) & (owner != me) & missed).tolist():
         view, ends = int(seen.view[k]), slice(begin[k], begin[k + 1])
-        if table.gate[row, joint, view] != Gate.NOT_SEEN:
-            continue
-        with_whom, off = owner[other[ends]], float(np.linalg.norm(seen.xy[k] - xy[view]))
-        theirs, others = (affinity[ends][chosen].sum() for chosen in (with_whom == person, with_whom == owner[k]))
-        sigmas, whose = all_of_it.seen.sigmas_px[:, joint, view], f"person {owner[k]}'s"
+        name, off = str(table.view_names[view]), float(np.linalg.norm(seen.xy[k] - xy[view]))
+        theirs, others = (affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k]))
+        whose = f"person {people.person[here[owner[k]]]}'s"
         if owner[k] < 0:
-            usual, others = sigmas.sum() / max((sigmas > 0).sum(), 1), 0.0
+            sigmas, others = all_of_it.seen.sigmas_px[:, joint, view], 0.0
+            usual = sigmas.sum() / max((sigmas > 0).sum(), 1)
             whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off) or "nobody's"
-        name, cause = str(table.view_names[view]), Cause.GATED if whose == "nobody's" else Cause.FOREIGN
+        cause = Cause.GATED if whose == "nobody's" else Cause.FOREIGN
         if theirs > others:
-            words = f"Camera {name} joins a detection with theirs that is {whose}, {off:.0f} px off. It was not taken."
-            found.append((-1.0, Finding(cause, (name,), words)))
+            words = f"joins a detection with theirs that is {whose}, {off:.0f} px off. It was not taken."
+            joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
         elif whose == "nobody's" and off * depth[view] < _NEAR_M * views.focal[0, view]:
             words = f"Camera {name} has a detection {off:.0f} px off that nobody was given."
-            found.append((off, Finding(cause, (name,), words)))
-    return [each for _, each in sorted(found, key=lambda one: one[0])]
+            beside.append((off, Finding(cause, (name,), words)))
+    return joined + [each for _, each in sorted(beside, key=lambda one: one[0])]
 
 
 def _findings(
@@ -318,7 +315,9 @@ def _findings(
     problem = _problem(people, row, joint)
     if problem:
         found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
-    if wrong is not None:
+    told = _checked(people, row)
+    found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
+    if wrong is not None and all(views[wrong.view].camera not in each.cameras for each in found):
         name = views[wrong.view].camera
         words = (
             f"Camera {name} is off with whatever it sees around this time: turned by {wrong.turn_deg:.1f} degrees"
@@ -335,6 +334,7 @@ def _findings(
             found.append(Finding(Cause.FOREIGN, (view.camera,), words))
     named = {name for each in found for name in each.cameras}
     suspects = [view for view in suspects if view.camera not in named]
+    found += [each for each in told if each.cause == Cause.CONTRADICTION]
     against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
@@ -354,7 +354,7 @@ def _findings(
     for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
         words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
         found.append(Finding(Cause.GATED, (view.camera,), words))
-    found += refused
+    found += [each for each in refused if each.cameras[0] not in named]
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body says {shares[0]:.0%}, motion from other frames the rest."
@@ -374,6 +374,24 @@ def _problem(people: Reconstruction, row: int, joint: int) -> str:
         if same and each.get("joint") == people.joint_names[joint]:
             return str(each.get("reason"))
     return ""
+
+
+def _checked(people: Reconstruction, row: int) -> list[Finding]:
+    """Cameras that the set-up check left out of a row's frame, or doubted in it, as run.json has it."""
+    told, found = people.run.get("setup", {}), list[Finding]()
+    for key, cause, fate in (
+        ("left_out", Cause.WRONG_CAMERA, "left out"),
+        ("doubted", Cause.CONTRADICTION, "not believed"),
+    ):
+        spells = [(each["camera"], *each["frames"]) for each in told.get(key, ())]
+        cameras = tuple(name for name, first, last in spells if first <= people.frame[row] < last)
+        says = "; ".join(each["says"] for each in told.get("findings", ()) if {*each["cameras"]} & {*cameras})
+        if cameras:
+            words = (
+                f"By the set-up check {_cameras(cameras)} {'were' if len(cameras) > 1 else 'was'} {fate}: {says}."
+            )
+            found.append(Finding(cause, cameras, words))
+    return found
 
 
 def _taken(view: ViewReason) -> str:
