@@ -12,12 +12,13 @@ LASTS_S = 0.25
 """Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
 SURE_M = 0.02
 """Joints that views see are known to this, metres."""
-DRAWN_MOST = 8.0
-"""A joint known so many times better across than along is as doubtful at any more: few views are so bad."""
 CARRIED_MOST = 3.0
 """A joint that no view sees is as doubtful at any sigma over this many times as much: it has room enough then."""
 
-WEIGHTS = ("power", "unseen", "drawn", "association", "draft", "exchange")
+PERSON_MOST = 4.0
+"""A person known on average to this many times `SURE_M` is as doubtful at any more."""
+
+WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
 """What the file names beside the scales of joints, as `Calibration` has them."""
 
 
@@ -53,12 +54,12 @@ class Clues:
         return np.where(self.views == 0, np.clip(sigma_m / SURE_M, 1.0, CARRIED_MOST), 1.0)
 
     @property
-    def drawn(self) -> Array:
-        """(N, J) squared logarithm of the largest sigma over the least: how badly the joint's views cross."""
-        known = np.asarray(np.isfinite(self.covariance).all(axis=(-2, -1)))
-        values = np.linalg.eigvalsh(np.where(known[..., None, None], self.covariance, np.eye(3)))
-        ratio = values[..., 2] / np.maximum(values[..., 0], 1e-12)
-        return np.square(np.log(np.clip(ratio, 1.0, DRAWN_MOST**2)) / 2)
+    def person(self) -> Array:
+        """(N, 1) squared logarithm of the mean sigma of a person's joints over `SURE_M`, from 1 to `PERSON_MOST`."""
+        known = np.isfinite(self.covariance).all(axis=(-2, -1))
+        variance = np.where(known, np.trace(self.covariance, axis1=-2, axis2=-1) / 3, 0.0)
+        sigma_m = np.sqrt(variance).sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
+        return np.square(np.log(np.clip(sigma_m / SURE_M, 1.0, PERSON_MOST)))
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,6 @@ class Calibration:
     unseen: float
     """And, of a joint that no view sees, with its sigma over `SURE_M`, to this, where that is over 1: body and
     motion, which carry it then, err rarely and by much."""
-    drawn: float
-    """And by the exponential of this times how badly its views cross (`Clues.drawn`): of two cameras that face
-    each other, errors that the graph takes to be independent, of the body's joints and of frames, add up along the
-    line between them."""
     association: float
     """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
     frames are one."""
@@ -84,6 +81,9 @@ class Calibration:
     """Likewise."""
     exchange: float
     """Likewise: how probable it is that two limbs that both bodies can have are exchanged."""
+    person: float
+    """And all by the exponential of this times how badly the person is known as a whole (`Clues.person`): where
+    that is badly, detections are somebody else's more often, and nothing tells which."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":
@@ -98,9 +98,9 @@ class Calibration:
     def covariance(self, clues: Clues) -> Array:
         """(N, J, 3, 3) covariances to report, m²."""
         times = self.scale * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
-        times = times * np.exp(self.drawn * clues.drawn)
         added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
-        return times[..., None, None] * clues.covariance + added
+        whole = times[..., None, None] * clues.covariance + added
+        return np.exp(self.person * clues.person)[..., None, None] * whole
 
 
 def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:

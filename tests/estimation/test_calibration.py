@@ -23,20 +23,19 @@ def clues(**changed):
 
 def test_each_clue_widens_what_it_speaks_of():
     calibration = Calibration(
-        np.array([0.8]), power=0.5, unseen=2.0, drawn=0.4, association=7.0, draft=2.0, exchange=0.5
+        np.array([0.8]), power=0.5, unseen=2.0, association=7.0, draft=2.0, exchange=0.5, person=0.4
     )
     plain = calibration.covariance(clues())
     np.testing.assert_allclose(plain[0, 0], 0.8 * 4e-4 * I3)
     np.testing.assert_allclose(calibration.covariance(clues(disagreement=np.full((1, 1), 3.0))), 2 * plain)
     unseen = {"views": np.zeros((1, 1), dtype=int)}
     np.testing.assert_allclose(calibration.covariance(clues(**unseen)), plain, err_msg="it is known to 2 cm")
-    wider = {"covariance": 4 * clues().covariance}
-    np.testing.assert_allclose(calibration.covariance(clues(**unseen, **wider)), 2**2 * 4 * plain)
-    np.testing.assert_allclose(calibration.covariance(clues(**wider)), 4 * plain)
-    for times, most in ((5.0, 5.0), (30.0, 8.0)):  # so many times better across than along; 8 is the most
-        drawn = np.diag([1.0, 1.0, times**2]) * 4e-4
-        found = calibration.covariance(clues(covariance=drawn[None, None]))[0, 0]
-        np.testing.assert_allclose(found, 0.8 * np.exp(0.4 * np.log(most) ** 2) * drawn)
+    for times, most in ((2.0, 2.0), (10.0, 4.0)):  # the person is known to so many times 2 cm; 4 is the most
+        wider = {"covariance": times**2 * clues().covariance}
+        whole = np.exp(0.4 * np.log(most) ** 2) * times**2 * plain
+        np.testing.assert_allclose(calibration.covariance(clues(**wider)), whole)
+        carried = min(times, 3.0) ** 2
+        np.testing.assert_allclose(calibration.covariance(clues(**unseen, **wider)), carried * whole)
     along_x = np.diag([0.01, 0, 0])[None, None]
     for name, weight in (("association", 7.0), ("draft", 2.0), ("exchange", 0.5)):
         np.testing.assert_allclose(calibration.covariance(clues(**{name: along_x})), plain + weight * along_x)
@@ -49,7 +48,7 @@ def test_the_numbers_that_ship():
     assert all(by_name["L" + name[1:]] == scale for name, scale in by_name.items() if name.startswith("R"))
     assert min(found.scale) < by_name["Tail"] < max(found.scale) < 1.5
     assert by_name["Nose"] < by_name["RHip"], "a detector's hip is off for as long as somebody stands"
-    assert 0 < found.power < 2 and 0 < found.unseen < 2 and 0 < found.drawn < 1
+    assert 0 < found.power < 2 and 0 < found.unseen < 2 and 0 < found.person < 2
     assert found.association > 1, "doubts of neighbouring joints and frames are one"
     assert 0 < found.exchange < 1, "a probability"
     assert found.draft > 0
