@@ -184,16 +184,51 @@ def _gate(gate: Gate) -> str:
     return gate.name.lower().replace("_", " ")
 
 
+def with_turned(rig, view: int, degrees: float):
+    """The rig with a camera turned to the side."""
+    cameras = list(rig.cameras)
+    wTc = cameras[view].wTc.copy()
+    wTc[:3, :3] = wTc[:3, :3] @ Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
+    cameras[view] = replace(cameras[view], wTc=wTc)
+    return replace(rig, cameras=tuple(cameras))
+
+
 def test_a_camera_that_was_turned(people, scene):
     person, _, cameras = seen_by_many(people)
-    view, all_of_them = int(cameras[0]), list(scene.rig.cameras)
-    wTc = all_of_them[view].wTc.copy()
-    wTc[:3, :3] = wTc[:3, :3] @ Rotation.from_rotvec([0, np.radians(2.0), 0]).as_matrix()
-    all_of_them[view] = replace(all_of_them[view], wTc=wTc)
-    spoiled = replace(scene.rig, cameras=tuple(all_of_them))
+    view = int(cameras[0])
+    spoiled = with_turned(scene.rig, view, 2.0)
     found = asked(solved(people, spoiled), spoiled, person)
     assert first(found) == (Cause.WRONG_CAMERA, (scene.rig.names[view],))
     assert "turned by 2." in found.findings[0].words or "turned by 1.9" in found.findings[0].words
+
+
+def test_a_camera_of_which_hardly_anything_was_taken(scene):
+    """Turned by 4 degrees before anybody is sought, 28 cm at 4 m: what it saw was given to nobody, and tells. Of a
+    turn a part may as well be a shift.
+    """
+    rig, recording = with_turned(scene.rig, 3, 4.0), simulate(scene, seed=3)
+    found = reconstruct(recording, rig)
+    assert found.observations.used[:, :, 3].mean() < 0.05
+    person, _, _ = seen_by_many(found)
+    told = explain(found, rig, person=person, joint="LElbow", frame=5, detections=recording)
+    assert first(told) == (Cause.WRONG_CAMERA, (rig.names[3],))
+    assert float(told.findings[0].words.split("turned by ")[1].split()[0]) == pytest.approx(4.0, abs=1.0)
+    assert all(each.cause != Cause.WRONG_CAMERA for each in asked(found, rig, person).findings)
+
+
+def test_what_the_set_up_check_left_out_is_said(people, scene):
+    """In the frames that it says, and no others."""
+    person, _, _ = seen_by_many(people)
+    name, spell = scene.rig.names[2], {"camera": scene.rig.names[2], "frames": [3, 6]}
+    findings = [{"kind": "turned", "cameras": [name], "says": "it looks turned"}]
+    left_out = people.with_run(setup={"findings": findings, "left_out": [spell], "doubted": []})
+    told = asked(left_out, scene.rig, person)
+    assert first(told) == (Cause.WRONG_CAMERA, (name,))
+    assert "it looks turned" in told.words[1]
+    later = explain(left_out, scene.rig, person=person, joint="LElbow", frame=6)
+    assert all(each.cause != Cause.WRONG_CAMERA for each in later.findings)
+    doubted = people.with_run(setup={"findings": findings, "left_out": [], "doubted": [spell]})
+    assert first(asked(doubted, scene.rig, person)) == (Cause.CONTRADICTION, (name,))
 
 
 def test_the_command_says_the_same(people, scene, tmp_path, capsys):
