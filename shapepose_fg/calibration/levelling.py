@@ -4,7 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
@@ -12,16 +14,63 @@ from shapepose_fg.setup_check.diagnosis import build_of
 
 ADULT_M = 1.70
 """Mean stature of adults, of the body model as of the world's women and men."""
-_BONES = 0.932
-"""Stature as `build_of` has it, over stature: joints as detectors mark them lie inside anatomy's landmarks. Of the
-body model's mean person; its spread over persons is 2 %."""
+_BONES = (
+    ("Shoulder", "Hip", 0.311, 0.52),
+    ("Hip", "Knee", 0.227, 0.15),
+    ("Knee", "Ankle", 0.231, 0.15),
+    ("Shoulder", "Elbow", 0.155, 0.08),
+    ("Elbow", "Wrist", 0.153, 0.10),
+)
+"""Lengths between joints as parts of stature, of the body model's mean person, and how much each tells of the
+scale: the best linear estimate for four people, by the model's shape space and a detector that is off by 2 cm."""
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
-"""One sigma of the scale, as parts of it: what a person's bones vary by among adults, and among people of a known
-stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
+"""One sigma of the scale by these bones, as parts of it: what they vary by among adults, and among people of a
+known stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
+_TAPE_M = 0.02
+"""One sigma of a distance between lenses as it is measured with a tape."""
+_CONTRADICTS = 4.0
+"""Sigmas by which no measurement is off."""
 _LEAN_RAD = np.radians(3.0)
 """How far people's mean trunk leans: from it the floor is sought."""
 _ANKLE_M = 0.10
 """Ankles of who stands are so far above the floor."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What says how large the rig is: distances between cameras, or people's stature, or that they are adults."""
+
+    stature_m: float | None = None
+    """People's median stature; None for adults'."""
+    distances: tuple[tuple[int, int, float], ...] = ()
+    """Two cameras, and metres between their lenses; these decide where there are any."""
+
+    def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
+        """By how much the distances say that the cameras are too near each other, a factor, and its sigma.
+
+        ValueError where distances contradict each other.
+        """
+        rig, sides = adjusted.rig, np.array([[a, b] for a, b, _ in self.distances])
+        away = rig.centres[sides[:, 0]] - rig.centres[sides[:, 1]]
+        length, metres = np.linalg.norm(away, axis=1), np.array([each for *_, each in self.distances])
+        way, every = away / length[:, None], np.arange(len(sides))
+        change = np.zeros((len(sides), *adjusted.covariance.shape[:2]))
+        for side, sign in enumerate((1.0, -1.0)):
+            view = sides[:, side]
+            rotations = np.stack([camera.wTc[:3, :3] for camera in rig.cameras])[view]
+            change[every, view, MOVE] = sign * np.einsum("dji,dj->di", rotations, way)
+        variance = np.einsum("dvq,vqwr,dwr->d", change, adjusted.covariance, change)
+        sigma = np.hypot(np.sqrt(np.maximum(variance, 0.0)) / length, _TAPE_M / metres)
+        weight, said = 1 / sigma**2, np.log(metres / length)
+        log = float((weight * said).sum() / weight.sum())
+        off = np.abs(said - log) / sigma
+        if off.max() > _CONTRADICTS:
+            a, b, given = self.distances[int(off.argmax())]
+            raise ValueError(
+                f"cameras {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
+                f" {np.exp(log) * length[off.argmax()]:.2f} m apart, not {given:g} m; measure again"
+            )
+        return float(np.exp(log)), float(1 / np.sqrt(weight.sum()))
 
 
 @dataclass(frozen=True)
@@ -30,6 +79,8 @@ class World:
 
     sigma_scale: float
     """Of the scale, as a part of it, one sigma."""
+    stature_m: float
+    """Median stature of the people, metres, at this scale."""
     persons: int
     """People, as many as were seen at a time."""
     floor: Floor | None
@@ -38,11 +89,26 @@ class World:
     """How alike people stand: the length of their trunks' mean direction, 1 at the most."""
 
 
+def stature_of(points: Array, skeleton: Skeleton) -> float:
+    """Median stature of people (P, J, 3), J the core joints of `skeleton`, as their bones have it; in the points'
+    unit, NaN if nobody's bones are seen.
+    """
+    place = {skeleton.joints[joint]: index for index, joint in enumerate(skeleton.core)}
+    logs, weights = [0.0], [0.0]
+    for a, b, share, weight in _BONES:
+        sides = [(place[side + a], place[side + b]) for side in "RL" if {side + a, side + b} <= place.keys()]
+        lengths = np.array([np.linalg.norm(points[:, i] - points[:, j], axis=-1) for i, j in sides])
+        if np.isfinite(lengths).any():
+            logs.append(float(np.log(np.nanmedian(lengths) / share)))
+            weights.append(weight)
+    return float(np.exp(np.average(logs, weights=weights))) if len(logs) > 1 else np.nan
+
+
 def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
     """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if
     nobody's bones are seen.
     """
-    return float(_BONES * (stature_m or ADULT_M) / build_of(people.points, skeleton).stature)
+    return (stature_m or ADULT_M) / stature_of(people.points, skeleton)
 
 
 def scaled(rig: Rig, factor: float) -> Rig:
@@ -55,12 +121,18 @@ def scaled(rig: Rig, factor: float) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
+def at_once(people: People) -> int:
+    """How many people were seen at a time, in all but the fullest tenth."""
+    _, counts = np.unique(people.frame, return_counts=True)
+    return int(np.percentile(counts, 90)) if len(counts) > 0 else 0
+
+
 def sigma_of_scale(persons: int, known: bool) -> float:
     """One sigma of the scale, a part of it, from the bones of so many people, their stature `known` or not."""
     return float(np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON))
 
 
-def levelled(rig: Rig, people: People, skeleton: Skeleton, known: bool) -> tuple[Rig, World]:
+def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -> tuple[Rig, World]:
     """The rig with z up, the floor at 0, people in the middle, and y away from the first camera."""
     build = build_of(people.points, skeleton)
     upright = float(np.linalg.norm(build.up))
@@ -94,6 +166,5 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, known: bool) -> tuple
         wTc[:3] = R @ wTc[:3]
         wTc[:3, 3] += move
         cameras.append(replace(camera, wTc=wTc))
-    _, counts = np.unique(people.frame, return_counts=True)
-    persons = int(np.percentile(counts, 90)) if len(counts) > 0 else 0
-    return Rig(tuple(cameras), "z"), World(sigma_of_scale(persons, known), persons, floor, upright)
+    world = World(sigma_scale, stature_of(people.points, skeleton), at_once(people), floor, upright)
+    return Rig(tuple(cameras), "z"), world
