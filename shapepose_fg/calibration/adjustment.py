@@ -1,8 +1,8 @@
 """The solver: poses and lenses of all cameras, and joints of the people they see, in one factor graph (GTSAM).
 
 A joint seen by a camera is `ProjectionFactorPPPC` between pose, joint and lens, with a robust kernel; its fourth
-variable, where the lens sits on the camera's body, is held at nothing. `GeneralSFMFactor2` takes a joint behind the
-camera for one without error, and prints that. What is known of each camera beforehand is a prior on its pose and
+variable, where the lens sits on the camera's body, is held at zero. (`GeneralSFMFactor2` takes joints behind a
+camera for ones without error, and prints that.) What is known of each camera beforehand is a prior on its pose and
 its lens.
 """
 

@@ -14,6 +14,7 @@ import numpy as np
 from shapepose_fg.calibration.adjustment import FOCAL, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.levelling import (
+    ADULT_M,
     Measured,
     World,
     at_once,
@@ -45,6 +46,8 @@ _LEAST_PEOPLE = 10
 """People, one per frame, by whom cameras are adjusted at the least."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """A turn that is known worse than the first, or differs by more between halves of the recording, is not known."""
+_UNUSUAL = 3.0
+"""Sigmas of stature by which people are taken to be adults."""
 _FREE = Freedom(turn_deg=20.0, move_m=1.0)
 _FILM = (
     "film a minute of two or more people who walk through all that the cameras see, near and far, not on one line"
@@ -128,7 +131,7 @@ def calibrate(
 
     `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The scale is that of what
     was `measured`, or of adults. Cameras that are about as in `start` are not sought. Undetermined where cameras
-    share too little, or motion does not tell; ValueError where measured distances contradict each other.
+    share too little, or motion does not tell; Contradiction where measured distances do.
     """
     measured = measured or Measured()
     views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
@@ -164,7 +167,12 @@ def calibrate(
     new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, sigma)
     moved = new.cameras[0].wTc @ np.linalg.inv(adjusted.rig.cameras[0].wTc)
     people = replace(adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3])
-    return _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
+    found = _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
+    usual = _UNUSUAL * sigma_of_scale(world.persons, False)
+    if not measured.distances or abs(np.log(world.stature_m / ADULT_M)) < usual:
+        return found
+    tall = f"people come out {world.stature_m:.2f} m tall in the median"
+    return replace(found, notes=(f"{tall}; if they are adults, measure the cameras' distance again",))
 
 
 def _pairs(

@@ -36,6 +36,10 @@ _ANKLE_M = 0.10
 """Ankles of who stands are so far above the floor."""
 
 
+class Contradiction(ValueError):
+    """Distances that do not go together, in words."""
+
+
 @dataclass(frozen=True)
 class Measured:
     """What says how large the rig is: distances between cameras, or people's stature, or that they are adults."""
@@ -48,7 +52,7 @@ class Measured:
     def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
         """By how much the distances say that the cameras are too near each other, a factor, and its sigma.
 
-        ValueError where distances contradict each other.
+        Contradiction where distances do not go together.
         """
         rig, sides = adjusted.rig, np.array([[a, b] for a, b, _ in self.distances])
         away = rig.centres[sides[:, 0]] - rig.centres[sides[:, 1]]
@@ -66,7 +70,7 @@ class Measured:
         off = np.abs(said - log) / sigma
         if off.max() > _CONTRADICTS:
             a, b, given = self.distances[int(off.argmax())]
-            raise ValueError(
+            raise Contradiction(
                 f"cameras {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
                 f" {np.exp(log) * length[off.argmax()]:.2f} m apart, not {given:g} m; measure again"
             )
