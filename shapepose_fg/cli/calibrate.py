@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
 
 _CAMERAS = "What is known"
-_FILE_OFF, _GUESS_OFF = 0.02, 0.1
+_FILE_OFF, _GUESS_OFF = 0.02, 0.2
 """How far focal lengths of a calibration, and of a field of view, may be off, one sigma, as parts of them."""
 
 
@@ -69,7 +69,7 @@ def calibrate(
     seen: LensOptions,
     rate: RateOptions,
     focal: bool = option(
-        _CAMERAS, "Refine focal lengths: by 2 % of a calibration, 10 % of a field of view.", False
+        _CAMERAS, "Refine focal lengths: by 2 % of a calibration, 20 % of a field of view.", False
     ),
     stature: float | None = option(
         _CAMERAS, "People's median stature in metres; without it that of adults, 1.70."
