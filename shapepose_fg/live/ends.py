@@ -40,7 +40,7 @@ def views(where: str | None, rig: Rig, skeleton: Skeleton, note: Callable[[str],
     if where is not None and where.startswith("tcp:"):
         yield from _from_socket(where, rig, skeleton, note)
     elif where is not None and where.endswith(".mcap"):
-        yield from read_views(Path(where), rig, skeleton)
+        yield from read_views(Path(where), rig, skeleton, note)
     else:
         with ExitStack() as files:
             named = where not in (None, "-")
