@@ -131,7 +131,7 @@ def calibrate(
 
     `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The scale is that of what
     was `measured`, or of adults. Cameras that are about as in `start` are not sought. Undetermined where cameras
-    share too little, or motion does not tell; Contradiction where measured distances do.
+    share too little, or motion does not tell; InputError where measured distances do not go together.
     """
     measured = measured or Measured()
     views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS

@@ -8,6 +8,7 @@ from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 from shapepose_fg.setup_check.diagnosis import build_of
@@ -36,10 +37,6 @@ _ANKLE_M = 0.10
 """Ankles of who stands are so far above the floor."""
 
 
-class Contradiction(ValueError):
-    """Distances that do not go together, in words."""
-
-
 @dataclass(frozen=True)
 class Measured:
     """What says how large the rig is: distances between cameras, or people's stature, or that they are adults."""
@@ -52,7 +49,7 @@ class Measured:
     def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
         """By how much the distances say that the cameras are too near each other, a factor, and its sigma.
 
-        Contradiction where distances do not go together.
+        InputError where distances do not go together.
         """
         rig, sides = adjusted.rig, np.array([[a, b] for a, b, _ in self.distances])
         away = rig.centres[sides[:, 0]] - rig.centres[sides[:, 1]]
@@ -70,8 +67,8 @@ class Measured:
         off = np.abs(said - log) / sigma
         if off.max() > _CONTRADICTS:
             a, b, given = self.distances[int(off.argmax())]
-            raise Contradiction(
-                f"cameras {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
+            raise InputError(
+                f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
                 f" {np.exp(log) * length[off.argmax()]:.2f} m apart, not {given:g} m; measure again"
             )
         return float(np.exp(log)), float(1 / np.sqrt(weight.sum()))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
-from shapepose_fg.cli.found_cameras import check_most, report_option, show_clocks
+from shapepose_fg.cli.found_cameras import MOST_S, check_most, report_option, show_clocks
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
@@ -43,7 +43,9 @@ class LensOptions:
     skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
     calibration: Path | None = option(INPUT, "File of the lenses; its poses, if any, are not used.")
     field_of_view: list[str] | None = option(
-        INPUT, "Without one: degrees from left to right; of one camera, or several: CAMERA=DEGREES.", metavar="DEG"
+        INPUT,
+        "Without one: degrees from left to right, or a photo with EXIF; of one camera CAMERA=...",
+        metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Size of pictures where no file says it.", metavar="WxH")
 
@@ -81,7 +83,7 @@ def calibrate(
     times: Path | None = option(
         TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
     ),
-    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", 60.0),
+    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", MOST_S),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -92,7 +94,7 @@ def calibrate(
     determine the cameras; nothing is written then.
     """
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
-    from shapepose_fg.calibration.levelling import Contradiction, Measured
+    from shapepose_fg.calibration.levelling import Measured
     from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
     from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.calibration import write_rig
@@ -121,8 +123,6 @@ def calibrate(
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
-        except Contradiction as error:
-            raise InputError(f"--distance: {error}") from None
     note(*found.notes)
     write_rig(found.rig, output)
     if times is not None and clocks is not None:

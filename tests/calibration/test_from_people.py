@@ -11,7 +11,7 @@ from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.from_people import Undetermined, calibrate
-from shapepose_fg.calibration.levelling import Contradiction, Measured, scale_of, sigma_of_scale, stature_of
+from shapepose_fg.calibration.levelling import Measured, scale_of, sigma_of_scale, stature_of
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.relative import Relative, cross, refined_pose
 from shapepose_fg.cli.main import main
@@ -111,7 +111,7 @@ def test_measured_distances_say_the_scale(adjusted):
     both, surer = Measured(distances=((2, 0, 1.1 * away[2, 0]), (1, 3, 1.1 * away[3, 1]))).size_of(adjusted)
     assert both == pytest.approx(1.1) and surer < 0.8 * sigma
     wrong = ((2, 0, 1.1 * away[2, 0]), (1, 3, 1.1 * away[3, 1]), (1, 0, 1.3 * away[1, 0]))
-    with pytest.raises(Contradiction, match=r"cameras cam1 and cam0: people and .* put them .* m apart, not"):
+    with pytest.raises(InputError, match=r"distance of cam1 and cam0: people and .* put them .* m apart, not"):
         Measured(distances=wrong).size_of(adjusted)
 
 
@@ -199,6 +199,29 @@ def test_lenses_by_their_field_of_view(tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             lenses_of(tmp_path, fields, size)
+
+
+def test_lenses_by_a_photo(tmp_path):
+    """Of film's 36 x 24 mm a lens of 28 mm sees 75.4 degrees along the diagonal, whatever the picture's shape."""
+    image = pytest.importorskip("PIL.Image", reason='needs pip install "shapepose-fg[photos]"')
+    for name in ("left_json", "right_json"):
+        (tmp_path / name).mkdir()
+    exif = image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 28
+    image.new("RGB", (400, 300)).save(tmp_path / "phone.jpg", exif=exif)
+    image.new("RGB", (400, 300)).save(tmp_path / "bare.jpg")
+    (tmp_path / "torn.jpg").write_bytes((tmp_path / "phone.jpg").read_bytes()[:40])
+    along = 250 / np.tan(np.arctan(np.hypot(36, 24) / 2 / 28))  # pixels of the photo
+    for size in ((1920, 1080), (1080, 1920)):
+        rig = lenses_of(tmp_path, [str(tmp_path / "phone.jpg"), "right=60"], size)
+        np.testing.assert_allclose(rig.focal_px[0], along / 400 * 1920)
+    for name, said in (
+        ("bare", "does not say FocalLengthIn35mmFilm"),
+        ("torn", "cannot be read"),
+        ("no", "cannot"),
+    ):
+        with pytest.raises(InputError, match=rf"{name}\.jpg: .*{said}.*; give a photo as the camera wrote it"):
+            lenses_of(tmp_path, [str(tmp_path / f"{name}.jpg")], (640, 480))
 
 
 @pytest.mark.slow
