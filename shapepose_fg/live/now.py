@@ -93,7 +93,8 @@ class Newest:
         fit = self.fitter.fit_whole(JointTargets(np.where(known[..., None], joints.position, 0.0), information))
         of_body = fit.covariance + MODEL_SIGMA_M**2 * np.eye(3) + _FORGOTTEN * covariance
         surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(covariance, axis1=2, axis2=3)  # not where NaN
-        surer &= (now.views < 2) & (now.views >= 2).any(axis=1)[:, None]
+        seen = now.views >= 2
+        surer &= ~seen & seen.any(axis=1, keepdims=True)
         mean = joints.mean.copy()
         mean[surer, :3], covariance[surer] = fit.joints[surer], of_body[surer]
         covariance[~(known | surer)] = np.nan
