@@ -6,7 +6,6 @@ import numpy as np
 
 from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
-from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
@@ -15,17 +14,8 @@ from shapepose_fg.setup_check.diagnosis import build_of
 
 ADULT_M = 1.70
 """Mean stature of adults, of the body model as of the world's women and men."""
-_BONES = (
-    ("Shoulder", "Hip", 0.311, 0.52),
-    ("Hip", "Knee", 0.227, 0.15),
-    ("Knee", "Ankle", 0.231, 0.15),
-    ("Shoulder", "Elbow", 0.155, 0.08),
-    ("Elbow", "Wrist", 0.153, 0.10),
-)
-"""Lengths between joints as parts of stature, of the body model's mean person, and how much each tells of the
-scale: the best linear estimate for four people, by the model's shape space and a detector that is off by 2 cm."""
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
-"""One sigma of the scale by these bones, as parts of it: what they vary by among adults, and among people of a
+"""One sigma of the scale by `build_of`, as parts of it: what bones vary by among adults, and among people of a
 known stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
 _TAPE_M = 0.02
 """One sigma of a distance between lenses as it is measured with a tape."""
@@ -51,25 +41,25 @@ class Measured:
 
         InputError where distances do not go together.
         """
-        rig, sides = adjusted.rig, np.array([[a, b] for a, b, _ in self.distances])
-        away = rig.centres[sides[:, 0]] - rig.centres[sides[:, 1]]
-        length, metres = np.linalg.norm(away, axis=1), np.array([each for *_, each in self.distances])
-        way, every = away / length[:, None], np.arange(len(sides))
-        change = np.zeros((len(sides), *adjusted.covariance.shape[:2]))
-        for side, sign in enumerate((1.0, -1.0)):
-            view = sides[:, side]
-            rotations = np.stack([camera.wTc[:3, :3] for camera in rig.cameras])[view]
-            change[every, view, MOVE] = sign * np.einsum("dji,dj->di", rotations, way)
-        variance = np.einsum("dvq,vqwr,dwr->d", change, adjusted.covariance, change)
-        sigma = np.hypot(np.sqrt(np.maximum(variance, 0.0)) / length, _TAPE_M / metres)
+        rig, V = adjusted.rig, len(adjusted.rig)
+        length, metres = np.empty(len(self.distances)), np.array([each for *_, each in self.distances])
+        sigma = np.empty(len(self.distances))
+        for n, (a, b, _) in enumerate(self.distances):
+            away = rig.centres[a] - rig.centres[b]
+            length[n] = np.linalg.norm(away)
+            change = np.zeros((V, adjusted.covariance.shape[1]))
+            for view, sign in ((a, 1.0), (b, -1.0)):
+                change[view, MOVE] = sign * rig.cameras[view].wTc[:3, :3].T @ away / length[n]
+            variance = np.einsum("vq,vqwr,wr->", change, adjusted.covariance, change)
+            sigma[n] = np.hypot(np.sqrt(max(variance, 0.0)) / length[n], _TAPE_M / metres[n])
         weight, said = 1 / sigma**2, np.log(metres / length)
-        log = float((weight * said).sum() / weight.sum())
-        off = np.abs(said - log) / sigma
-        if off.max() > _CONTRADICTS:
-            a, b, given = self.distances[int(off.argmax())]
+        log = float(np.average(said, weights=weight))
+        worst = int(np.abs((said - log) / sigma).argmax())
+        if abs(said[worst] - log) > _CONTRADICTS * sigma[worst]:
+            a, b, given = self.distances[worst]
             raise InputError(
                 f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
-                f" {np.exp(log) * length[off.argmax()]:.2f} m apart, not {given:g} m; measure again"
+                f" {np.exp(log) * length[worst]:.2f} m apart, not {given:g} m; measure again"
             )
         return float(np.exp(log)), float(1 / np.sqrt(weight.sum()))
 
@@ -90,26 +80,11 @@ class World:
     """How alike people stand: the length of their trunks' mean direction, 1 at the most."""
 
 
-def stature_of(points: Array, skeleton: Skeleton) -> float:
-    """Median stature of people (P, J, 3), J the core joints of `skeleton`, as their bones have it; in the points'
-    unit, NaN if nobody's bones are seen.
-    """
-    place = {skeleton.joints[joint]: index for index, joint in enumerate(skeleton.core)}
-    logs, weights = [0.0], [0.0]
-    for a, b, share, weight in _BONES:
-        sides = [(place[side + a], place[side + b]) for side in "RL" if {side + a, side + b} <= place.keys()]
-        lengths = np.array([np.linalg.norm(points[:, i] - points[:, j], axis=-1) for i, j in sides])
-        if np.isfinite(lengths).any():
-            logs.append(float(np.log(np.nanmedian(lengths) / share)))
-            weights.append(weight)
-    return float(np.exp(np.average(logs, weights=weights))) if len(logs) > 1 else np.nan
-
-
 def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
     """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if
     nobody's bones are seen.
     """
-    return (stature_m or ADULT_M) / stature_of(people.points, skeleton)
+    return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
 
 
 def scaled(rig: Rig, factor: float) -> Rig:
@@ -167,5 +142,5 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -
         wTc[:3] = R @ wTc[:3]
         wTc[:3, 3] += move
         cameras.append(replace(camera, wTc=wTc))
-    world = World(sigma_scale, stature_of(people.points, skeleton), at_once(people), floor, upright)
+    world = World(sigma_scale, build.stature, at_once(people), floor, upright)
     return Rig(tuple(cameras), "z"), world

@@ -8,14 +8,13 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
-from shapepose_fg.calibration.levelling import stature_of
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.setup_check.diagnosis import diagnose
+from shapepose_fg.setup_check.diagnosis import build_of, diagnose
 from shapepose_fg.setup_check.findings import Kind
 from shapepose_fg.setup_check.fit import difference
 
@@ -158,7 +157,7 @@ def refine(
         )
     was, now = (float(np.nanmedian(each)) for each in missed)
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
-    stature = stature_of(found[0].people.points, detections.skeleton)
+    stature = build_of(found[0].people.points, detections.skeleton).stature
     notes = tuple(_undetermined(found[0], freedom, counts))
     return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature)
 

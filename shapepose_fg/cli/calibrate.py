@@ -102,8 +102,6 @@ def calibrate(
 
     if stature is not None and not 0.5 <= stature <= 2.5:
         raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
-    if stature is not None and distance:
-        raise InputError("--stature and --distance: one of them says the scale; leave the stature out")
     check_most(most)
     if times is not None and rate.timestamps is not None:
         raise InputError("--times and --timestamps: when frames were taken is sought, or known; give one of them")

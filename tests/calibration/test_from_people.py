@@ -11,7 +11,7 @@ from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.from_people import Undetermined, calibrate
-from shapepose_fg.calibration.levelling import Measured, scale_of, sigma_of_scale, stature_of
+from shapepose_fg.calibration.levelling import Measured, scale_of, sigma_of_scale
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.relative import Relative, cross, refined_pose
 from shapepose_fg.cli.main import main
@@ -24,6 +24,7 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.lenses import lenses_of
 from shapepose_fg.io.write_detections import write_openpose
+from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.scene import keypoints_of
 from tests.calibration.conftest import FPS, off_by
@@ -84,14 +85,14 @@ def test_bones_say_how_tall_somebody_is():
     betas = np.random.default_rng(0).normal(size=(40, body.num_betas))
     statures = statures_m(betas, read_body())
     stands = keypoints_of(body, Motion.still(betas))[0][:, list(BODY_25.core)]
-    said = np.array([stature_of(each[None], BODY_25) for each in stands])
+    said = np.array([build_of(each[None], BODY_25).stature for each in stands])
     # The model's shape space leaves 0.9 %; limbs alone, legs and arms alike, would leave 2.4.
     assert np.std(said / statures) < 0.012 and np.mean(said / statures) == pytest.approx(1, abs=0.005)
     # Whose trunk and right leg are hidden is as tall, about; of whom nothing is seen nobody knows.
     stands[:, [8, 9, 10, 11, 12]] = np.nan
-    arms = np.array([stature_of(each[None], BODY_25) for each in stands])
+    arms = np.array([build_of(each[None], BODY_25).stature for each in stands])
     np.testing.assert_allclose(arms / statures, 1, atol=0.13)
-    assert np.isnan(stature_of(np.full((2, 15, 3), np.nan), BODY_25))
+    assert np.isnan(build_of(np.full((2, 15, 3), np.nan), BODY_25).stature)
 
 
 @pytest.fixture(scope="module")
@@ -263,7 +264,6 @@ def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, caps
     for more, said in (
         (["--distance=cam0=3"], "give two cameras and metres, such as cam0,cam1=3.42"),
         (["--distance=cam0,cam2=-1"], "must be 0.05 to 1000 metres"),
-        (["--distance=cam0,cam2=3", "--stature=1.8"], "one of them says the scale"),
     ):
         code, _, error = run(*lenses, *more)
         assert code == 2 and said in error

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust, misfit
-from shapepose_fg.calibration.levelling import stature_of
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.refinement import dilution, refine
 from shapepose_fg.cli.main import main
@@ -17,6 +16,7 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
+from shapepose_fg.setup_check.diagnosis import build_of
 from tests.calibration.conftest import FPS, disturbed, off_by
 
 TIMES = FrameTimes.from_fps(FPS, 250)
@@ -54,7 +54,7 @@ def test_disturbed_cameras_come_back(rig, recording, people):
     wide, before = (np.linalg.norm(np.diff(each.centres, axis=0)) for each in (found.of_stature(1.8), found.rig))
     assert wide / before == pytest.approx(1.8 / found.stature_m)
     bones = people[:, :, list(BODY_25.core)].reshape(-1, 15, 3)
-    assert found.stature_m == pytest.approx(stature_of(bones, BODY_25), rel=0.02)
+    assert found.stature_m == pytest.approx(build_of(bones, BODY_25).stature, rel=0.02)
 
 
 @pytest.mark.slow
