@@ -20,12 +20,21 @@ from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
-from shapepose_fg.setup_check.findings import Finding, Kind
+from shapepose_fg.setup_check.findings import Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import GAIN, GOOD_PAIR, Change, Lag, gross_mistake, judged, lag_of, lags
+from shapepose_fg.setup_check.hypotheses import (
+    GAIN,
+    GOOD_PAIR,
+    Change,
+    Lag,
+    judged,
+    lag_of,
+    lags,
+    mistake_of_cameras,
+)
 from shapepose_fg.setup_check.matching import same_frame
-from shapepose_fg.setup_check.over_time import parted, stories
-from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
+from shapepose_fg.setup_check.over_time import parted
+from shapepose_fg.setup_check.small import ONE, SHIFT, Problem, SmallErrors
 
 _SAME_PX = 0.6
 """Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""
@@ -235,7 +244,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
 
 def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | None:
     """The mistake that explains most: of a camera all the time, or from some time on, or of one person."""
-    camera, bias = _of_cameras(look, rng), problem.bias
+    camera, bias = mistake_of_cameras(look, rng), problem.bias
     if bias is None:
         return camera
     finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)))
@@ -243,20 +252,6 @@ def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | No
     # Of one person alone a bias and a turn look alike, and nobody is accused.
     more = 0.0 if camera is None else judged(look, camera) - judged(look, person)
     return person if more <= GAIN / look.view_count else camera
-
-
-def _of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
-    """The camera's mistake that explains most."""
-    gross = gross_mistake(look, rng)
-    views = range(look.view_count if look.cameras_used > 2 else 0)
-    over_time = [story for view in views for story in stories(look, view, rng)]
-    if len(over_time) == 0:
-        return gross
-    best = max(over_time, key=lambda story: story.gain)
-    elsewhere = gross is not None and gross.finding.cameras != best.finding.cameras
-    if gross is not None and elsewhere and gross.look.total > best.look.total:
-        return gross
-    return Change(best.finding, best.look, 0.0, freedom=6)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
@@ -319,14 +314,14 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 
 def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
-    (gain, view, kind), sure = problem.singles[0], problem.sure
+    (gain, view, _), sure = problem.singles[0], problem.sure
     log = np.abs(np.log(small.focal))
     if gain > _LIKELY and sure > _SURE_OF_ONE and view not in known:
-        found, _ = problem.single(view, kind)
-        large = abs(np.log(found.amount)) > _OFF_FOCAL if kind == Kind.FOCAL else found.amount > _OFF_DEG
+        told = [each for each, _ in problem.explained(view, look.views, dict.fromkeys(ONE, look.views))]
+        found = one_of([replace(each, sure=sure * each.sure) for each in told])
+        large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _OFF_DEG
         if large:
-            x, y = small.centre_px[view].tolist()
-            return [replace(found, sure=sure, shift_px=((x, y),) if found.kind == Kind.TURNED else found.shift_px)]
+            return [found]
     largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
     if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
         return []
@@ -345,7 +340,8 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
     first, second = shift[order[:2]]
     alone = problem.likely(int(order[0])) > 0 and first > _OUTLIER_RATIO * second
     if tells_apart and first > _OUTLIER_DEG and alone:
-        findings.append(_turned(shifted, int(order[0])))
+        angle = float(np.hypot(shifted.shift_deg[order[0]], shifted.roll_deg[order[0]]))
+        findings.append(Finding(Kind.TURNED, (int(order[0]),), angle))
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)
     if len(rest) > 0:
@@ -362,12 +358,6 @@ def _off(problem: Problem, small: SmallErrors, shifted: SmallErrors) -> tuple[Ma
     turned = (np.hypot(small.shift_deg, roll) > _OFF_DEG) & sure
     turned |= (small.shift_deg > _OFF_DEG) & (shifted.cost < _MOST_COST)
     return turned, (log > _OFF_FOCAL) & (log > _SIGMAS * focal_sigma)
-
-
-def _turned(small: SmallErrors, view: int) -> Finding:
-    x, y = small.centre_px[view].tolist()
-    angle = float(np.hypot(small.shift_deg[view], small.roll_deg[view]))
-    return Finding(Kind.TURNED, (view,), angle, ((x, y),))
 
 
 def _unfit(look: Look, known: set[int]) -> list[Finding]:

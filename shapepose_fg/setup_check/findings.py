@@ -1,10 +1,8 @@
 """What may be wrong with a set-up, and how it is said: which camera, what it looks like, and what to do."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
-
-import numpy as np
 
 from shapepose_fg.core.camera import Rig
 
@@ -60,6 +58,24 @@ class Finding:
     """The probability that it is this, and not another mistake or none, as far as the detections tell."""
     same: str = ""
     """In what alone two cameras are one, if not in both: "pose" or "detections"."""
+    instead: "tuple[Finding, ...]" = ()
+    """What else it may be, likeliest first; their `sure` are their probabilities."""
+
+
+_NOT_UNLIKELY = 0.05
+"""An explanation with less probability is not said."""
+
+
+def one_of(found: Sequence[Finding]) -> Finding:
+    """The likeliest of findings, which exclude each other, with the others that are not unlikely beside it."""
+    sure: dict[tuple[Kind, tuple[int, ...]], float] = {}
+    first: dict[tuple[Kind, tuple[int, ...]], Finding] = {}
+    for each in sorted(found, key=lambda each: -each.sure):
+        what = each.kind, each.cameras
+        sure[what] = sure.get(what, 0.0) + each.sure
+        first.setdefault(what, each)
+    told = sorted((replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure)
+    return replace(told[0], instead=tuple(each for each in told[1:] if each.sure >= _NOT_UNLIKELY))
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
@@ -92,24 +108,24 @@ def sentence(finding: Finding, rig: Rig) -> str:
         up=rig.up,
     )
     said += f" (probability {finding.sure:.2f})" if finding.sure < 0.95 else ""
+    for other in finding.instead:
+        what = sentence(replace(other, sure=1.0, instead=()), rig).split(";")[0]
+        said += f"; or {what} ({other.sure:.2f})"
     return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
 
 
 def _turned(finding: Finding, side_px: int) -> str:
-    turned = "{who} looks turned by about {degrees} degrees"
-    if len(finding.shift_px) == 0:
-        return f"{turned}{' and moved by {moved}' if finding.moved > 0.1 else ''}; calibrate its pose again"
-    if np.hypot(*finding.shift_px[0]) < 0.002 * side_px:
-        return f"{turned} about its axis; calibrate its pose again"
-    instead = "(or its principal point should lie {shift}, which people hardly tell from a turn)"
-    return f"{turned} {instead}; calibrate it again"
+    return (
+        "{who} looks turned by about {degrees} degrees"
+        + (" and moved by {moved}" if finding.moved > 0.1 else "")
+        + "; calibrate its pose again"
+    )
 
 
 def _principal_point(finding: Finding, side_px: int) -> str:
     cure = "check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
     if len(finding.cameras) == 1:
-        instead = "(or the camera is turned by {degrees} degrees, which people hardly tell from it)"
-        return f"the principal point of {{who}} looks off, it should lie {{shift}} {instead}; {cure}"
+        return f"the principal point of {{who}} looks off, it should lie {{shift}}; {cure}"
     return f"principal points look off, they should lie {{shifts}} (at most a turn of {{degrees}} degrees); {cure}"
 
 

@@ -46,18 +46,11 @@ Way = Callable[[Index], Array]
 """From frames (S,) to rotation vectors (S, 3): how a camera is turned in each, about its own axes."""
 
 
-@dataclass(frozen=True)
-class Story:
-    """What a camera may have done over time, and the recording as if it had not."""
+def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[Finding, Look, int]]:
+    """What one camera did over time, if that explains what it saw better than a pose that lasts.
 
-    finding: Finding
-    look: Look
-    gain: float
-    """By how much the likelihood's logarithm rises over that of the best pose that lasts."""
-
-
-def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[Story]:
-    """What one camera did over time, if that explains what it saw better than a pose that lasts."""
+    Each with the recording as if it had not, and how many parameters that took.
+    """
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     if len(others) < 4 * _LEAST_PEOPLE or len(seen) < 4 * _LEAST_PEOPLE:
         return
@@ -76,7 +69,7 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[Story]:
         after = match(others, warped(seen, camera, way(seen.frame)), camera).score
         gain = likelihood(after, worth, freedom) - before
         if gain > _SURE and finding.amount > _LEAST_DEG:
-            yield Story(replace(finding, cameras=(view,)), _as_if_still(look, view, way), gain)
+            yield replace(finding, cameras=(view,)), _as_if_still(look, view, way), freedom
 
 
 def _as_if_still(look: Look, view: int, way: Way) -> Look:

@@ -4,7 +4,7 @@ The points are not known, so that what a change moves *along with the points* ex
 them (bundle adjustment).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, partial
 
@@ -41,6 +41,8 @@ _BIAS, _LIKELY_BIAS = 0.1, 2.0
 """A detector's bias on one person, part of the size (one sigma), and how much likelier than
 none it must be to be taken away."""
 _MOST_PEOPLE = 160
+_TURN_DEG = 1.0
+"""A camera that is moved and turned by more is called turned."""
 _WEAK = 1e-6
 """The information that a point has without any view, as a part of what it has: two rays may be parallel."""
 
@@ -246,6 +248,7 @@ class Problem:
     def small_errors(self, parts: Parts = ALL) -> SmallErrors:
         """What small errors of the cameras the residuals look like, with a sparse prior."""
         views, change, cost = self._solved(partial(_sparse_step, parts))
+        cost /= max(_cost(self.structure), 1e-12)
         shift_deg = np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px)
         return SmallErrors(
             change[:, CENTRE], shift_deg, np.rad2deg(change[:, 2]), np.exp(change[:, 8]), views, cost
@@ -289,36 +292,55 @@ class Problem:
         mine = np.array([each[1] == view for each in self.singles])
         return float(weights[mine].sum() / (weights.sum() + np.exp(-max(gain, 0.0))))
 
-    def single(self, view: int, kind: Kind) -> tuple[Finding, float]:
-        """That change of one camera alone, and what remains of the residuals' cost."""
-        columns = np.array(ONE[kind]) + Q * view
+    def explained(self, view: int, given: Views, starts: Mapping[Kind, Views]) -> list[tuple[Finding, Views]]:
+        """What one camera alone may have wrong, likeliest first, against the cameras as `given`.
 
-        def step(normal: Normal, structure: Structure, total: Array) -> Array:
-            change = np.zeros_like(total)
-            change[columns] = normal.solve(columns)
-            return change
+        Each of the `starts` has the camera already as it is after that mistake, or nearly.
+        """
+        found = []
+        for kind, start in starts.items():
+            columns = np.array(ONE[kind]) + Q * view
 
-        views, change, cost = self._solved(step)
-        turn, moved = difference(self.views.cTw[view], views.cTw[view])
-        if kind == Kind.FOCAL:
-            return Finding(kind, (view,), float(np.exp(-change[view, FOCAL[0]]))), cost
-        if kind == Kind.PRINCIPAL_POINT:
-            x, y = change[view, CENTRE].tolist()
-            return Finding(
-                kind, (view,), float(np.rad2deg(np.hypot(x, y) / views.focal_px[view])), ((x, y),)
-            ), cost
-        return Finding(Kind.TURNED if turn > 1 else kind, (view,), turn, moved=moved), cost
+            def step(normal: Normal, structure: Structure, total: Array, columns: Index = columns) -> Array:
+                change = np.zeros_like(total)
+                change[columns] = normal.solve(columns)
+                return change
 
-    def _solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:
+            views, _, cost = self._solved(step, start)
+            found.append((-_PRIOR * cost - self._price * len(columns), named(kind, view, given, views), views))
+        best = max((likely for likely, _, _ in found), default=0.0)
+        total = sum(np.exp(likely - best) for likely, _, _ in found)
+        told = [(replace(each, sure=float(np.exp(x - best) / total)), views) for x, each, views in found]
+        return sorted(told, key=lambda each: -each[0].sure)
+
+    def _solved(
+        self, step: Callable[[Normal, Structure, Array], Array], start: Views | None = None
+    ) -> tuple[Views, Array, float]:
         """Cameras after steps (V Q,), which are told their sum so far; the sum (V, Q); the cost that remains."""
-        views, structure, normal, total = self.views, self.structure, self.normal, np.zeros(len(self.views) * Q)
-        for number in range(_ROUNDS):
-            normal = normal_equations(structure, views) if number > 0 else normal
+        views, structure, normal, total = self.views, self.structure, None, np.zeros(len(self.views) * Q)
+        if start is None:
+            normal = self.normal
+        else:
+            views, structure = start, triangulate(*self.seen, start, 4)
+        for _ in range(_ROUNDS):
+            normal = normal_equations(structure, views) if normal is None else normal
             change = step(normal, structure, total)
-            total = total + change
+            normal, total = None, total + change
             views = changed(views, change.reshape(-1, Q))
             structure = triangulate(*self.seen, views, 4)
-        return views, total.reshape(-1, Q), _cost(structure) / max(_cost(self.structure), 1e-12)
+        return views, total.reshape(-1, Q), _cost(structure)
+
+
+def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
+    """A change of one camera alone, in what the calibration has over what fits."""
+    if kind == Kind.FOCAL:
+        return Finding(kind, (view,), float(given.K[view, 0, 0] / views.K[view, 0, 0]))
+    if kind == Kind.PRINCIPAL_POINT:
+        x, y = (views.K - given.K)[view, :2, 2].tolist()
+        degrees = float(np.rad2deg(np.hypot(x, y) / views.focal_px[view]))
+        return Finding(kind, (view,), degrees, ((x, y),))
+    turn, moved = difference(given.cTw[view], views.cTw[view])
+    return Finding(Kind.TURNED if turn > _TURN_DEG else kind, (view,), turn, moved=moved)
 
 
 def _sparse_step(parts: Parts, normal: Normal, structure: Structure, total: Array) -> Array:
