@@ -34,7 +34,7 @@ from shapepose_fg.setup_check.hypotheses import (
 )
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted
-from shapepose_fg.setup_check.small import ONE, SHIFT, Problem, SmallErrors
+from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
 
 _SAME_PX = 0.6
 """Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""
@@ -247,8 +247,7 @@ def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | No
     camera, bias = mistake_of_cameras(look, rng), problem.bias
     if bias is None:
         return camera
-    finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)))
-    person = Change(finding, problem.unbiased(look, bias), 0.0, freedom=2)
+    person = Change(problem.biased, problem.unbiased(look, bias), 0.0, freedom=2)
     # Of one person alone a bias and a turn look alike, and nobody is accused.
     more = 0.0 if camera is None else judged(look, camera) - judged(look, person)
     return person if more <= GAIN / look.view_count else camera
@@ -317,8 +316,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
     (gain, view, _), sure = problem.singles[0], problem.sure
     log = np.abs(np.log(small.focal))
     if gain > _LIKELY and sure > _SURE_OF_ONE and view not in known:
-        told = [each for each, _ in problem.explained(view, look.views, dict.fromkeys(ONE, look.views))]
-        found = one_of([replace(each, sure=sure * each.sure) for each in told])
+        found = one_of(problem.kinds(view, sure))
         large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _OFF_DEG
         if large:
             return [found]

@@ -62,8 +62,8 @@ class Finding:
     """What else it may be, likeliest first; their `sure` are their probabilities."""
 
 
-_NOT_UNLIKELY = 0.05
-"""An explanation with less probability is not said."""
+SURE = 0.95
+"""Of what has more probability nothing is said of it, nor of what else it may be."""
 
 
 def one_of(found: Sequence[Finding]) -> Finding:
@@ -75,7 +75,7 @@ def one_of(found: Sequence[Finding]) -> Finding:
         sure[what] = sure.get(what, 0.0) + each.sure
         first.setdefault(what, each)
     told = sorted((replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure)
-    return replace(told[0], instead=tuple(each for each in told[1:] if each.sure >= _NOT_UNLIKELY))
+    return replace(told[0], instead=tuple(each for each in told[1:] if each.sure >= 1 - SURE))
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
@@ -107,7 +107,7 @@ def sentence(finding: Finding, rig: Rig) -> str:
         when=_when(*finding.frames),
         up=rig.up,
     )
-    said += f" (probability {finding.sure:.2f})" if finding.sure < 0.95 else ""
+    said += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
     for other in finding.instead:
         what = sentence(replace(other, sure=1.0, instead=()), rig).split(";")[0]
         said += f"; or {what} ({other.sure:.2f})"

@@ -16,7 +16,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import KERNEL, Look, Structure, observed, triangulate
-from shapepose_fg.setup_check.findings import Finding, Kind
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
 from shapepose_fg.setup_check.matching import Groups, least_of_each
 
@@ -40,6 +40,9 @@ _LEAST_OF_ONE = 6
 _BIAS, _LIKELY_BIAS = 0.1, 2.0
 """A detector's bias on one person, part of the size (one sigma), and how much likelier than
 none it must be to be taken away."""
+_TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
+"""How large a camera's small mistake usually is (one sigma): a turn, or a shift of the picture as large; a move, part
+of the people's distance; the logarithm of the focal length."""
 _MOST_PEOPLE = 160
 _TURN_DEG = 1.0
 """A camera that is moved and turned by more is called turned."""
@@ -219,7 +222,8 @@ class Problem:
                 slope = size @ g[:, columns]
                 shift = -np.linalg.solve(matrix + np.eye(2) / (_PRIOR * _BIAS**2), slope)
                 gain = -0.5 * _PRIOR * float(slope @ shift)
-                found.append((gain - self._price * len(CENTRE), Bias(person, view, shift)))
+                price = 0.5 * float(np.linalg.slogdet(np.eye(2) + _PRIOR * _BIAS**2 * matrix)[1])
+                found.append((gain - price, Bias(person, view, shift)))
         return sorted(found, key=lambda each: -each[0])
 
     @property
@@ -229,6 +233,14 @@ class Problem:
             return None
         gain, bias = self.biases[0]
         return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - _LIKELY_BIAS) else None
+
+    @property
+    def biased(self) -> Finding:
+        """The largest of the `biases`, and what its camera may have wrong instead."""
+        gain, bias = self.biases[0]
+        sure = 1 / (1 + float(np.exp(self.likely(bias.view) - gain)))
+        finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)), sure=sure)
+        return one_of([finding, *(self.kinds(bias.view, 1 - sure) if sure < SURE else [])])
 
     def unbiased(self, look: Look, bias: Bias) -> Look:
         """The recording as if the person had been seen where the others see that person."""
@@ -266,23 +278,27 @@ class Problem:
 
     @cached_property
     def singles(self) -> "list[tuple[float, int, Kind]]":
-        """Each change of one camera alone, best first: the likelihood's logarithm less BIC's price; view; kind."""
+        """Each change of one camera alone, best first: the likelihood's logarithm less its price; view; kind."""
         found = []
         for view in range(len(self.views)):
             for kind, parts in ONE.items():
                 columns = np.array(parts) + Q * view
                 gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
-                found.append((_PRIOR * gain - self._price * len(parts), view, kind))
+                found.append((_PRIOR * gain - self._price(columns), view, kind))
         return sorted(found, key=lambda each: -each[0])
 
     def likely(self, view: int) -> float:
         """How much likelier some mistake of one camera is than none: see `singles`."""
         return max(gain for gain, of, _ in self.singles if of == view)
 
-    @property
-    def _price(self) -> float:
-        """What a parameter costs, by BIC."""
-        return 0.5 * float(np.log(max(_PRIOR * 2 * float(np.isfinite(self.structure.miss_px).sum()), 2.0)))
+    def _price(self, columns: Index) -> float:
+        """What parameters of a camera cost: by how much (logarithm) the detections narrow down what is usual."""
+        depth = float(np.nanmedian(self.structure.depth))
+        usual = np.tile([_TURN, _TURN, _TURN, *[_MOVE * depth] * 3, 0.0, 0.0, _FOCAL], (len(self.views), 1))
+        usual[:, CENTRE] = _TURN * self.views.focal_px[:, None]
+        usual = usual.ravel()[columns]
+        narrowed = np.eye(len(columns)) + _PRIOR * usual[:, None] * self.normal.H[np.ix_(columns, columns)] * usual
+        return 0.5 * float(np.linalg.slogdet(narrowed)[1])
 
     @property
     def sure(self) -> float:
@@ -291,6 +307,11 @@ class Problem:
         weights = np.exp(np.array([each[0] for each in self.singles]) - max(gain, 0.0))
         mine = np.array([each[1] == view for each in self.singles])
         return float(weights[mine].sum() / (weights.sum() + np.exp(-max(gain, 0.0))))
+
+    def kinds(self, view: int, sure: float) -> list[Finding]:
+        """What one camera has wrong if it has something, which is so with the probability `sure`."""
+        told = self.explained(view, self.views, dict.fromkeys(ONE, self.views))
+        return [replace(each, sure=sure * each.sure) for each, _ in told]
 
     def explained(self, view: int, given: Views, starts: Mapping[Kind, Views]) -> list[tuple[Finding, Views]]:
         """What one camera alone may have wrong, likeliest first, against the cameras as `given`.
@@ -307,7 +328,7 @@ class Problem:
                 return change
 
             views, _, cost = self._solved(step, start)
-            found.append((-_PRIOR * cost - self._price * len(columns), named(kind, view, given, views), views))
+            found.append((-_PRIOR * cost - self._price(columns), named(kind, view, given, views), views))
         best = max((likely for likely, _, _ in found), default=0.0)
         total = sum(np.exp(likely - best) for likely, _, _ in found)
         told = [(replace(each, sure=float(np.exp(x - best) / total)), views) for x, each, views in found]
