@@ -342,6 +342,8 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         findings.append(Finding(Kind.TURNED, (int(order[0]),), angle))
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)
+    if len(rest) == 1:
+        return [*findings, one_of(problem.kinds(int(rest[0]), 1.0))]
     if len(rest) > 0:
         shifts = tuple((float(x), float(y)) for x, y in shifted.centre_px[rest])
         findings.append(Finding(Kind.PRINCIPAL_POINT, tuple(rest.tolist()), float(shift.max()), shifts))

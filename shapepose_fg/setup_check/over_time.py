@@ -23,7 +23,7 @@ _LEAST_PEOPLE = 6
 """Fewer people of the others say nothing of a piece."""
 _RESTLESS = 0.03
 """A camera is looked at closely if it sees people so far apart in two pieces, a part of their size: 5 cm."""
-_LOST, _THERE, _GOOD = 0.25, 0.3, 0.45
+_LOST, _THERE, _GOOD = 0.2, 0.2, 0.45
 """Or if its score differs by the first; a piece says something from the second on (in crowds sound cameras come
 to little more), and below the third other turns than its neighbours' are tried."""
 _LEAST_DEG = 1.2

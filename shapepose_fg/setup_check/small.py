@@ -41,7 +41,7 @@ _BIAS, _LIKELY_BIAS = 0.1, 2.0
 """A detector's bias on one person, part of the size (one sigma), and how much likelier than
 none it must be to be taken away."""
 _TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
-"""How large a camera's small mistake usually is (one sigma): a turn, or a shift of the picture as large; a move, part
+"""How large a small mistake of a camera usually is (one sigma): a turn, or a shift as large; a move, part
 of the people's distance; the logarithm of the focal length."""
 _MOST_PEOPLE = 160
 _TURN_DEG = 1.0
@@ -186,6 +186,8 @@ class Problem:
     """(N, V) the sightings of all people, -1 for none."""
     who: Index
     """(N,) who each is."""
+    frame: Index
+    """(N,) when."""
     step: int
     """Of these N every so many is in `structure`."""
 
@@ -198,7 +200,8 @@ class Problem:
         structure = triangulate(*seen, views, 5)
         one = [Structure(*(each[n : n + 1] for each in astuple(structure))) for n in range(len(structure.points))]
         parts = tuple(normal_equations(each, views) for each in one)
-        return cls(seen, views, structure, parts, groups.member, followed(groups.frame, all_people.points), step)
+        who = followed(groups.frame, all_people.points)
+        return cls(seen, views, structure, parts, groups.member, who, groups.frame, step)
 
     @cached_property
     def normal(self) -> Normal:
@@ -285,7 +288,34 @@ class Problem:
                 columns = np.array(parts) + Q * view
                 gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
                 found.append((_PRIOR * gain - self._price(columns), view, kind))
+        found += [(gain, *each.cameras, each.kind) for gain, each in self.over_time]
         return sorted(found, key=lambda each: -each[0])
+
+    @cached_property
+    def over_time(self) -> list[tuple[float, Finding]]:
+        """Each camera's turn in the frames before or after one, and its turn that grows or ends: as `singles`."""
+        if len(self.parts) == 0:
+            return []
+        frame, found = self.frame[:: self.step], list[tuple[float, Finding]]()
+        H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
+        steps, t = np.unique(frame)[1:], (frame - frame.min()) / max(np.ptp(frame), 1)
+        after = frame >= steps[:, None]
+        ends = [(None, at) for at in steps.tolist()] + [(at, None) for at in steps.tolist()] + [(None, None)] * 2
+        part = np.concatenate([~after, after, [1 - t, t]])
+        for view in range(len(self.views)):
+            columns = np.array(TURN) + Q * view
+            matrix = np.einsum("wn,nij->wij", part**2, H[:, columns[:, None], columns])
+            slope = part @ g[:, columns]
+            turn = -np.linalg.solve(matrix + np.eye(3) / (_PRIOR * _TURN**2), slope[..., None])[..., 0]
+            gain = -0.5 * _PRIOR * (slope * turn).sum(axis=1)
+            gain -= 0.5 * np.linalg.slogdet(np.eye(3) + _PRIOR * _TURN**2 * matrix)[1]
+            degrees = np.rad2deg(np.linalg.norm(turn, axis=1))
+            for kind, which in ((Kind.BUMPED, slice(0, -2)), (Kind.DRIFTING, slice(-2, None))):
+                if len(gain[which]) > 0:
+                    best = int(np.arange(len(gain))[which][np.argmax(gain[which])])
+                    finding = Finding(kind, (view,), float(degrees[best]), frames=ends[best])
+                    found.append((float(gain[best] - np.log(len(gain[which]))), finding))
+        return found
 
     def likely(self, view: int) -> float:
         """How much likelier some mistake of one camera is than none: see `singles`."""
@@ -310,8 +340,14 @@ class Problem:
 
     def kinds(self, view: int, sure: float) -> list[Finding]:
         """What one camera has wrong if it has something, which is so with the probability `sure`."""
+        gains = [(gain, kind) for gain, of, kind in self.singles if of == view]
+        weight = np.exp([gain - gains[0][0] for gain, _ in gains])
+        share = {kind: sure * each / weight.sum() for (_, kind), each in zip(gains, weight, strict=True)}
         told = self.explained(view, self.views, dict.fromkeys(ONE, self.views))
-        return [replace(each, sure=sure * each.sure) for each, _ in told]
+        lasting = sum(share[kind] for kind in ONE)
+        found = [replace(each, sure=float(lasting * each.sure)) for each, _ in told]
+        moving = [each for _, each in self.over_time if each.cameras == (view,)]
+        return found + [replace(each, sure=float(share[each.kind])) for each in moving]
 
     def explained(self, view: int, given: Views, starts: Mapping[Kind, Views]) -> list[tuple[Finding, Views]]:
         """What one camera alone may have wrong, likeliest first, against the cameras as `given`.
