@@ -79,14 +79,23 @@ def one_of(found: Sequence[Finding]) -> Finding:
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
-    """What was found, as it is printed."""
+    """What was found, as it is printed, with what else it may be."""
+    said = _words(finding, rig)
+    said += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
+    for each in finding.instead:
+        said += f"; or {_words(each, rig).split(';')[0]} ({each.sure:.2f})"
+    return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
+
+
+def _words(finding: Finding, rig: Rig) -> str:
+    """The sentence without its probability."""
     words, amount = _WORDS[finding.kind], finding.amount
     names = [rig.names[view] for view in finding.cameras]
     all_of_them = len(names) == len(rig) > 2
     width, height = rig.cameras[finding.cameras[0] if names else 0].image_size
     shifts = [_shift(x, y) for x, y in finding.shift_px]
     count = abs(round(amount))
-    said = (words if isinstance(words, str) else words(finding, max(width, height))).format(
+    return (words if isinstance(words, str) else words(finding, max(width, height))).format(
         who="all cameras" if all_of_them else " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:]))),
         first=names[0] if names else "",
         second=names[-1] if names else "",
@@ -107,11 +116,6 @@ def sentence(finding: Finding, rig: Rig) -> str:
         when=_when(*finding.frames),
         up=rig.up,
     )
-    said += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
-    for other in finding.instead:
-        what = sentence(replace(other, sure=1.0, instead=()), rig).split(";")[0]
-        said += f"; or {what} ({other.sure:.2f})"
-    return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
 
 
 def _turned(finding: Finding, side_px: int) -> str:
@@ -231,8 +235,7 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.UNFIT: _unfit,
     Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit they do not"
     " tell; check it in frames with fewer",
-    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs"
-    " there, or, if nobody else is in the picture, the camera may be turned",
+    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }

@@ -17,8 +17,9 @@ from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import KERNEL, Look, Structure, observed, triangulate
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Pinhole, Q, changed, difference
 from shapepose_fg.setup_check.matching import Groups, least_of_each
+from shapepose_fg.setup_check.over_time import unturned
 
 _ROLL = [2]
 Parts = tuple[tuple[list[int], float], ...]
@@ -43,7 +44,7 @@ none it must be to be taken away."""
 _TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
 """How large a small mistake of a camera usually is (one sigma): a turn, or a shift as large; a move, part
 of the people's distance; the logarithm of the focal length."""
-_MOST_PEOPLE = 160
+_MOST_PEOPLE, _MOST_BIASES = 160, 4
 _TURN_DEG = 1.0
 """A camera that is moved and turned by more is called turned."""
 _WEAK = 1e-6
@@ -216,7 +217,7 @@ class Problem:
         if len(self.parts) == 0:
             return []
         H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
-        who, found = self.who[:: self.step], list[tuple[float, Bias]]()
+        who, found = self.who[:: self.step], list[tuple[float, float, Bias]]()
         for person in np.flatnonzero(np.bincount(who) >= _LEAST_OF_ONE).tolist():
             for view in range(len(self.views)):
                 columns, size = np.array(CENTRE) + Q * view, np.nan_to_num(self.structure.size_px[:, view])
@@ -226,8 +227,15 @@ class Problem:
                 shift = -np.linalg.solve(matrix + np.eye(2) / (_PRIOR * _BIAS**2), slope)
                 gain = -0.5 * _PRIOR * float(slope @ shift)
                 price = 0.5 * float(np.linalg.slogdet(np.eye(2) + _PRIOR * _BIAS**2 * matrix)[1])
-                found.append((gain - price, Bias(person, view, shift)))
-        return sorted(found, key=lambda each: -each[0])
+                found.append((gain - price, price, Bias(person, view, shift)))
+        found = sorted(found, key=lambda each: -each[0])[:_MOST_BIASES]
+        return sorted([(self._gain(self.views, self._beside(b)) - p, b) for _, p, b in found], key=lambda e: -e[0])
+
+    def _beside(self, bias: Bias) -> Array:
+        """The detections `seen` without a bias."""
+        xy, mine = self.seen[0].copy(), self.who[:: self.step] == bias.person
+        xy[mine, :, bias.view] -= bias.shift * self.structure.size_px[mine, bias.view, None, None]
+        return xy
 
     @property
     def bias(self) -> Bias | None:
@@ -286,10 +294,17 @@ class Problem:
         for view in range(len(self.views)):
             for kind, parts in ONE.items():
                 columns = np.array(parts) + Q * view
-                gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
-                found.append((_PRIOR * gain - self._price(columns), view, kind))
+                change = np.zeros(Q * len(self.views))
+                change[columns] = self.normal.solve(columns)
+                gain = self._gain(changed(self.views, change.reshape(-1, Q)), self.seen[0])
+                found.append((gain - self._price(columns), view, kind))
         found += [(gain, *each.cameras, each.kind) for gain, each in self.over_time]
         return sorted(found, key=lambda each: -each[0])
+
+    def _gain(self, views: Views, xy: Array) -> float:
+        """By how much the likelihood's logarithm is higher with other cameras, or other detections."""
+        structure = triangulate(xy, *self.seen[1:], views, 4)
+        return _PRIOR * (_cost(self.structure) - _cost(structure))
 
     @cached_property
     def over_time(self) -> list[tuple[float, Finding]]:
@@ -307,14 +322,17 @@ class Problem:
             matrix = np.einsum("wn,nij->wij", part**2, H[:, columns[:, None], columns])
             slope = part @ g[:, columns]
             turn = -np.linalg.solve(matrix + np.eye(3) / (_PRIOR * _TURN**2), slope[..., None])[..., 0]
-            gain = -0.5 * _PRIOR * (slope * turn).sum(axis=1)
-            gain -= 0.5 * np.linalg.slogdet(np.eye(3) + _PRIOR * _TURN**2 * matrix)[1]
-            degrees = np.rad2deg(np.linalg.norm(turn, axis=1))
+            worth = -0.5 * _PRIOR * (slope * turn).sum(axis=1)
+            price = 0.5 * np.linalg.slogdet(np.eye(3) + _PRIOR * _TURN**2 * matrix)[1]
             for kind, which in ((Kind.BUMPED, slice(0, -2)), (Kind.DRIFTING, slice(-2, None))):
-                if len(gain[which]) > 0:
-                    best = int(np.arange(len(gain))[which][np.argmax(gain[which])])
-                    finding = Finding(kind, (view,), float(degrees[best]), frames=ends[best])
-                    found.append((float(gain[best] - np.log(len(gain[which]))), finding))
+                if len(worth[which]) == 0:
+                    continue
+                best = int(np.arange(len(worth))[which][np.argmax((worth - price)[which])])
+                xy, camera = self.seen[0].copy(), Pinhole(self.views.K[view], self.views.cTw[view])
+                xy[:, :, view] = unturned(xy[:, :, view], camera, part[best][:, None] * turn[best])
+                gain = self._gain(self.views, xy) - price[best] - np.log(len(worth[which]))
+                degrees = float(np.rad2deg(np.linalg.norm(turn[best])))
+                found.append((float(gain), Finding(kind, (view,), degrees, frames=ends[best])))
         return found
 
     def likely(self, view: int) -> float:
