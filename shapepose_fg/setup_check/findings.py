@@ -235,7 +235,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.UNFIT: _unfit,
     Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit they do not"
     " tell; check it in frames with fewer",
-    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs",
+    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others see that person: the"
+    " detector errs",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }
