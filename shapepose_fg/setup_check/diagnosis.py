@@ -316,9 +316,11 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
     (gain, view, _), sure = problem.singles[0], problem.sure
     log = np.abs(np.log(small.focal))
     if gain > _LIKELY and sure > _SURE_OF_ONE and view not in known:
-        found = one_of(problem.kinds(view, sure))
+        told = problem.kinds(view, sure)
+        found, views = one_of([each for each, _ in told]), told[0][1]
         large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _OFF_DEG
-        if large:
+        # Where another camera is off without this mistake, several are.
+        if large and (views is look.views or Problem.of(replace(look, views=views)).singles[0][0] < 0):
             return [found]
     largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
     if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
@@ -343,7 +345,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         shift[order[0]] = 0.0
     rest = np.flatnonzero(shift > _NOTABLE_DEG)
     if len(rest) == 1:
-        return [*findings, one_of(problem.kinds(int(rest[0]), 1.0))]
+        return [*findings, one_of([each for each, _ in problem.kinds(int(rest[0]), 1.0)])]
     if len(rest) > 0:
         shifts = tuple((float(x), float(y)) for x, y in shifted.centre_px[rest])
         findings.append(Finding(Kind.PRINCIPAL_POINT, tuple(rest.tolist()), float(shift.max()), shifts))

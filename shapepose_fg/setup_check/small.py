@@ -44,6 +44,8 @@ none it must be to be taken away."""
 _TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
 """How large a small mistake of a camera usually is (one sigma): a turn, or a shift as large; a move, part
 of the people's distance; the logarithm of the focal length."""
+_LEAST_PART = 8
+"""A camera is bumped neither in the first of so many parts of the recording nor in the last."""
 _MOST_PEOPLE, _MOST_BIASES = 160, 4
 _TURN_DEG = 1.0
 """A camera that is moved and turned by more is called turned."""
@@ -251,7 +253,10 @@ class Problem:
         gain, bias = self.biases[0]
         sure = 1 / (1 + float(np.exp(self.likely(bias.view) - gain)))
         finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)), sure=sure)
-        return one_of([finding, *(self.kinds(bias.view, 1 - sure) if sure < SURE else [])])
+        if sure >= SURE:
+            return finding
+        camera = one_of([each for each, _ in self.kinds(bias.view, 1 - sure)])
+        return replace(finding, instead=(replace(camera, instead=()), *camera.instead))
 
     def unbiased(self, look: Look, bias: Bias) -> Look:
         """The recording as if the person had been seen where the others see that person."""
@@ -313,7 +318,8 @@ class Problem:
             return []
         frame, found = self.frame[:: self.step], list[tuple[float, Finding]]()
         H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
-        steps, t = np.unique(frame)[1:], (frame - frame.min()) / max(np.ptp(frame), 1)
+        steps, t = np.unique(frame), (frame - frame.min()) / max(np.ptp(frame), 1)
+        steps = steps[1 + len(steps) // _LEAST_PART : len(steps) - len(steps) // _LEAST_PART]
         after = frame >= steps[:, None]
         ends = [(None, at) for at in steps.tolist()] + [(at, None) for at in steps.tolist()] + [(None, None)] * 2
         part = np.concatenate([~after, after, [1 - t, t]])
@@ -356,16 +362,17 @@ class Problem:
         mine = np.array([each[1] == view for each in self.singles])
         return float(weights[mine].sum() / (weights.sum() + np.exp(-max(gain, 0.0))))
 
-    def kinds(self, view: int, sure: float) -> list[Finding]:
-        """What one camera has wrong if it has something, which is so with the probability `sure`."""
+    def kinds(self, view: int, sure: float) -> list[tuple[Finding, Views]]:
+        """What one camera has wrong if it has something, which is so with probability `sure`: see `explained`."""
         gains = [(gain, kind) for gain, of, kind in self.singles if of == view]
         weight = np.exp([gain - gains[0][0] for gain, _ in gains])
         share = {kind: sure * each / weight.sum() for (_, kind), each in zip(gains, weight, strict=True)}
         told = self.explained(view, self.views, dict.fromkeys(ONE, self.views))
         lasting = sum(share[kind] for kind in ONE)
-        found = [replace(each, sure=float(lasting * each.sure)) for each, _ in told]
+        found = [(replace(each, sure=float(lasting * each.sure)), views) for each, views in told]
         moving = [each for _, each in self.over_time if each.cameras == (view,)]
-        return found + [replace(each, sure=float(share[each.kind])) for each in moving]
+        found += [(replace(each, sure=float(share[each.kind])), self.views) for each in moving]
+        return sorted(found, key=lambda each: -each[0].sure)
 
     def explained(self, view: int, given: Views, starts: Mapping[Kind, Views]) -> list[tuple[Finding, Views]]:
         """What one camera alone may have wrong, likeliest first, against the cameras as `given`.
