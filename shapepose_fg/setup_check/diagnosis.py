@@ -167,8 +167,8 @@ _MOST_COST = 0.86
 _OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
 """Where several cameras have small errors, one that is off by so much, and so many times the next, is turned."""
 _NOTABLE_DEG = 0.25
-_LIKELY, _SURE_OF_ONE = 1.0, 0.7
-"""One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less BIC's
+_LIKELY, _SURE_OF_ONE = 1.0, 0.5
+"""One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less its
 price), and of all cameras' mistakes with this probability its own."""
 _NOBODY = 0.05
 """With fewer people than this for each sighting, cameras see no people in common."""
@@ -313,12 +313,11 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 
 def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
-    (gain, view, _), sure = problem.singles[0], problem.sure
-    log = np.abs(np.log(small.focal))
-    if gain > _LIKELY and sure > _SURE_OF_ONE and view not in known:
-        told = problem.kinds(view, sure)
+    (gain, view, _), log = problem.singles[0], np.abs(np.log(small.focal))
+    if gain > _LIKELY and problem.guilt[view] > _SURE_OF_ONE and view not in known:
+        told = problem.causes()
         found, views = one_of([each for each, _ in told]), told[0][1]
-        large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _OFF_DEG
+        large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _NOTABLE_DEG
         # Where another camera is off without this mistake, several are.
         if large and (views is look.views or Problem.of(replace(look, views=views)).singles[0][0] < 0):
             return [found]
@@ -375,7 +374,8 @@ def _unfit(look: Look, known: set[int]) -> list[Finding]:
         fits = look.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
         return [] if fits else [Finding(Kind.UNFIT, everybody, float(look.scores[0]))]
     bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
-    return [Finding(Kind.UNFIT, (view,), float(look.scores[view])) for view in bad if view not in known]
+    bad = tuple(view for view in bad if view not in known)
+    return [Finding(Kind.UNFIT, bad, float(look.scores[list(bad)].min()))] if bad else []
 
 
 def _of_people(build: Build, rig: Rig) -> list[Finding]:

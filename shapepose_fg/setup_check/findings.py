@@ -100,6 +100,7 @@ def _words(finding: Finding, rig: Rig) -> str:
         first=names[0] if names else "",
         second=names[-1] if names else "",
         sees="sees" if len(names) == 1 else "see",
+        others="each other" if len(names) == len(rig) else "the others",
         amount=amount,
         degrees=f"{amount:.1f}" if amount < 10 else f"{amount:.0f}",
         percent=100 * abs(amount - (finding.kind not in (Kind.STOPPED, Kind.BIASED))),
@@ -201,7 +202,7 @@ def _unfit(finding: Finding, side_px: int) -> str:
     if len(finding.cameras) == 1:
         return f"{{who}} fits the others in nothing that was tried; {check}"
     since = "" if finding.frames == (None, None) else " {when}, while they agree else: one of them was moved"
-    return f"{{who}} contradict each other{since}; {check.replace('its', 'their')}"
+    return f"{{who}} contradict {{others}}{since}; {check.replace('its', 'their')}"
 
 
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {

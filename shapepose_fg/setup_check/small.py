@@ -354,13 +354,19 @@ class Problem:
         narrowed = np.eye(len(columns)) + _PRIOR * usual[:, None] * self.normal.H[np.ix_(columns, columns)] * usual
         return 0.5 * float(np.linalg.slogdet(narrowed)[1])
 
-    @property
-    def sure(self) -> float:
-        """The probability that the camera of the first of `singles` is to blame, and not another, or none."""
-        gain, view, _ = self.singles[0]
-        weights = np.exp(np.array([each[0] for each in self.singles]) - max(gain, 0.0))
-        mine = np.array([each[1] == view for each in self.singles])
-        return float(weights[mine].sum() / (weights.sum() + np.exp(-max(gain, 0.0))))
+    @cached_property
+    def guilt(self) -> dict[int, float]:
+        """The probability of each camera to be the one with a mistake, likeliest first; the rest is of none."""
+        gains = np.array([each[0] for each in self.singles])
+        weights = np.exp(gains - max(gains.max(), 0.0))
+        weights /= weights.sum() + np.exp(-max(gains.max(), 0.0))
+        of = np.bincount([view for _, view, _ in self.singles], weights, len(self.views))
+        return {view: float(of[view]) for view in np.argsort(-of).tolist()}
+
+    def causes(self) -> list[tuple[Finding, Views]]:
+        """What one camera may have wrong, likeliest first, as `kinds`, of all cameras that are not unlikely."""
+        found = [each for view, sure in self.guilt.items() if sure > 1 - SURE for each in self.kinds(view, sure)]
+        return sorted(found, key=lambda each: -each[0].sure)
 
     def kinds(self, view: int, sure: float) -> list[tuple[Finding, Views]]:
         """What one camera has wrong if it has something, which is so with probability `sure`: see `explained`."""
