@@ -241,11 +241,11 @@ class Problem:
 
     @property
     def bias(self) -> Bias | None:
-        """One person's bias, if it explains the residuals better than any camera's mistake."""
+        """One person's bias, if it explains the residuals and no camera's mistake surely does so better."""
         if len(self.biases) == 0:
             return None
         gain, bias = self.biases[0]
-        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - _LIKELY_BIAS) else None
+        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - np.log(SURE / (1 - SURE))) else None
 
     @property
     def biased(self) -> Finding:
