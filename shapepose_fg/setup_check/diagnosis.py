@@ -314,7 +314,8 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
     """Small errors that are worth naming: of one camera, or of several."""
     (gain, view, _), log = problem.singles[0], np.abs(np.log(small.focal))
-    if gain > _LIKELY and problem.guilt[view] > _SURE_OF_ONE and view not in known:
+    one = look.cameras_used > 2 and gain > _LIKELY and problem.guilt[view] > _SURE_OF_ONE
+    if one and view not in known:
         told = problem.causes()
         found, views = one_of([each for each, _ in told]), told[0][1]
         large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _NOTABLE_DEG
