@@ -241,17 +241,20 @@ def _drifted(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Wa
     return Finding(Kind.DRIFTING, (), amount), way, 6
 
 
-_PARTED, _LEAST_PART = 0.3, 0.15
-_POOR = {2: 0.5}
-_POOR_OF_MORE = 0.25
-"""Cameras stop to agree where their score falls by so much, with this part of the people on either side, and to so
-little: two cameras whose rays have only to meet to more than three or more, of which one that is turned by 3
-degrees leaves 0.16; people who hide each other before three sound cameras leave 0.3 to 0.5."""
+_PARTED, _LEAST_PART, _POOR = 0.3, 0.15, 0.5
+"""Two cameras, whose rays have only to meet, stop to agree where their score falls by so much, with this part of
+the people on either side, and to so little."""
 
 
 def parted(look: Look) -> tuple[int | None, int | None] | None:
-    """The frames in which cameras do not agree, where they do in the others."""
-    fits, possible = (np.cumsum(each) for each in _agreement(look))
+    """The frames in which two cameras do not agree, where they do in the others; of more, `stories` are told."""
+    views, last = np.unique(look.sightings.view).tolist(), int(look.sightings.frame.max()) + 1
+    if len(views) != 2:
+        return None
+    groups, error, _ = look.pair(*views)
+    counts = [np.bincount(look.seen_by(view).frame, minlength=last) for view in views]
+    fits = np.cumsum(np.bincount(groups.frame, 1 - error / GATE, minlength=last))
+    possible = np.cumsum(np.minimum(*counts))
     if possible[-1] == 0:
         return None
     rest = possible[-1] - possible
@@ -259,23 +262,6 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
     enough = np.minimum(possible, rest) > _LEAST_PART * possible[-1]
     at = int(np.argmax(np.where(enough, np.abs(before - after) * np.sqrt(possible * rest), 0.0)))
     low, high = sorted((before[at], after[at]))
-    if not enough[at] or high - low < _PARTED or low > _POOR.get(look.cameras_used, _POOR_OF_MORE):
+    if not enough[at] or high - low < _PARTED or low > _POOR:
         return None
     return (None, at + 1) if before[at] < after[at] else (at + 1, None)
-
-
-def _agreement(look: Look) -> tuple[Array, Array]:
-    """How well people fit in each frame (`Match.score` times their number), and how many could."""
-    views, last = np.unique(look.sightings.view).tolist(), int(look.sightings.frame.max()) + 1
-    if len(views) == 2:
-        groups, error, _ = look.pair(*views)
-        counts = [np.bincount(look.seen_by(view).frame, minlength=last) for view in views]
-        fits = np.bincount(groups.frame, 1 - error / GATE, minlength=last)
-        return np.asarray(fits, dtype=np.float64), np.minimum(*counts) * 1.0
-    fits, possible = np.zeros(last), np.zeros(last)
-    for view in views:
-        others, seen = look.others(view), look.seen_by(view)
-        found = match(others, seen, look.camera(view))
-        fits += np.bincount(others.frame[found.person], 1 - found.error / GATE, minlength=last)
-        possible += np.minimum(*(np.bincount(each.frame, minlength=last) for each in (others, seen)))
-    return fits, possible
