@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
-from shapepose_fg.cli.found_cameras import check_most, report_option, show_clocks, write_page
+from shapepose_fg.cli.found_cameras import MOST_S, check_most, report_option, show_clocks, write_page
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
@@ -42,7 +42,9 @@ class LensOptions:
     skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
     calibration: Path | None = option(INPUT, "File of the lenses; its poses, if any, are not used.")
     field_of_view: list[str] | None = option(
-        INPUT, "Without one: degrees from left to right; of one camera, or several: CAMERA=DEGREES.", metavar="DEG"
+        INPUT,
+        "Without one: degrees from left to right, or a photo with EXIF; of one camera CAMERA=...",
+        metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Size of pictures where no file says it.", metavar="WxH")
 
@@ -77,7 +79,7 @@ def calibrate(
     times: Path | None = option(
         TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
     ),
-    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", 60.0),
+    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", MOST_S),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:

@@ -46,7 +46,9 @@ def refine_calibration(
     seen: DetectionOptions,
     rate: RateOptions,
     may: FreedomOptions,
-    output: Path = option(RESULT, "File for the refined cameras, in the format they came in.", REQUIRED),
+    output: Path = option(
+        RESULT, "File, or folder, for the refined cameras, in the format they came in.", REQUIRED
+    ),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -84,7 +86,7 @@ def refine_calibration(
             found = refine(recording, rig, times, span, freedom, reference, done)
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
-    form = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
+    form, output = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
     heads, rows = _figures(found, may)
     lines = _words(found, may)
     if report is not None:

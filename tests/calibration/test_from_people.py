@@ -153,6 +153,29 @@ def test_lenses_by_their_field_of_view(tmp_path):
             lenses_of(tmp_path, fields, size)
 
 
+def test_lenses_by_a_photo(tmp_path):
+    """Of film's 36 x 24 mm a lens of 28 mm sees 75.4 degrees along the diagonal, whatever the picture's shape."""
+    image = pytest.importorskip("PIL.Image", reason='needs pip install "shapepose-fg[photos]"')
+    for name in ("left_json", "right_json"):
+        (tmp_path / name).mkdir()
+    exif = image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 28
+    image.new("RGB", (400, 300)).save(tmp_path / "phone.jpg", exif=exif)
+    image.new("RGB", (400, 300)).save(tmp_path / "bare.jpg")
+    (tmp_path / "torn.jpg").write_bytes((tmp_path / "phone.jpg").read_bytes()[:40])
+    along = 250 / np.tan(np.arctan(np.hypot(36, 24) / 2 / 28))  # pixels of the photo
+    for size in ((1920, 1080), (1080, 1920)):
+        rig = lenses_of(tmp_path, [str(tmp_path / "phone.jpg"), "right=60"], size)
+        np.testing.assert_allclose(rig.focal_px[0], along / 400 * 1920)
+    for name, said in (
+        ("bare", "does not say FocalLengthIn35mmFilm"),
+        ("torn", "cannot be read"),
+        ("no", "cannot"),
+    ):
+        with pytest.raises(InputError, match=rf"{name}\.jpg: .*{said}.*; give a photo as the camera wrote it"):
+            lenses_of(tmp_path, [str(tmp_path / f"{name}.jpg")], (640, 480))
+
+
 @pytest.mark.slow
 def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, capsys):
     write_openpose(recording, rig, tmp_path / "seen")

@@ -87,6 +87,14 @@ def test_the_command_writes_what_reconstruct_takes(rig, late, two_people, tmp_pa
     with pytest.raises(SystemExit) as ended:
         main([*line.split()[2:], "--frames", "0:40", "--no-report"])
     assert ended.value.code == 0
+    asked = ["reconstruct", "--calibration", "rig.json", "--detections", "detection", "--output", "at-once"]
+    asked += ["--synchronise", "--frames", "0:40", "--no-report"]
+    for more, code in ((["--timestamps", "same.csv"], 2), (["--fps", "25"], 0)):
+        with pytest.raises(SystemExit) as ended:
+            main([*asked, *more])
+        assert ended.value.code == code
+    assert (tmp_path / "at-once" / "synchronised.csv").read_text() == (tmp_path / "same.csv").read_text()
+    np.testing.assert_array_equal(Reconstruction.load("at-once").joints, Reconstruction.load("results").joints)
     # The cameras' first common moment: what the first camera, which the times are of, calls 4 s.
     people, body = Reconstruction.load("results"), two_people[0] + np.array([0.45, 0.0, 0.0])
     start = people.time_s.min() - (LATE_S.max() - LATE_S.min())
