@@ -195,6 +195,15 @@ def test_cameras_that_see_nobody_are_named(recording, room):
     assert "no camera sees a person" in sentence(found, room).lower()
 
 
+def test_people_before_and_after_a_long_gap_are_looked_at(recording, room):
+    """Of a hundred frames spread over the recording next to none shows anybody."""
+    gap = [Detections.empty()] * 5000
+    late = delayed(recording, 1, 10)
+    for seen, kinds in ((recording, []), (late, [Kind.LATE])):
+        parted = Recording(BODY_25, [*seen.frames[:30], *gap, *seen.frames[30:]])
+        assert [each.kind for each in diagnose(parted, room).findings] == kinds
+
+
 def test_cameras_that_never_see_people_at_once_are_named(recording, room):
     by_turns = [recording[t].only(recording[t].view == t % 5) for t in range(len(recording))]
     assert only_finding(Recording(BODY_25, by_turns), room).kind == Kind.NOBODY
