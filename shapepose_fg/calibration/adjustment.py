@@ -1,15 +1,18 @@
 """The solver: poses and lenses of all cameras, and joints of the people they see, in one factor graph (GTSAM).
 
-A joint seen by a camera is `GeneralSFMFactor2` between pose, joint and lens, with a robust kernel; what is known
-of each camera beforehand is a prior on its pose and its lens.
+A joint seen by a camera is `ProjectionFactorPPPC` between pose, joint and lens, with a robust kernel; its fourth
+variable, where the lens sits on the camera's body, is held at zero. (`GeneralSFMFactor2` takes joints behind a
+camera for ones without error, and prints that.) What is known of each camera beforehand is a prior on its pose and
+its lens.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
+import gtsam_unstable
 import numpy as np
-from gtsam.symbol_shorthand import C, L, X
+from gtsam.symbol_shorthand import B, C, L, X
 
 from factors.noise import diagonal, gaussian, isotropic_models, robust_kernel
 from shapepose_fg.calibration.people import People
@@ -97,15 +100,16 @@ def adjust(
     key = np.unique(person * people.points.shape[1] + joint, return_inverse=True)[1]
     xy = people.xy[person, joint, view]
     models = isotropic_models(2, scale * people.sigma_px[person, joint, view], robust_kernel("cauchy"))
-    factor = gtsam.GeneralSFMFactor2Cal3DS2 if free else gtsam.GeneralSFMFactor2Cal3_S2
+    seen = gtsam_unstable.ProjectionFactorPPPCCal3DS2 if free else gtsam_unstable.ProjectionFactorPPPCCal3_S2
     joints = [L(each) for each in key.tolist()]
     poses, lenses = ([letter(each) for each in view.tolist()] for letter in (X, C))
-    for each in map(factor, xy, models, poses, joints, lenses):
-        graph.push_back(each)
+    for each in zip(xy, models, poses, joints, lenses, strict=True):
+        graph.push_back(seen(*each[:3], B(0), *each[3:], False, False))
     first = np.unique(key, return_index=True)[1]
     for place in first.tolist():
         values.insert(joints[place], points[place])
     weight = np.sqrt(dilution)
+    values.insert(B(0), gtsam.Pose3())
     priors, kernel = gtsam.NonlinearFactorGraph(), robust_kernel("cauchy", _PRIOR_WIDTH * weight)
     for each, (camera, before) in enumerate(zip(start.cameras, given.cameras, strict=True)):
         values.insert(X(each), gtsam.Pose3(camera.wTc))
@@ -116,7 +120,8 @@ def adjust(
         noise = gaussian(_lens_covariance(before, sigmas, free))
         factor = gtsam.PriorFactorCal3DS2 if free else gtsam.PriorFactorCal3_S2
         priors.add(factor(C(each), _lens(before, free), noise))  # type: ignore[arg-type]
-    last = [letter(each) for letter in (X, C) for each in range(len(start))]
+    priors.addPriorPose3(B(0), gtsam.Pose3(), diagonal(np.full(6, _HELD)))
+    last = [B(0), *(letter(each) for letter in (X, C) for each in range(len(start)))]
     order = gtsam.Ordering()
     for each in [*dict.fromkeys(joints), *last]:
         order.push_back(each)
@@ -206,8 +211,9 @@ def _information(
         at, ours = n * (6 + lens), view * Q
         to[at : at + 6, ours : ours + 6] = np.eye(6)
         to[at + 6 : at + 6 + lens, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view], free)
+    last.push_back(B(0))
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(first)
-    information, _ = rest.hessian(last)
+    information = rest.hessian(last)[0][: len(to), : len(to)]  # the lens stays on the body
     return to.T @ information @ to
 
 

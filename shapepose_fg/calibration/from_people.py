@@ -4,7 +4,7 @@ Two cameras at a time (`relative`), all together (`arrangement`), then who is wh
 (`adjustment`), and at last metres, up and the floor (`levelling`). What people do not determine is refused.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
@@ -13,7 +13,16 @@ import numpy as np
 
 from shapepose_fg.calibration.adjustment import FOCAL, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
-from shapepose_fg.calibration.levelling import World, levelled, scale_of, scaled
+from shapepose_fg.calibration.levelling import (
+    ADULT_M,
+    Measured,
+    World,
+    at_once,
+    levelled,
+    scale_of,
+    scaled,
+    sigma_of_scale,
+)
 from shapepose_fg.calibration.people import Footage, People, missed_px
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.calibration.relative import Relative, relative
@@ -31,14 +40,14 @@ _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
 """Frames of the first rounds; how many rounds there are of these, of all frames, and of each half of them."""
 _STILL_DEG = 0.03
 """Cameras that turn by less from round to round have settled."""
-_LEAST_SEEN = 50
-"""People, one per frame, whom a camera must see at the least."""
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
 """Pairs of cameras that fit worse, or have fewer person-seconds in common, say nothing of each other."""
 _LEAST_PEOPLE = 10
 """People, one per frame, by whom cameras are adjusted at the least."""
-_MOST_SIGMA_DEG, _MOST_APART_DEG = 0.7, 2.0
+_MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """A turn that is known worse than the first, or differs by more between halves of the recording, is not known."""
+_UNUSUAL = 3.0
+"""Sigmas of stature by which people are taken to be adults."""
 _FREE = Freedom(turn_deg=20.0, move_m=1.0)
 _FILM = (
     "film a minute of two or more people who walk through all that the cameras see, near and far, not on one line"
@@ -100,7 +109,11 @@ class Calibrated:
         ]
         floor = self.world.floor
         about = {"held_out_px": round(self.held_out_px, 3), "sigma_scale": round(self.world.sigma_scale, 4)}
-        about |= {"people_at_once": self.world.persons, "upright": round(self.world.upright, 3)}
+        about |= {
+            "stature_m": round(self.world.stature_m, 3),
+            "people_at_once": self.world.persons,
+            "upright": round(self.world.upright, 3),
+        }
         return {"cameras": cameras, **about, "floor_found": floor is not None, "notes": list(self.notes)}
 
 
@@ -110,16 +123,17 @@ def calibrate(
     times: FrameTimes,
     frames: range,
     focal: float = 0.0,
-    stature_m: float | None = None,
+    measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Rig | None = None,
 ) -> Calibrated:
     """Where the cameras of `rig` stand, whose poses are not looked at, by the people whom `detections` show.
 
-    `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The people's median stature is
-    `stature_m`, or that of adults. Cameras that are about as in `start` are not sought. Undetermined where cameras
-    share too little, or motion does not tell.
+    `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The scale is that of what
+    was `measured`, or of adults. Cameras that are about as in `start` are not sought. Undetermined where cameras
+    share too little, or motion does not tell; InputError where measured distances do not go together.
     """
+    measured = measured or Measured()
     views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
     done = 0
 
@@ -130,12 +144,12 @@ def calibrate(
 
     footage, freedom = Footage.of(detections, rig, times, frames), replace(_FREE, focal=focal)
     taken = np.unique(footage.sightings.frame)
-    how = _How(rig, times, freedom, detections.skeleton, stature_m, told)
+    how = _How(rig, times, freedom, detections.skeleton, measured.stature_m, told)
     if start is None:
         pairs = _pairs(detections, rig, times, frames, told)
         if len(connected := parts(pairs, views)) > 1:
             raise Undetermined(tuple(_apart(rig, connected)))
-        edges = {pair: _edge(each, detections.skeleton, stature_m) for pair, each in pairs.items()}
+        edges = {pair: _edge(each, detections.skeleton, measured.stature_m) for pair, each in pairs.items()}
         few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
         start = how.settled(few, _posed(rig, arranged(edges, views)), _ROUGH).rig
     adjusted = how.settled(footage, start, _ROUNDS)
@@ -145,10 +159,20 @@ def calibrate(
         away = missed_px(footage.at(left).people(half), half)
         halves.append(half)
         missed.append(away.reshape(-1, len(rig)))
-    new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, stature_m is not None)
+    if measured.distances:
+        factor, sigma = measured.size_of(adjusted)
+        adjusted = _grown(adjusted, factor)
+    else:
+        sigma = sigma_of_scale(at_once(adjusted.people), measured.stature_m is not None)
+    new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, sigma)
     moved = new.cameras[0].wTc @ np.linalg.inv(adjusted.rig.cameras[0].wTc)
     people = replace(adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3])
-    return _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
+    found = _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
+    usual = _UNUSUAL * sigma_of_scale(world.persons, False)
+    if not measured.distances or abs(np.log(world.stature_m / ADULT_M)) < usual:
+        return found
+    tall = f"people come out {world.stature_m:.2f} m tall in the median"
+    return replace(found, notes=(f"{tall}; if they are adults, measure the cameras' distance again",))
 
 
 def _pairs(
@@ -172,26 +196,29 @@ def _pairs(
 
 def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
     """The tracks of each camera, in its own frame; Undetermined where one sees hardly anybody."""
-    problems = [
-        f"camera {name}: it sees {count} people, one per frame, {_LEAST_SEEN} are the least; {_FILM}"
-        for view, name in enumerate(rig.names)
-        if (count := int((sightings.view == view).sum())) < _LEAST_SEEN
-    ]
-    if problems:
-        raise Undetermined(tuple(problems))
+    seen_s = np.bincount(sightings.view, minlength=len(rig)) / fps
+    if len(few := np.flatnonzero(seen_s < _LEAST_S)) > 0:
+        figures = ", ".join(f"{each:.1f}" for each in seen_s[few])
+        least = f"{_LEAST_S:g} s of a person are the least, {figures} s are seen"
+        raise Undetermined((f"{_named(rig, few)}: {least}; {_FILM}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
     return [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
 
 
 def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
     """Which cameras share too little with the others, in words."""
-    names = [" ".join(rig.names[view] for view in part) for part in connected]
+    most = " ".join(rig.names[view] for view in connected[0])
     return [
-        f"camera{'s' if len(part) > 1 else ''} {name}: too few people are seen at the same moments by"
-        f" {'them' if len(part) > 1 else 'it'} and by {names[0]}, or cameras are not synchronised; {_FILM}, where"
-        " views overlap"
-        for name, part in zip(names[1:], connected[1:], strict=True)
+        f"{_named(rig, part)}: too few people are seen at the same moments there and by {most}, or cameras are not"
+        f" synchronised; {_FILM}, where views overlap"
+        for part in connected[1:]
     ]
+
+
+def _named(rig: Rig, views: Iterable[int]) -> str:
+    """Some cameras, in words."""
+    names = [rig.names[view] for view in views]
+    return f"camera{'s' if len(names) > 1 else ''} {' '.join(names)}"
 
 
 def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
@@ -237,8 +264,8 @@ class _How:
                 raise Undetermined(
                     (f"nobody's arms and legs are seen by two cameras: there is no scale; {_FILM}",)
                 )
-            before, now = now, scaled(adjusted.rig, factor)
-            adjusted = _grown(replace(adjusted, rig=now), factor)
+            adjusted = _grown(adjusted, factor)
+            before, now = now, adjusted.rig
             still = _apart_by(before, now)[0].max() < _STILL_DEG
             self.told(rounds - step if still else 1)
             if still:
@@ -248,12 +275,15 @@ class _How:
 
 
 def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
-    """People and covariances in another unit."""
+    """Cameras, people and covariances in another unit."""
     unit = np.ones(adjusted.covariance.shape[1])
     unit[MOVE] = factor
     covariance = adjusted.covariance * unit[:, None, None] * unit
     return replace(
-        adjusted, covariance=covariance, people=replace(adjusted.people, points=factor * adjusted.people.points)
+        adjusted,
+        rig=scaled(adjusted.rig, factor),
+        covariance=covariance,
+        people=replace(adjusted.people, points=factor * adjusted.people.points),
     )
 
 
@@ -266,22 +296,18 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
     held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan
     found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed)
     sigma = np.degrees(adjusted.sigma(TURN))
-    problems = list[str]()
-    for view, name in enumerate(rig.names):
-        if counts[view] < _LEAST_PEOPLE:
-            problems.append(
-                f"camera {name}: it sees {counts[view]} people whom another camera sees, too few; {_FILM}"
-            )
-        elif sigma[view] > _MOST_SIGMA_DEG:
-            problems.append(
-                f"camera {name}: the people's motion does not determine which way it looks, to"
-                f" {sigma[view]:.1f} degrees only; {_FILM}"
-            )
-        elif apart_deg[view] > _MOST_APART_DEG:
-            problems.append(
-                f"camera {name}: the two halves of the recording place it {apart_deg[view]:.1f} degrees apart;"
-                f" {_FILM}"
-            )
+    few, vague = counts < _LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
+    torn = apart_deg > _MOST_APART_DEG
+    kinds = (
+        (few, counts, f"{{}} people whom another camera sees, {_LEAST_PEOPLE} are the least"),
+        (~few & vague, sigma.round(1), "the people's motion determines the direction to {} degrees only"),
+        (~few & ~vague & torn, apart_deg.round(1), "the two halves of the recording are {} degrees apart"),
+    )
+    problems = [
+        f"{_named(rig, views)}: {words.format(', '.join(map(str, amounts[views])))}; {_FILM}"
+        for wrong, amounts, words in kinds
+        if len(views := np.flatnonzero(wrong)) > 0
+    ]
     if problems:
         raise Undetermined(tuple(problems), found)
     return found

@@ -18,6 +18,10 @@ _MOST_PLACED = 20_000
 _LEAST_MISS = 0.004
 """No detector misses by less than this part of a person's size: 7 mm."""
 _REWEIGHED = 10
+_NUDGE = 0.25
+"""Frames by which a clock is moved to see what that changes: more than the errors that are looked for."""
+_LEAST_OTHERS = 0.2
+"""What all other blocks weigh at the least when one is judged."""
 _FASTEST = 2.5
 """Statures a second: joints that move faster have changed their person."""
 
@@ -84,21 +88,28 @@ class InSpace:
         return cls(tracks, views, shift, times[groups.frame[many]], member[many], step, fps)
 
     def settled(self) -> tuple[Array, Array]:
-        """(V,) shifts in frames and their covariance (V, V) as against the first camera."""
+        """(V,) shifts in frames and their covariance (V, V) as against the first camera; infinite for unknown."""
         V, shift = len(self.tracks), self.shift.copy()
-        variance = np.full(V, np.inf)
-        for _ in range(6):
-            rays, speed, xy, size = self.seen(shift)
-            late = np.zeros(V)
-            for view in range(V):
-                late[view], variance[view] = self.late(view, rays[:, :, view], speed, xy, size)
-            late -= late.mean()
-            shift -= late
-            if np.abs(late).max() < 0.003:
-                break
-        covariance = np.diag(variance) + variance[0]
-        covariance[0], covariance[:, 0] = 0.0, 0.0
+        late, errors = self.all_late(shift)
+        shift -= late - late.mean()
+        late, errors = self.all_late(shift)
+        # A clock that is moved moves what its camera places, too, and joints that miss by more count less.
+        slope = np.stack([self.all_late(shift + _NUDGE * one)[0] - late for one in np.eye(V)], axis=1) / _NUDGE
+        inverse = np.linalg.pinv((slope - slope[0])[1:, 1:], rcond=1e-3)
+        for _ in range(2):
+            shift[1:] -= np.clip(inverse @ (late - late[0])[1:], -1.0, 1.0)
+            late, errors = self.all_late(shift)
+        known = np.isfinite(errors[0]) & np.isfinite(errors[0, 0])
+        apart = inverse @ np.where(known, errors - errors[:, :1], 0.0)[:, 1:].T
+        covariance = np.zeros((V, V))
+        covariance[1:, 1:] = apart @ apart.T + np.diag(np.where(known[1:], 0.0, np.inf))
         return shift - shift[0], covariance
+
+    def all_late(self, shift: Array) -> tuple[Array, Array]:
+        """`late` of all cameras: (V,) frames, and the parts of their errors (B, V)."""
+        rays, speed, xy, size = self.seen(shift)
+        each = [self.late(view, rays[:, :, view], speed, xy, size) for view in range(len(shift))]
+        return np.array([late for late, _ in each]), np.stack([error for _, error in each], axis=1)
 
     def seen(self, shift: Array) -> tuple[Array, Array, Array, Array]:
         """Directions and their speeds (P, J, V, 3), pixels (P, J, V, 2), and sizes (P, V) in rad."""
@@ -123,8 +134,14 @@ class InSpace:
         A[~enough] = np.eye(3)
         return np.where(enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan)
 
-    def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, float]:
-        """By how many frames one camera's clock is off against what the others place, and the variance."""
+    def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, Array]:
+        """By how many frames one camera's clock is off against what the others place.
+
+        And what each of B blocks of time adds to that in error (B,): its square sums to the variance. Infinite
+        where nothing is known.
+        """
+        block = block_frames(self.fps, float(np.ptp(self.time)))
+        blocks = int(np.ptp(self.time) // block) + 1
         xy = xy.copy()
         xy[:, :, view] = np.nan
         seen = np.isfinite(xy[..., 0])
@@ -165,16 +182,15 @@ class InSpace:
             now.append(self.time[rows])
             whom.append(self.member[rows, view])
         if not off:
-            return 0.0, np.inf
+            return 0.0, np.full(blocks, np.inf)
         miss, calm, fast, time = (np.concatenate(each) for each in (off, change, own, now))
         weight = np.concatenate(weights)
         # The speeds of what others place have not seen this camera's errors; its own say what a frame changes.
         gains = (weight * (calm * fast).sum(axis=-1)).sum(axis=1)
         if (gain := float(gains.sum())) <= 0:
-            return 0.0, np.inf
+            return 0.0, np.full(blocks, np.inf)
         score = (weight * (calm * miss).sum(axis=-1)).sum(axis=1)
-        block = block_frames(self.fps, float(np.ptp(time)))
-        when = ((time - time.min()) // block).astype(np.intp)
+        when = ((time - self.time.min()) // block).astype(np.intp)
         (when, _), each = np.unique(np.stack([when, np.concatenate(whom)]), axis=1, return_inverse=True)
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
@@ -182,9 +198,11 @@ class InSpace:
             away = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
             trust = 1 / (1 + (away / (2.0 * max(1.5 * float(np.median(away)), 1e-12))) ** 2)
             late = (trust * score).sum() / (trust * gains).sum()
-        sums = np.bincount(when, trust * (score - late * gains))
-        sums, gain = sums[np.unique(when)], float((trust * gains).sum())
-        return float(late), float((sums**2).sum() / gain**2 * len(sums) / max(len(sums) - 1, 1))
+        gains *= trust
+        part = np.bincount(when, gains, blocks) / gains.sum()
+        errors = np.bincount(when, trust * score - late * gains, blocks) / gains.sum()
+        # A block that weighs much pulls the mean to itself: without it the mean were farther away.
+        return float(late), errors / np.maximum(1 - part, _LEAST_OTHERS)
 
 
 def _across(points: Array, moving: Array, centre: Array) -> Array:

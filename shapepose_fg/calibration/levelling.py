@@ -4,24 +4,64 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 from shapepose_fg.setup_check.diagnosis import build_of
 
 ADULT_M = 1.70
 """Mean stature of adults, of the body model as of the world's women and men."""
-_BONES = 0.932
-"""Stature as `build_of` has it, over stature: joints as detectors mark them lie inside anatomy's landmarks. Of the
-body model's mean person; its spread over persons is 2 %."""
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
-"""One sigma of the scale, as parts of it: what a person's bones vary by among adults, and among people of a known
-stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
+"""One sigma of the scale by `build_of`, as parts of it: what bones vary by among adults, and among people of a
+known stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
+_TAPE_M = 0.02
+"""One sigma of a distance between lenses as it is measured with a tape."""
+_CONTRADICTS = 4.0
+"""Sigmas by which no measurement is off."""
 _LEAN_RAD = np.radians(3.0)
 """How far people's mean trunk leans: from it the floor is sought."""
 _ANKLE_M = 0.10
 """Ankles of who stands are so far above the floor."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What says how large the rig is: distances between cameras, or people's stature, or that they are adults."""
+
+    stature_m: float | None = None
+    """People's median stature; None for adults'."""
+    distances: tuple[tuple[int, int, float], ...] = ()
+    """Two cameras, and metres between their lenses; these decide where there are any."""
+
+    def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
+        """By how much the distances say that the cameras are too near each other, a factor, and its sigma.
+
+        InputError where distances do not go together.
+        """
+        rig, V = adjusted.rig, len(adjusted.rig)
+        length, metres = np.empty(len(self.distances)), np.array([each for *_, each in self.distances])
+        sigma = np.empty(len(self.distances))
+        for n, (a, b, _) in enumerate(self.distances):
+            away = rig.centres[a] - rig.centres[b]
+            length[n] = np.linalg.norm(away)
+            change = np.zeros((V, adjusted.covariance.shape[1]))
+            for view, sign in ((a, 1.0), (b, -1.0)):
+                change[view, MOVE] = sign * rig.cameras[view].wTc[:3, :3].T @ away / length[n]
+            variance = np.einsum("vq,vqwr,wr->", change, adjusted.covariance, change)
+            sigma[n] = np.hypot(np.sqrt(max(variance, 0.0)) / length[n], _TAPE_M / metres[n])
+        weight, said = 1 / sigma**2, np.log(metres / length)
+        log = float(np.average(said, weights=weight))
+        worst = int(np.abs((said - log) / sigma).argmax())
+        if abs(said[worst] - log) > _CONTRADICTS * sigma[worst]:
+            a, b, given = self.distances[worst]
+            raise InputError(
+                f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
+                f" {np.exp(log) * length[worst]:.2f} m apart, not {given:g} m; measure again"
+            )
+        return float(np.exp(log)), float(1 / np.sqrt(weight.sum()))
 
 
 @dataclass(frozen=True)
@@ -30,6 +70,8 @@ class World:
 
     sigma_scale: float
     """Of the scale, as a part of it, one sigma."""
+    stature_m: float
+    """Median stature of the people, metres, at this scale."""
     persons: int
     """People, as many as were seen at a time."""
     floor: Floor | None
@@ -42,7 +84,7 @@ def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> flo
     """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if
     nobody's bones are seen.
     """
-    return float(_BONES * (stature_m or ADULT_M) / build_of(people.points, skeleton).stature)
+    return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
 
 
 def scaled(rig: Rig, factor: float) -> Rig:
@@ -55,12 +97,18 @@ def scaled(rig: Rig, factor: float) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
+def at_once(people: People) -> int:
+    """How many people were seen at a time, in all but the fullest tenth."""
+    _, counts = np.unique(people.frame, return_counts=True)
+    return int(np.percentile(counts, 90)) if len(counts) > 0 else 0
+
+
 def sigma_of_scale(persons: int, known: bool) -> float:
     """One sigma of the scale, a part of it, from the bones of so many people, their stature `known` or not."""
     return float(np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON))
 
 
-def levelled(rig: Rig, people: People, skeleton: Skeleton, known: bool) -> tuple[Rig, World]:
+def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -> tuple[Rig, World]:
     """The rig with z up, the floor at 0, people in the middle, and y away from the first camera."""
     build = build_of(people.points, skeleton)
     upright = float(np.linalg.norm(build.up))
@@ -94,6 +142,5 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, known: bool) -> tuple
         wTc[:3] = R @ wTc[:3]
         wTc[:3, 3] += move
         cameras.append(replace(camera, wTc=wTc))
-    _, counts = np.unique(people.frame, return_counts=True)
-    persons = int(np.percentile(counts, 90)) if len(counts) > 0 else 0
-    return Rig(tuple(cameras), "z"), World(sigma_of_scale(persons, known), persons, floor, upright)
+    world = World(sigma_scale, build.stature, at_once(people), floor, upright)
+    return Rig(tuple(cameras), "z"), world

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from shapepose_fg.calibration.from_people import Calibrated, Undetermined, calibrate, own_tracks
+from shapepose_fg.calibration.levelling import Measured
 from shapepose_fg.calibration.rise_and_fall import offsets_without_poses
 from shapepose_fg.calibration.synchronisation import WHOLE_S, Synchronised, offsets
 from shapepose_fg.calibration.tracks import next_of, on_one_clock
@@ -25,7 +26,7 @@ def calibrate_unsynchronised(
     frames: range,
     most_s: float = 60.0,
     focal: float = 0.0,
-    stature_m: float | None = None,
+    measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Calibrated, Synchronised]:
     """Where the cameras of `rig` stand, as `calibrate` says, and when each was started, up to `most_s` apart.
@@ -54,7 +55,7 @@ def calibrate_unsynchronised(
             progress(begin + round(100 * step / steps), total)
 
         try:
-            found, problems = calibrate(seen, rig, times, seen.frames, focal, stature_m, part, start), ()
+            found, problems = calibrate(seen, rig, times, seen.frames, focal, measured, part, start), ()
         except Undetermined as refused:
             if refused.found is None:
                 raise

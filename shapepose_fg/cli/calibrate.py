@@ -2,6 +2,7 @@
 
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
-from shapepose_fg.cli.found_cameras import check_most, report_option, show_clocks, write_page
+from shapepose_fg.cli.found_cameras import MOST_S, check_most, report_option, show_clocks
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
 
 _CAMERAS = "What is known"
-_FILE_OFF, _GUESS_OFF = 0.02, 0.1
+_FILE_OFF, _GUESS_OFF = 0.02, 0.2
 """How far focal lengths of a calibration, and of a field of view, may be off, one sigma, as parts of them."""
 
 
@@ -42,7 +43,9 @@ class LensOptions:
     skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
     calibration: Path | None = option(INPUT, "File of the lenses; its poses, if any, are not used.")
     field_of_view: list[str] | None = option(
-        INPUT, "Without one: degrees from left to right; of one camera, or several: CAMERA=DEGREES.", metavar="DEG"
+        INPUT,
+        "Without one: degrees from left to right, or a photo with EXIF; of one camera CAMERA=...",
+        metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Size of pictures where no file says it.", metavar="WxH")
 
@@ -68,16 +71,19 @@ def calibrate(
     seen: LensOptions,
     rate: RateOptions,
     focal: bool = option(
-        _CAMERAS, "Refine focal lengths: by 2 % of a calibration, 10 % of a field of view.", False
+        _CAMERAS, "Refine focal lengths: by 2 % of a calibration, 20 % of a field of view.", False
     ),
     stature: float | None = option(
         _CAMERAS, "People's median stature in metres; without it that of adults, 1.70."
+    ),
+    distance: list[str] | None = option(
+        _CAMERAS, "Metres between the lenses of two cameras, which then say the scale.", metavar="CAM,CAM=M"
     ),
     output: Path = option(RESULT, "File for the cameras, our own JSON.", REQUIRED),
     times: Path | None = option(
         TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
     ),
-    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", 60.0),
+    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", MOST_S),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -88,6 +94,7 @@ def calibrate(
     determine the cameras; nothing is written then.
     """
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
+    from shapepose_fg.calibration.levelling import Measured
     from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
     from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.calibration import write_rig
@@ -100,6 +107,7 @@ def calibrate(
         raise InputError("--times and --timestamps: when frames were taken is sought, or known; give one of them")
     off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
     rig = seen.rig()
+    measured = Measured(stature, _distances(distance or [], rig.names))
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         part = rate.part(seen.detections, seen.skeleton, rig, Path(folder), own_frames=times is not None)
         recording, known, span = part
@@ -107,9 +115,9 @@ def calibrate(
         try:
             with progress("calibrating", "steps") as done:
                 if times is None:
-                    found = calibrate(recording, rig, known, span, off, stature, done)
+                    found = calibrate(recording, rig, known, span, off, measured, done)
                 else:
-                    found, clocks = calibrate_unsynchronised(recording, rig, fps, span, most, off, stature, done)
+                    found, clocks = calibrate_unsynchronised(recording, rig, fps, span, most, off, measured, done)
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
@@ -118,12 +126,26 @@ def calibrate(
     if times is not None and clocks is not None:
         write_timestamps(times, rig.names, known.of_views(len(rig)) + clocks.offset_s)
     heads, rows = _figures(found, focal)
-    lines = [_CAPTION, *_world(found, stature)]
+    lines = [_CAPTION, *_world(found, stature, distance or [])]
     if report is not None:
-        people, figures = found.adjusted.people, (heads, rows, {"joint, px": found.missed_px})
-        # Moments of one clock that was found begin at 0.
-        time_s = known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps
-        write_page(report, found.rig, None, people, time_s, recording.skeleton, figures, lines, found.notes)
+        from shapepose_fg.viz.report.cameras import CameraPage
+
+        people = found.adjusted.people
+        page = CameraPage(
+            rig=found.rig,
+            points=people.points,
+            frame=people.frame,
+            # Moments of one clock that was found begin at 0.
+            time_s=known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps,
+            skeleton=recording.skeleton,
+            heads=heads,
+            rows=rows,
+            missed_px={"joint, px": found.missed_px},
+            lines=lines,
+            remarks=found.notes,
+        )
+        page.write(report)
+        note(f"{report}: the cameras in 3D and the people, to be opened in a browser")
     if as_json:
         told = found.as_dict() | ({} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]})
         print(json.dumps(told, indent=2, allow_nan=False))
@@ -159,13 +181,36 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
     return heads, rows
 
 
-def _world(found: "Calibrated", stature: float | None) -> list[str]:
+def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
     """Scale, up and fit, a line each."""
-    whose = f"people of {stature:g} m" if stature is not None else "adults of 1.70 m in the median"
     world = found.world
+    if distances:
+        whose = f"{' '.join(distances)}, people are {world.stature_m:.2f} m tall in the median"
+    else:
+        whose = f"people of {stature:g} m" if stature is not None else "adults of 1.70 m in the median"
+        whose += f", {world.persons} at once"
+    better = "" if distances else "; --distance between two cameras says it better"
     level = "from feet on the floor" if world.floor is not None else "from bodies alone, no level floor was found"
     return [
-        f"scale: {whose}, {world.persons} at once: ± {100 * world.sigma_scale:.1f} %, one sigma",
+        f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma{better}",
         f"up: z, {level}; the floor is at 0",
         f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px",
     ]
+
+
+def _distances(given: list[str], names: Sequence[str]) -> tuple[tuple[int, int, float], ...]:
+    """Two cameras each, and metres between them."""
+    found = []
+    for text in given:
+        pair, _, number = text.rpartition("=")
+        cameras = pair.split(",")
+        if len(cameras) != 2 or cameras[0] == cameras[1] or not set(cameras) <= set(names):
+            raise InputError(f"--distance {text}: give two cameras and metres, such as {names[0]},{names[1]}=3.42")
+        try:
+            metres = float(number)
+        except ValueError:
+            metres = np.nan
+        if not 0.05 <= metres <= 1000:
+            raise InputError(f"--distance {text}: must be 0.05 to 1000 metres")
+        found.append((names.index(cameras[0]), names.index(cameras[1]), metres))
+    return tuple(found)

@@ -1,20 +1,20 @@
-"""What `calibrate`, `refine-calibration` and `synchronise` say alike: clocks that were found, and a page."""
+"""What `calibrate`, `refine-calibration` and `synchronise` say alike: clocks that were found."""
 
 import math
-from collections.abc import Sequence
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shapepose_fg.cli.options import RESULT, option
-from shapepose_fg.cli.terminal import note, show, table
+from shapepose_fg.cli.options import RESULT, frame_range, option
+from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from shapepose_fg.calibration.people import People
     from shapepose_fg.calibration.synchronisation import Synchronised
-    from shapepose_fg.core.arrays import Array
     from shapepose_fg.core.camera import Rig
-    from shapepose_fg.core.skeleton import Skeleton
+
+MOST_S = 60.0
+"""Cameras that were started by hand began so far apart, at most, where nobody says more."""
 
 
 def report_option() -> Any:
@@ -22,26 +22,20 @@ def report_option() -> Any:
     return option(RESULT, "Page with the cameras in 3D and people over them, for the browser: FILE.html.")
 
 
-def write_page(
-    file: Path,
-    rig: "Rig",
-    before: "Rig | None",
-    people: "People",
-    time_s: "Array",
-    skeleton: "Skeleton",
-    figures: "tuple[list[str], list[tuple[str, list[str]]], dict[str, Array]]",
-    lines: Sequence[str],
-    remarks: Sequence[str],
-) -> None:
-    """The page of cameras, and those `before`: `figures` are heads, rows, and residuals; `lines` the caption, and
-    what is said above.
-    """
-    from shapepose_fg.viz.report.cameras import write_camera_page
+def found_clocks(
+    detections: Path, rig: "Rig", skeleton: "str | Path | None", fps: float, most: float, frames: str | None = None
+) -> "tuple[Synchronised, int]":
+    """When cameras at known poses began, up to `most` seconds apart, and how many frames the longest has."""
+    from shapepose_fg.calibration.synchronisation import synchronise
+    from shapepose_fg.core.storage.kept_arrays import InFolder
+    from shapepose_fg.io.detections import read_detections
 
-    joints = [skeleton.joints[joint] for joint in skeleton.core]
-    where = (people.points, people.frame, time_s[people.frame], joints)
-    write_camera_page(file, rig, before, *where, *figures, "; ".join(lines[1:]), f"{lines[0]}.", remarks)
-    note(f"{file}: the cameras in 3D and the people, to be opened in a browser")
+    with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
+        recording = read_detections(detections, rig, skeleton, InFolder(Path(folder)), True)
+        note(*recording.notes)
+        span = frame_range(frames, len(recording), recording.first)
+        with progress("comparing", "pairs") as done:
+            return synchronise(recording, rig, fps, span, most, progress=done), len(recording)
 
 
 def check_most(most: float) -> None:

@@ -16,14 +16,17 @@ def live(
     detections: str | None = option(INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; standard input."),
     skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME"),
     lag: float = option(TIME, "How much later refined people follow, seconds.", 0.3),
-    output: str | None = option(RESULT, "File of JSON lines, tcp://:PORT, or .mcap; standard output by default."),
+    output: list[str] | None = option(
+        RESULT, "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun to look; standard output; may be repeated."
+    ),
     workers: int = option(RUN, "Processes that refine; 1: none but this one.", 2),
 ) -> None:
     """Follow people while a detector runs: a line per camera and picture in, lines of people out.
 
     In: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people". Out: "now" after each
     frame, "settled" when its people are refined. Ends with the input. A socket listens on this machine only,
-    unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2 messages.
+    unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2 messages. `rerun` starts that viewer,
+    rerun+http://HOST:9876/proxy is one that runs.
     """
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.io.skeleton_file import find_skeleton
@@ -35,7 +38,7 @@ def live(
     frames, said = 0, 0
     with (
         naming("--lag, --calibration", "change them"),
-        published(output, rig, note) as publish,
+        published(output or (), rig, note) as publish,
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
         for view in views(detections, rig, joints, note):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from shapepose_fg.cli.found_cameras import report_option, write_page
+from shapepose_fg.cli.found_cameras import report_option
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
@@ -22,7 +22,6 @@ from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
-    from shapepose_fg.core.arrays import Array
     from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "What may change"
@@ -46,7 +45,9 @@ def refine_calibration(
     seen: DetectionOptions,
     rate: RateOptions,
     may: FreedomOptions,
-    output: Path = option(RESULT, "File for the refined cameras, in the format they came in.", REQUIRED),
+    output: Path = option(
+        RESULT, "File, or folder, for the refined cameras, in the format they came in.", REQUIRED
+    ),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -84,14 +85,27 @@ def refine_calibration(
             found = refine(recording, rig, times, span, freedom, reference, done)
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
-    form = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
+    form, output = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
     heads, rows = _figures(found, may)
     lines = _words(found, may)
     if report is not None:
-        missed: dict[str, Array] = {"before, px": found.missed_px[0], "after, px": found.missed_px[1]}
-        before = found.given if found.better else None
-        people, figures = found.adjusted.people, (heads, rows, missed)
-        write_page(report, new, before, people, times.frame_s, recording.skeleton, figures, lines, found.notes)
+        from shapepose_fg.viz.report.cameras import CameraPage
+
+        page = CameraPage(
+            rig=new,
+            before=found.given if found.better else None,
+            points=found.adjusted.people.points,
+            frame=found.adjusted.people.frame,
+            time_s=times.frame_s,
+            skeleton=recording.skeleton,
+            heads=heads,
+            rows=rows,
+            missed_px=dict(zip(("before, px", "after, px"), found.missed_px, strict=True)),
+            lines=lines,
+            remarks=found.notes,
+        )
+        page.write(report)
+        note(f"{report}: the cameras in 3D and the people, to be opened in a browser")
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:

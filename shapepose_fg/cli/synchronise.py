@@ -2,38 +2,32 @@
 
 import json
 import shlex
-import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
 
-from shapepose_fg.cli.found_cameras import check_most, show_clocks
+from shapepose_fg.cli.found_cameras import MOST_S, check_most, found_clocks, show_clocks
 from shapepose_fg.cli.options import (
     RESULT,
     TIME,
     DetectionOptions,
     check_fps,
-    frame_range,
     frames_option,
     grouped,
     json_option,
     next_reconstruct,
     option,
 )
-from shapepose_fg.cli.terminal import note, progress
+from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 
 @grouped
 def synchronise(
     seen: DetectionOptions,
     fps: float | None = option(TIME, "Frames a second of all cameras; needed."),
-    most: float = option(TIME, "Largest offset that is looked for, seconds.", 60.0),
+    most: float = option(TIME, "Largest offset that is looked for, seconds.", MOST_S),
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "File for the times of all frames, as --timestamps takes it."),
     as_json: bool = json_option(),
@@ -42,9 +36,6 @@ def synchronise(
 
     Exit code 1 where motion does not determine a camera's offset; nothing is written then.
     """
-    from shapepose_fg.calibration.synchronisation import synchronise
-    from shapepose_fg.core.storage.kept_arrays import InFolder
-    from shapepose_fg.io.detections import read_detections
     from shapepose_fg.io.timestamps import write_timestamps
 
     if fps is None:
@@ -52,15 +43,10 @@ def synchronise(
     check_fps(fps)
     check_most(most)
     rig = seen.still_rig("synchronise")
-    with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording = read_detections(seen.detections, rig, seen.skeleton, InFolder(Path(folder)), True)
-        note(*recording.notes)
-        span = frame_range(frames, len(recording), recording.first)
-        with progress("comparing", "pairs") as done:
-            found = synchronise(recording, rig, fps, span, most, progress=done)
-        problems = found.undetermined(rig)
+    found, count = found_clocks(seen.detections, rig, seen.skeleton, fps, most, frames)
+    problems = found.undetermined(rig)
     if output is not None and not problems:
-        write_timestamps(output, rig.names, found.at(np.arange(len(recording)) / fps))
+        write_timestamps(output, rig.names, found.at(np.arange(count) / fps))
     if as_json:
         print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
     else:
@@ -79,5 +65,5 @@ def synchronise(
             options = {"--calibration": seen.calibration, "--detections": seen.detections}
             options |= {"--skeleton": seen.skeleton, "--up": seen.up, "--unit": seen.unit}
             options |= {"--image-size": seen.image_size, "--timestamps": output, "--output": "results"}
-            print(f"{output}: times of {len(recording)} frames")
+            print(f"{output}: times of {count} frames")
             print(next_reconstruct(options))

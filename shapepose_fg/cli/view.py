@@ -31,12 +31,12 @@ def view(
     if save is not None and connect is not None:
         raise InputError("--save and --connect: this is written or shown; give one of them")
     pairs = _pictures(part.results, take, pictures) if pictures.videos else []
-    viewer = rerun_app.viewer_file() if connect is None and save is None and not statistics else None
-    if viewer is not None and rerun_app.switch_off(viewer):
-        note("rerun's statistics of use were on and are off now; `rerun analytics enable` switches them on")
+    if connect is None and save is None and not statistics:
+        note(*rerun_app.quiet_viewer())
     arrays, missing = rerun_app.body_if_there(Job(take, part.results, part.body))
     note(*missing)
-    with rerun_app.shown(take, connect) if save is None else rerun_app.written(save, take) as stream:
+    first = rerun_app.layout_of(take)
+    with rerun_app.shown(first, connect) if save is None else rerun_app.written(save, first) as stream:
         log_take(stream, take, arrays)
         if len(pairs) > 0:
             with progress("showing pictures", "pictures") as done:

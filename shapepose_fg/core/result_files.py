@@ -23,6 +23,8 @@ from shapepose_fg.core.storage.schema import Table, columns_of
 PEOPLE, RUN, OBSERVATIONS = "people.npz", "run.json", "observations.npz"
 MOMENTS = "moments.csv"
 """Which picture of each camera a frame is, where cameras differ."""
+CLOCKS = "synchronised.csv"
+"""When each camera took its frames, where the people have told it."""
 RUN_ID = "run_id"
 """What ties them: a digest of all columns of people.npz."""
 T = TypeVar("T", bound=Table)

@@ -6,12 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.footage.placement import read_used_footage
 
 _NARROWEST, _WIDEST = 5.0, 150.0
 """Degrees from left to right that a lens without distortion can see."""
+_PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+_EXIF, _FOCAL_35MM = 0x8769, 0xA405
+"""The tags of EXIF's own directory in a photo, and of FocalLengthIn35mmFilm in it."""
+_FILM_MM = (36.0, 24.0)
 _USUAL = 65.0
 """What phones see, about."""
 
@@ -19,11 +23,12 @@ _USUAL = 65.0
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
     """Cameras without poses, one for each file or folder of `detections`, in the order of their names.
 
-    `fields` are degrees from left to right, `CAMERA=DEG` for one camera. `size` (width, height) are the pictures'
+    `fields` are degrees from left to right, or a photo of the same lens whose EXIF tells the focal length;
+    `CAMERA=` before it is for one camera. `size` (width, height) are the pictures'
     pixels; without it footage.json, which `detect` writes, says them. InputError names what is missing.
     """
     names = camera_names(detections)
-    degrees = _degrees(fields, names)
+    given = _given(fields, names)
     footage = detections / "footage.json"
     sizes = (
         {}
@@ -38,7 +43,7 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
                 f"camera {name}: nothing says how large its pictures are; pass --image-size WIDTHxHEIGHT"
             )
         with naming(detections):
-            cameras.append(_camera(name, picture, degrees[name]))
+            cameras.append(_camera(name, picture, _degrees(given[name], picture)))
     with naming(detections):
         return Rig(tuple(cameras), "z")
 
@@ -76,20 +81,46 @@ def camera_names(detections: Path) -> list[str]:
     return names
 
 
-def _degrees(fields: Sequence[str], names: Sequence[str]) -> dict[str, float]:
-    """Of each camera."""
-    found = dict[str, float]()
+def _given(fields: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """What is given for each camera: what is for all of them, or its own."""
+    found = dict[str, str]()
     for text in fields:
-        name, given, number = text.rpartition("=")
+        name, given, value = text.partition("=")
         if given and name not in names:
             raise InputError(f"--field-of-view {text}: no such camera; give one of {listing(names)}")
-        try:
-            degrees = float(number)
-        except ValueError:
-            degrees = np.nan
-        if not _NARROWEST <= degrees <= _WIDEST:
-            raise InputError(f"--field-of-view {text}: must be {_NARROWEST:g} to {_WIDEST:g} degrees")
-        found |= {name: degrees} if given else {each: degrees for each in names if each not in found}
+        found |= {name: value} if given else {each: text for each in names if each not in found}
     if missing := [name for name in names if name not in found]:
         raise InputError(f"--field-of-view: camera {missing[0]} has none; give {missing[0]}=DEGREES")
     return found
+
+
+def _degrees(given: str, size: tuple[int, int]) -> float:
+    """From left to right of pictures of a size (width, height)."""
+    if Path(given).suffix.lower() in _PHOTOS:
+        longer = _focal_of_photo(Path(given)) * max(size)
+        return float(np.degrees(2 * np.arctan(size[0] / 2 / longer)))
+    try:
+        degrees = float(given)
+    except ValueError:
+        degrees = np.nan
+    if not _NARROWEST <= degrees <= _WIDEST:
+        raise InputError(
+            f"--field-of-view {given[:80]}: must be {_NARROWEST:g} to {_WIDEST:g} degrees, or a .jpg with EXIF"
+        )
+    return degrees
+
+
+def _focal_of_photo(file: Path) -> float:
+    """A photo's focal length, as a part of its longer side, from EXIF's FocalLengthIn35mmFilm: of a film's picture
+    with the same diagonal (EXIF 2.3, 4.6.5).
+    """
+    image = optional("PIL.Image", "photos")
+    cure = "give a photo as the camera wrote it, or degrees"
+    try:
+        with image.open(file) as photo:
+            sides, found = photo.size, photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
+    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
+        raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
+    if not isinstance(found, int | float) or not 0 < found < 2000:
+        raise InputError(f"{file}: its EXIF does not say FocalLengthIn35mmFilm; {cure}")
+    return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))

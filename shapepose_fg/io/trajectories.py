@@ -28,10 +28,16 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
 
     Eight numbers a line (TUM: time x y z qx qy qz qw), apart by blanks or commas; or with a header that names the
     columns `POSE` in any order, and those of `COVARIANCE` that there are: the diagonal at least. `#` begins a
-    comment. InputError, one sentence that names file, line and cure.
+    comment. Or an MCAP file of ROS 2 messages, `FILE.mcap#FRAME` where more than one frame moves in it.
+    InputError, one sentence that names file, line and cure.
     """
     from scipy.spatial.transform import Rotation
 
+    file, _, frame = str(path).partition(".mcap")
+    if file != str(path) and frame[:1] in ("", "#"):
+        from shapepose_fg.io.ros.mcap_files import read_frame
+
+        return read_frame(Path(f"{file}.mcap"), frame[1:], name or str(path))
     path = Path(path)
     names, numbers, lines = _table(path)
     if len(numbers) < 2:

@@ -1,14 +1,15 @@
-"""Where detections come from and people go to, as they come: lines of JSON, a socket, an MCAP file.
+"""Where detections come from and people go to, as they come: lines of JSON, a socket, MCAP; rerun, to look.
 
 `-` or nothing is standard input and output; `tcp://:5000` listens on this machine only, `tcp://0.0.0.0:5000` for
-everybody; a name that ends in `.mcap` is that; any other is a file or a pipe of lines.
+everybody; a name that ends in `.mcap` or `.rrd` is that, `rerun` a viewer that is started, `rerun+http://...` one
+that runs; any other is a file or a pipe of lines.
 """
 
 import json
 import selectors
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,9 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.detections.lines import read_view_line
+from shapepose_fg.io.export import rerun_app, rerun_log
 from shapepose_fg.io.ros.mcap_files import McapWriter, read_views
+from shapepose_fg.io.solved_setup import body_of
 
 View = tuple[Any, ...]
 """What `OnlineReconstructor.push_view` takes."""
@@ -40,7 +43,7 @@ def views(where: str | None, rig: Rig, skeleton: Skeleton, note: Callable[[str],
     if where is not None and where.startswith("tcp:"):
         yield from _from_socket(where, rig, skeleton, note)
     elif where is not None and where.endswith(".mcap"):
-        yield from read_views(Path(where), rig, skeleton)
+        yield from read_views(Path(where), rig, skeleton, note)
     else:
         with ExitStack() as files:
             named = where not in (None, "-")
@@ -52,18 +55,40 @@ def views(where: str | None, rig: Rig, skeleton: Skeleton, note: Callable[[str],
 
 
 @contextmanager
-def published(where: str | None, rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
-    """What takes people out, frame by frame."""
+def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
+    """What takes people out, frame by frame, to all those places; standard output where there is none."""
     with ExitStack() as files:
-        if where is not None and where.endswith(".mcap"):
+        targets = [files.enter_context(_target(each, rig, note)) for each in where or ["-"]]
+
+        def publish(kind: str, people: Reconstruction) -> None:
+            for target in targets:
+                target(kind, people)
+
+        yield publish
+
+
+@contextmanager
+def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
+    with ExitStack() as files:
+        if where.endswith(".mcap"):
             written = files.enter_context(McapWriter(files.enter_context(Path(where).open("wb")), rig))
             yield lambda kind, people: _by_time(people, lambda rows, time_s: written.frame(rows, time_s, kind))
             return
-        if where is not None and where.startswith("tcp:"):
+        if where == "rerun" or where.startswith("rerun+") or where.endswith(".rrd"):
+            first = rerun_app.layout(rig.up, rig, rig.centres, ["world/people/**"])
+            if where.endswith(".rrd"):
+                stream = files.enter_context(rerun_app.written(Path(where), first))
+            else:
+                if where == "rerun":
+                    note(*rerun_app.quiet_viewer())
+                stream = files.enter_context(rerun_app.shown(first, None if where == "rerun" else where))
+            log = rerun_log.LiveLog(stream, rig, body_of({}, None))
+            yield lambda kind, people: log.moment(people) if kind == "now" else None
+            return
+        if where.startswith("tcp:"):
             send = files.enter_context(_Listeners(_listening(where), note)).send
         else:
-            named = where not in (None, "-")
-            sink = files.enter_context(Path(str(where)).open("w", encoding="utf-8")) if named else sys.stdout
+            sink = sys.stdout if where == "-" else files.enter_context(Path(where).open("w", encoding="utf-8"))
 
             def send(line: str) -> None:
                 sink.write(line)

@@ -80,11 +80,11 @@ class Newest:
         `Known`, and bodies.
 
         Bodies are fitted to the joints as far as these are known. Joints that no two views see are where the body
-        has them, if that is surer.
+        has them, if that is surer, and some joint is seen: else the body is a guess between motion and what bodies
+        are like. Nobody of whom no joint is known is among them.
         """
-        order = np.flatnonzero(self.moment.named)[
-            np.argsort(self.moment.identity[self.moment.named], kind="stable")
-        ]
+        named = np.flatnonzero(self.moment.named & (self.moment.tracks.joints.sigma_m < PLACED_M).any(axis=1))
+        order = named[np.argsort(self.moment.identity[named], kind="stable")]
         now = self.moment.rows(order)
         joints, known = now.tracks.joints, now.tracks.joints.sigma_m < PLACED_M
         covariance = joints.covariance[..., :3, :3].copy()
@@ -93,7 +93,8 @@ class Newest:
         fit = self.fitter.fit_whole(JointTargets(np.where(known[..., None], joints.position, 0.0), information))
         of_body = fit.covariance + MODEL_SIGMA_M**2 * np.eye(3) + _FORGOTTEN * covariance
         surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(covariance, axis1=2, axis2=3)  # not where NaN
-        surer &= now.views < 2
+        seen = now.views >= 2
+        surer &= ~seen & seen.any(axis=1, keepdims=True)
         mean = joints.mean.copy()
         mean[surer, :3], covariance[surer] = fit.joints[surer], of_body[surer]
         covariance[~(known | surer)] = np.nan

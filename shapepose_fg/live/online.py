@@ -361,6 +361,8 @@ class OnlineReconstructor:
         for at in range(first, len(self._state.slots)):
             slot = self._state.slots[at]
             slot.moment, slot.candidate = self._filter.step(self._state.slots[at - 1].moment, slot.given)
+            if slot.refined is not None:
+                slot.moment = fed_back(self._filter.tracker, slot.moment, slot.refined)
         self._show()
 
     def _restart(self, refined: Reconstruction) -> None:
@@ -371,6 +373,7 @@ class OnlineReconstructor:
         frames = [slot.given.frame for slot in slots if slots[-1].time_s - slot.time_s < self.lag_s]
         if refined.frame[0] in frames:
             at = len(slots) - len(frames) + frames.index(refined.frame[0])
+            slots[at].refined = refined
             slots[at].moment = fed_back(self._filter.tracker, slots[at].moment, refined)
             self._again(at + 1)
 

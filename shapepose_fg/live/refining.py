@@ -32,6 +32,8 @@ class Slot:
     """(A, J, V) the detections of its tracks; -1 for none."""
     settled: bool = False
     """Whether its rows have been refined, or are being refined."""
+    refined: Reconstruction | None = None
+    """The newest rows of a window that ends here: what comes later is followed from them. Not saved."""
 
     @property
     def time_s(self) -> float:

@@ -33,7 +33,7 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
         if each.kind == Kind.DUPLICATE:
             views = (min(each.cameras[::-1], key=lambda view: given.scores[view] - 1e-6 * view),)
         first, last = (end if said is None else said for said, end in zip(each.frames, whole, strict=True))
-        if given.cameras_used == 2 or len(views) > 2:  # nothing says which of them is wrong
+        if given.cameras_used == 2 or len(views) >= given.cameras_used:  # nothing says which of them is wrong
             return Trust(doubted=tuple((view, first, last) for view in range(given.view_count)))
         sure = each.kind in (Kind.UNFIT, Kind.DUPLICATE)
         wrong += [(v, first, last) for v in views if sure or _worse(given, right, v, range(first, last))]

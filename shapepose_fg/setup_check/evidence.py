@@ -65,8 +65,12 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     else:
         most = MOST_LAG
         spread = np.unique(np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp))
+        if sum(len(detections[t]) > 0 for t in spread.tolist()) < ANCHORS // 4:  # people are there now and then
+            there = np.array([t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp)
+            spread = there[np.unique(np.linspace(0, len(there) - 1, ANCHORS).astype(np.intp))]
         around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
         wanted = np.unique(np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)]))
+        wanted = wanted[(wanted >= frames.start) & (wanted < frames.stop)]
     pictures, stopped = WithoutRepeats(detections, views), np.zeros(views)
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():

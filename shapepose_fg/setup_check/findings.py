@@ -1,10 +1,8 @@
 """What may be wrong with a set-up, and how it is said: which camera, what it looks like, and what to do."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
-
-import numpy as np
 
 from shapepose_fg.core.camera import Rig
 
@@ -60,21 +58,49 @@ class Finding:
     """The probability that it is this, and not another mistake or none, as far as the detections tell."""
     same: str = ""
     """In what alone two cameras are one, if not in both: "pose" or "detections"."""
+    instead: "tuple[Finding, ...]" = ()
+    """What else it may be, likeliest first; their `sure` are their probabilities."""
+
+
+SURE = 0.95
+"""Of what has more probability nothing is said of it, nor of what else it may be."""
+
+
+def one_of(found: Sequence[Finding]) -> Finding:
+    """The likeliest of findings, which exclude each other, with the others that are not unlikely beside it."""
+    sure: dict[tuple[Kind, tuple[int, ...]], float] = {}
+    first: dict[tuple[Kind, tuple[int, ...]], Finding] = {}
+    for each in sorted(found, key=lambda each: -each.sure):
+        what = each.kind, each.cameras
+        sure[what] = sure.get(what, 0.0) + each.sure
+        first.setdefault(what, each)
+    told = sorted((replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure)
+    return replace(told[0], instead=tuple(each for each in told[1:] if each.sure >= 1 - SURE))
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
-    """What was found, as it is printed."""
+    """What was found, as it is printed, with what else it may be."""
+    said = _words(finding, rig)
+    said += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
+    for each in finding.instead:
+        said += f"; or {_words(each, rig).split(';')[0]} ({each.sure:.2f})"
+    return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
+
+
+def _words(finding: Finding, rig: Rig) -> str:
+    """The sentence without its probability."""
     words, amount = _WORDS[finding.kind], finding.amount
     names = [rig.names[view] for view in finding.cameras]
     all_of_them = len(names) == len(rig) > 2
     width, height = rig.cameras[finding.cameras[0] if names else 0].image_size
     shifts = [_shift(x, y) for x, y in finding.shift_px]
     count = abs(round(amount))
-    said = (words if isinstance(words, str) else words(finding, max(width, height))).format(
+    return (words if isinstance(words, str) else words(finding, max(width, height))).format(
         who="all cameras" if all_of_them else " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:]))),
         first=names[0] if names else "",
         second=names[-1] if names else "",
         sees="sees" if len(names) == 1 else "see",
+        others="each other" if len(names) == len(rig) else "the others",
         amount=amount,
         degrees=f"{amount:.1f}" if amount < 10 else f"{amount:.0f}",
         percent=100 * abs(amount - (finding.kind not in (Kind.STOPPED, Kind.BIASED))),
@@ -91,25 +117,20 @@ def sentence(finding: Finding, rig: Rig) -> str:
         when=_when(*finding.frames),
         up=rig.up,
     )
-    said += f" (probability {finding.sure:.2f})" if finding.sure < 0.95 else ""
-    return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
 
 
 def _turned(finding: Finding, side_px: int) -> str:
-    turned = "{who} looks turned by about {degrees} degrees"
-    if len(finding.shift_px) == 0:
-        return f"{turned}{' and moved by {moved}' if finding.moved > 0.1 else ''}; calibrate its pose again"
-    if np.hypot(*finding.shift_px[0]) < 0.002 * side_px:
-        return f"{turned} about its axis; calibrate its pose again"
-    instead = "(or its principal point should lie {shift}, which people hardly tell from a turn)"
-    return f"{turned} {instead}; calibrate it again"
+    return (
+        "{who} looks turned by about {degrees} degrees"
+        + (" and moved by {moved}" if finding.moved > 0.1 else "")
+        + "; calibrate its pose again"
+    )
 
 
 def _principal_point(finding: Finding, side_px: int) -> str:
     cure = "check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
     if len(finding.cameras) == 1:
-        instead = "(or the camera is turned by {degrees} degrees, which people hardly tell from it)"
-        return f"the principal point of {{who}} looks off, it should lie {{shift}} {instead}; {cure}"
+        return f"the principal point of {{who}} looks off, it should lie {{shift}}; {cure}"
     return f"principal points look off, they should lie {{shifts}} (at most a turn of {{degrees}} degrees); {cure}"
 
 
@@ -181,7 +202,7 @@ def _unfit(finding: Finding, side_px: int) -> str:
     if len(finding.cameras) == 1:
         return f"{{who}} fits the others in nothing that was tried; {check}"
     since = "" if finding.frames == (None, None) else " {when}, while they agree else: one of them was moved"
-    return f"{{who}} contradict each other{since}; {check.replace('its', 'their')}"
+    return f"{{who}} contradict {{others}}{since}; {check.replace('its', 'their')}"
 
 
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
@@ -215,8 +236,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.UNFIT: _unfit,
     Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit they do not"
     " tell; check it in frames with fewer",
-    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others do: the detector errs"
-    " there, or, if nobody else is in the picture, the camera may be turned",
+    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others see that person: the"
+    " detector errs",
     Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
     " the one became the other, or calibrate the pictures as they are",
 }

@@ -1,7 +1,7 @@
 """How well one camera fits the people that the others see, and which change of it would fit them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -258,4 +258,4 @@ def changed(views: Views, change: Array) -> Views:
     K = views.K.copy()
     K[:, :2, :2] *= np.exp(np.clip(change[:, 8], -_MOST_ZOOM, _MOST_ZOOM))[:, None, None]
     K[:, :2, 2] += change[:, 6:8]
-    return Views(K, cTw)
+    return replace(views, K=K, cTw=cTw)

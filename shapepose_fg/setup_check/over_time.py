@@ -23,7 +23,7 @@ _LEAST_PEOPLE = 6
 """Fewer people of the others say nothing of a piece."""
 _RESTLESS = 0.03
 """A camera is looked at closely if it sees people so far apart in two pieces, a part of their size: 5 cm."""
-_LOST, _THERE, _GOOD = 0.25, 0.3, 0.45
+_LOST, _THERE, _GOOD = 0.2, 0.2, 0.45
 """Or if its score differs by the first; a piece says something from the second on (in crowds sound cameras come
 to little more), and below the third other turns than its neighbours' are tried."""
 _LEAST_DEG = 1.2
@@ -34,30 +34,27 @@ _SURE = 6.0
 
 def warped(seen: Sightings, camera: Pinhole, turns: Array) -> Sightings:
     """What `camera` would have seen without the `turns` (S, 3), rotation vectors about its own axes."""
+    xy = unturned(seen.xy, camera, turns)
+    return replace(seen, xy=xy, confidence=np.where(np.isnan(xy[..., 0]), 0.0, seen.confidence))
+
+
+def unturned(xy: Array, camera: Pinhole, turns: Array) -> Array:
+    """(S, J, 2) where `camera` would have seen the joints `xy` without the `turns` (S, 3); NaN for behind it."""
     back = camera.K @ exp_so3(-turns) @ np.linalg.inv(camera.K)
-    h = np.einsum("sij,snj->sni", back[:, :, :2], seen.xy) + back[:, None, :, 2]
+    h = np.einsum("sij,snj->sni", back[:, :, :2], xy) + back[:, None, :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        xy = np.where(h[..., 2:] > 0, h[..., :2] / h[..., 2:], np.nan)
-    confidence = np.where(np.isnan(xy[..., 0]), 0.0, seen.confidence)
-    return replace(seen, xy=xy, confidence=confidence)
+        return np.where(h[..., 2:] > 0, h[..., :2] / h[..., 2:], np.nan)
 
 
 Way = Callable[[Index], Array]
 """From frames (S,) to rotation vectors (S, 3): how a camera is turned in each, about its own axes."""
 
 
-@dataclass(frozen=True)
-class Story:
-    """What a camera may have done over time, and the recording as if it had not."""
+def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[Finding, Look, int]]:
+    """What one camera did over time, if that explains what it saw better than a pose that lasts.
 
-    finding: Finding
-    look: Look
-    gain: float
-    """By how much the likelihood's logarithm rises over that of the best pose that lasts."""
-
-
-def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[Story]:
-    """What one camera did over time, if that explains what it saw better than a pose that lasts."""
+    Each with the recording as if it had not, and how many parameters that took.
+    """
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     if len(others) < 4 * _LEAST_PEOPLE or len(seen) < 4 * _LEAST_PEOPLE:
         return
@@ -76,7 +73,7 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[Story]:
         after = match(others, warped(seen, camera, way(seen.frame)), camera).score
         gain = likelihood(after, worth, freedom) - before
         if gain > _SURE and finding.amount > _LEAST_DEG:
-            yield Story(replace(finding, cameras=(view,)), _as_if_still(look, view, way), gain)
+            yield replace(finding, cameras=(view,)), _as_if_still(look, view, way), freedom
 
 
 def _as_if_still(look: Look, view: int, way: Way) -> Look:
@@ -244,17 +241,20 @@ def _drifted(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Wa
     return Finding(Kind.DRIFTING, (), amount), way, 6
 
 
-_PARTED, _LEAST_PART = 0.3, 0.15
-_POOR = {2: 0.5}
-_POOR_OF_MORE = 0.25
-"""Cameras stop to agree where their score falls by so much, with this part of the people on either side, and to so
-little: two cameras whose rays have only to meet to more than three or more, of which one that is turned by 3
-degrees leaves 0.16; people who hide each other before three sound cameras leave 0.3 to 0.5."""
+_PARTED, _LEAST_PART, _POOR = 0.3, 0.15, 0.5
+"""Two cameras, whose rays have only to meet, stop to agree where their score falls by so much, with this part of
+the people on either side, and to so little."""
 
 
 def parted(look: Look) -> tuple[int | None, int | None] | None:
-    """The frames in which cameras do not agree, where they do in the others."""
-    fits, possible = (np.cumsum(each) for each in _agreement(look))
+    """The frames in which two cameras do not agree, where they do in the others; of more, `stories` are told."""
+    views, last = np.unique(look.sightings.view).tolist(), int(look.sightings.frame.max()) + 1
+    if len(views) != 2:
+        return None
+    groups, error, _ = look.pair(*views)
+    counts = [np.bincount(look.seen_by(view).frame, minlength=last) for view in views]
+    fits = np.cumsum(np.bincount(groups.frame, 1 - error / GATE, minlength=last))
+    possible = np.cumsum(np.minimum(*counts))
     if possible[-1] == 0:
         return None
     rest = possible[-1] - possible
@@ -262,23 +262,6 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
     enough = np.minimum(possible, rest) > _LEAST_PART * possible[-1]
     at = int(np.argmax(np.where(enough, np.abs(before - after) * np.sqrt(possible * rest), 0.0)))
     low, high = sorted((before[at], after[at]))
-    if not enough[at] or high - low < _PARTED or low > _POOR.get(look.cameras_used, _POOR_OF_MORE):
+    if not enough[at] or high - low < _PARTED or low > _POOR:
         return None
     return (None, at + 1) if before[at] < after[at] else (at + 1, None)
-
-
-def _agreement(look: Look) -> tuple[Array, Array]:
-    """How well people fit in each frame (`Match.score` times their number), and how many could."""
-    views, last = np.unique(look.sightings.view).tolist(), int(look.sightings.frame.max()) + 1
-    if len(views) == 2:
-        groups, error, _ = look.pair(*views)
-        counts = [np.bincount(look.seen_by(view).frame, minlength=last) for view in views]
-        fits = np.bincount(groups.frame, 1 - error / GATE, minlength=last)
-        return np.asarray(fits, dtype=np.float64), np.minimum(*counts) * 1.0
-    fits, possible = np.zeros(last), np.zeros(last)
-    for view in views:
-        others, seen = look.others(view), look.seen_by(view)
-        found = match(others, seen, look.camera(view))
-        fits += np.bincount(others.frame[found.person], 1 - found.error / GATE, minlength=last)
-        possible += np.minimum(*(np.bincount(each.frame, minlength=last) for each in (others, seen)))
-    return fits, possible

@@ -4,7 +4,7 @@ The points are not known, so that what a change moves *along with the points* ex
 them (bundle adjustment).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, partial
 
@@ -16,9 +16,10 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import KERNEL, Look, Structure, observed, triangulate
-from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Pinhole, Q, changed, difference
 from shapepose_fg.setup_check.matching import Groups, least_of_each
+from shapepose_fg.setup_check.over_time import unturned
 
 _ROLL = [2]
 Parts = tuple[tuple[list[int], float], ...]
@@ -40,7 +41,14 @@ _LEAST_OF_ONE = 6
 _BIAS, _LIKELY_BIAS = 0.1, 2.0
 """A detector's bias on one person, part of the size (one sigma), and how much likelier than
 none it must be to be taken away."""
-_MOST_PEOPLE = 160
+_TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
+"""How large a small mistake of a camera usually is (one sigma): a turn, or a shift as large; a move, part
+of the people's distance; the logarithm of the focal length."""
+_LEAST_PART = 8
+"""A camera is bumped neither in the first of so many parts of the recording nor in the last."""
+_MOST_PEOPLE, _MOST_BIASES = 160, 4
+_TURN_DEG = 1.0
+"""A camera that is moved and turned by more is called turned."""
 _WEAK = 1e-6
 """The information that a point has without any view, as a part of what it has: two rays may be parallel."""
 
@@ -181,6 +189,8 @@ class Problem:
     """(N, V) the sightings of all people, -1 for none."""
     who: Index
     """(N,) who each is."""
+    frame: Index
+    """(N,) when."""
     step: int
     """Of these N every so many is in `structure`."""
 
@@ -193,7 +203,8 @@ class Problem:
         structure = triangulate(*seen, views, 5)
         one = [Structure(*(each[n : n + 1] for each in astuple(structure))) for n in range(len(structure.points))]
         parts = tuple(normal_equations(each, views) for each in one)
-        return cls(seen, views, structure, parts, groups.member, followed(groups.frame, all_people.points), step)
+        who = followed(groups.frame, all_people.points)
+        return cls(seen, views, structure, parts, groups.member, who, groups.frame, step)
 
     @cached_property
     def normal(self) -> Normal:
@@ -208,7 +219,7 @@ class Problem:
         if len(self.parts) == 0:
             return []
         H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
-        who, found = self.who[:: self.step], list[tuple[float, Bias]]()
+        who, found = self.who[:: self.step], list[tuple[float, float, Bias]]()
         for person in np.flatnonzero(np.bincount(who) >= _LEAST_OF_ONE).tolist():
             for view in range(len(self.views)):
                 columns, size = np.array(CENTRE) + Q * view, np.nan_to_num(self.structure.size_px[:, view])
@@ -217,16 +228,35 @@ class Problem:
                 slope = size @ g[:, columns]
                 shift = -np.linalg.solve(matrix + np.eye(2) / (_PRIOR * _BIAS**2), slope)
                 gain = -0.5 * _PRIOR * float(slope @ shift)
-                found.append((gain - self._price * len(CENTRE), Bias(person, view, shift)))
-        return sorted(found, key=lambda each: -each[0])
+                price = 0.5 * float(np.linalg.slogdet(np.eye(2) + _PRIOR * _BIAS**2 * matrix)[1])
+                found.append((gain - price, price, Bias(person, view, shift)))
+        found = sorted(found, key=lambda each: -each[0])[:_MOST_BIASES]
+        return sorted([(self._gain(self.views, self._beside(b)) - p, b) for _, p, b in found], key=lambda e: -e[0])
+
+    def _beside(self, bias: Bias) -> Array:
+        """The detections `seen` without a bias."""
+        xy, mine = self.seen[0].copy(), self.who[:: self.step] == bias.person
+        xy[mine, :, bias.view] -= bias.shift * self.structure.size_px[mine, bias.view, None, None]
+        return xy
 
     @property
     def bias(self) -> Bias | None:
-        """One person's bias, if it explains the residuals better than any camera's mistake."""
+        """One person's bias, if it explains the residuals and no camera's mistake surely does so better."""
         if len(self.biases) == 0:
             return None
         gain, bias = self.biases[0]
-        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - _LIKELY_BIAS) else None
+        return bias if gain > max(_LIKELY_BIAS, self.singles[0][0] - np.log(SURE / (1 - SURE))) else None
+
+    @property
+    def biased(self) -> Finding:
+        """The largest of the `biases`, and what its camera may have wrong instead."""
+        gain, bias = self.biases[0]
+        sure = 1 / (1 + float(np.exp(self.likely(bias.view) - gain)))
+        finding = Finding(Kind.BIASED, (bias.view,), float(np.hypot(*bias.shift)), sure=sure)
+        if sure >= SURE:
+            return finding
+        camera = one_of([each for each, _ in self.kinds(bias.view, 1 - sure)])
+        return replace(finding, instead=(replace(camera, instead=()), *camera.instead))
 
     def unbiased(self, look: Look, bias: Bias) -> Look:
         """The recording as if the person had been seen where the others see that person."""
@@ -246,6 +276,7 @@ class Problem:
     def small_errors(self, parts: Parts = ALL) -> SmallErrors:
         """What small errors of the cameras the residuals look like, with a sparse prior."""
         views, change, cost = self._solved(partial(_sparse_step, parts))
+        cost /= max(_cost(self.structure), 1e-12)
         shift_deg = np.rad2deg(np.hypot(*change[:, CENTRE].T) / views.focal_px)
         return SmallErrors(
             change[:, CENTRE], shift_deg, np.rad2deg(change[:, 2]), np.exp(change[:, 8]), views, cost
@@ -263,62 +294,141 @@ class Problem:
 
     @cached_property
     def singles(self) -> "list[tuple[float, int, Kind]]":
-        """Each change of one camera alone, best first: the likelihood's logarithm less BIC's price; view; kind."""
+        """Each change of one camera alone, best first: the likelihood's logarithm less its price; view; kind."""
         found = []
         for view in range(len(self.views)):
             for kind, parts in ONE.items():
                 columns = np.array(parts) + Q * view
-                gain = -0.5 * float(self.normal.g[columns] @ self.normal.solve(columns))
-                found.append((_PRIOR * gain - self._price * len(parts), view, kind))
+                change = np.zeros(Q * len(self.views))
+                change[columns] = self.normal.solve(columns)
+                gain = self._gain(changed(self.views, change.reshape(-1, Q)), self.seen[0])
+                found.append((gain - self._price(columns), view, kind))
+        found += [(gain, *each.cameras, each.kind) for gain, each in self.over_time]
         return sorted(found, key=lambda each: -each[0])
+
+    def _gain(self, views: Views, xy: Array) -> float:
+        """By how much the likelihood's logarithm is higher with other cameras, or other detections."""
+        structure = triangulate(xy, *self.seen[1:], views, 4)
+        return _PRIOR * (_cost(self.structure) - _cost(structure))
+
+    @cached_property
+    def over_time(self) -> list[tuple[float, Finding]]:
+        """Each camera's turn in the frames before or after one, and its turn that grows or ends: as `singles`."""
+        if len(self.parts) == 0:
+            return []
+        frame, found = self.frame[:: self.step], list[tuple[float, Finding]]()
+        H, g = np.stack([each.H for each in self.parts]), np.stack([each.g for each in self.parts])
+        steps, t = np.unique(frame), (frame - frame.min()) / max(np.ptp(frame), 1)
+        steps = steps[1 + len(steps) // _LEAST_PART : len(steps) - len(steps) // _LEAST_PART]
+        after = frame >= steps[:, None]
+        ends = [(None, at) for at in steps.tolist()] + [(at, None) for at in steps.tolist()] + [(None, None)] * 2
+        part = np.concatenate([~after, after, [1 - t, t]])
+        for view in range(len(self.views)):
+            columns = np.array(TURN) + Q * view
+            matrix = np.einsum("wn,nij->wij", part**2, H[:, columns[:, None], columns])
+            slope = part @ g[:, columns]
+            turn = -np.linalg.solve(matrix + np.eye(3) / (_PRIOR * _TURN**2), slope[..., None])[..., 0]
+            worth = -0.5 * _PRIOR * (slope * turn).sum(axis=1)
+            price = 0.5 * np.linalg.slogdet(np.eye(3) + _PRIOR * _TURN**2 * matrix)[1]
+            for kind, which in ((Kind.BUMPED, slice(0, -2)), (Kind.DRIFTING, slice(-2, None))):
+                if len(worth[which]) == 0:
+                    continue
+                best = int(np.arange(len(worth))[which][np.argmax((worth - price)[which])])
+                xy, camera = self.seen[0].copy(), Pinhole(self.views.K[view], self.views.cTw[view])
+                xy[:, :, view] = unturned(xy[:, :, view], camera, part[best][:, None] * turn[best])
+                gain = self._gain(self.views, xy) - price[best] - np.log(len(worth[which]))
+                degrees = float(np.rad2deg(np.linalg.norm(turn[best])))
+                found.append((float(gain), Finding(kind, (view,), degrees, frames=ends[best])))
+        return found
 
     def likely(self, view: int) -> float:
         """How much likelier some mistake of one camera is than none: see `singles`."""
         return max(gain for gain, of, _ in self.singles if of == view)
 
-    @property
-    def _price(self) -> float:
-        """What a parameter costs, by BIC."""
-        return 0.5 * float(np.log(max(_PRIOR * 2 * float(np.isfinite(self.structure.miss_px).sum()), 2.0)))
+    def _price(self, columns: Index) -> float:
+        """What parameters of a camera cost: by how much (logarithm) the detections narrow down what is usual."""
+        depth = float(np.nanmedian(self.structure.depth))
+        usual = np.tile([_TURN, _TURN, _TURN, *[_MOVE * depth] * 3, 0.0, 0.0, _FOCAL], (len(self.views), 1))
+        usual[:, CENTRE] = _TURN * self.views.focal_px[:, None]
+        usual = usual.ravel()[columns]
+        narrowed = np.eye(len(columns)) + _PRIOR * usual[:, None] * self.normal.H[np.ix_(columns, columns)] * usual
+        return 0.5 * float(np.linalg.slogdet(narrowed)[1])
 
-    @property
-    def sure(self) -> float:
-        """The probability that the camera of the first of `singles` is to blame, and not another, or none."""
-        gain, view, _ = self.singles[0]
-        weights = np.exp(np.array([each[0] for each in self.singles]) - max(gain, 0.0))
-        mine = np.array([each[1] == view for each in self.singles])
-        return float(weights[mine].sum() / (weights.sum() + np.exp(-max(gain, 0.0))))
+    @cached_property
+    def guilt(self) -> dict[int, float]:
+        """The probability of each camera to be the one with a mistake, likeliest first; the rest is of none."""
+        gains = np.array([each[0] for each in self.singles])
+        weights = np.exp(gains - max(gains.max(), 0.0))
+        weights /= weights.sum() + np.exp(-max(gains.max(), 0.0))
+        of = np.bincount([view for _, view, _ in self.singles], weights, len(self.views))
+        return {view: float(of[view]) for view in np.argsort(-of).tolist()}
 
-    def single(self, view: int, kind: Kind) -> tuple[Finding, float]:
-        """That change of one camera alone, and what remains of the residuals' cost."""
-        columns = np.array(ONE[kind]) + Q * view
+    def causes(self) -> list[tuple[Finding, Views]]:
+        """What one camera may have wrong, likeliest first, as `kinds`, of all cameras that are not unlikely."""
+        found = [each for view, sure in self.guilt.items() if sure > 1 - SURE for each in self.kinds(view, sure)]
+        return sorted(found, key=lambda each: -each[0].sure)
 
-        def step(normal: Normal, structure: Structure, total: Array) -> Array:
-            change = np.zeros_like(total)
-            change[columns] = normal.solve(columns)
-            return change
+    def kinds(self, view: int, sure: float) -> list[tuple[Finding, Views]]:
+        """What one camera has wrong if it has something, which is so with probability `sure`: see `explained`."""
+        gains = [(gain, kind) for gain, of, kind in self.singles if of == view]
+        weight = np.exp([gain - gains[0][0] for gain, _ in gains])
+        share = {kind: sure * each / weight.sum() for (_, kind), each in zip(gains, weight, strict=True)}
+        told = self.explained(view, self.views, dict.fromkeys(ONE, self.views))
+        lasting = sum(share[kind] for kind in ONE)
+        found = [(replace(each, sure=float(lasting * each.sure)), views) for each, views in told]
+        moving = [each for _, each in self.over_time if each.cameras == (view,)]
+        found += [(replace(each, sure=float(share[each.kind])), self.views) for each in moving]
+        return sorted(found, key=lambda each: -each[0].sure)
 
-        views, change, cost = self._solved(step)
-        turn, moved = difference(self.views.cTw[view], views.cTw[view])
-        if kind == Kind.FOCAL:
-            return Finding(kind, (view,), float(np.exp(-change[view, FOCAL[0]]))), cost
-        if kind == Kind.PRINCIPAL_POINT:
-            x, y = change[view, CENTRE].tolist()
-            return Finding(
-                kind, (view,), float(np.rad2deg(np.hypot(x, y) / views.focal_px[view])), ((x, y),)
-            ), cost
-        return Finding(Kind.TURNED if turn > 1 else kind, (view,), turn, moved=moved), cost
+    def explained(self, view: int, given: Views, starts: Mapping[Kind, Views]) -> list[tuple[Finding, Views]]:
+        """What one camera alone may have wrong, likeliest first, against the cameras as `given`.
 
-    def _solved(self, step: Callable[[Normal, Structure, Array], Array]) -> tuple[Views, Array, float]:
+        Each of the `starts` has the camera already as it is after that mistake, or nearly.
+        """
+        found = []
+        for kind, start in starts.items():
+            columns = np.array(ONE[kind]) + Q * view
+
+            def step(normal: Normal, structure: Structure, total: Array, columns: Index = columns) -> Array:
+                change = np.zeros_like(total)
+                change[columns] = normal.solve(columns)
+                return change
+
+            views, _, cost = self._solved(step, start)
+            found.append((-_PRIOR * cost - self._price(columns), named(kind, view, given, views), views))
+        best = max((likely for likely, _, _ in found), default=0.0)
+        total = sum(np.exp(likely - best) for likely, _, _ in found)
+        told = [(replace(each, sure=float(np.exp(x - best) / total)), views) for x, each, views in found]
+        return sorted(told, key=lambda each: -each[0].sure)
+
+    def _solved(
+        self, step: Callable[[Normal, Structure, Array], Array], start: Views | None = None
+    ) -> tuple[Views, Array, float]:
         """Cameras after steps (V Q,), which are told their sum so far; the sum (V, Q); the cost that remains."""
-        views, structure, normal, total = self.views, self.structure, self.normal, np.zeros(len(self.views) * Q)
-        for number in range(_ROUNDS):
-            normal = normal_equations(structure, views) if number > 0 else normal
+        views, structure, normal, total = self.views, self.structure, None, np.zeros(len(self.views) * Q)
+        if start is None:
+            normal = self.normal
+        else:
+            views, structure = start, triangulate(*self.seen, start, 4)
+        for _ in range(_ROUNDS):
+            normal = normal_equations(structure, views) if normal is None else normal
             change = step(normal, structure, total)
-            total = total + change
+            normal, total = None, total + change
             views = changed(views, change.reshape(-1, Q))
             structure = triangulate(*self.seen, views, 4)
-        return views, total.reshape(-1, Q), _cost(structure) / max(_cost(self.structure), 1e-12)
+        return views, total.reshape(-1, Q), _cost(structure)
+
+
+def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
+    """A change of one camera alone, in what the calibration has over what fits."""
+    if kind == Kind.FOCAL:
+        return Finding(kind, (view,), float(given.K[view, 0, 0] / views.K[view, 0, 0]))
+    if kind == Kind.PRINCIPAL_POINT:
+        x, y = (views.K - given.K)[view, :2, 2].tolist()
+        degrees = float(np.rad2deg(np.hypot(x, y) / views.focal_px[view]))
+        return Finding(kind, (view,), degrees, ((x, y),))
+    turn, moved = difference(given.cTw[view], views.cTw[view])
+    return Finding(Kind.TURNED if turn > _TURN_DEG else kind, (view,), turn, moved=moved)
 
 
 def _sparse_step(parts: Parts, normal: Normal, structure: Structure, total: Array) -> Array:

@@ -13,8 +13,10 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
+from shapepose_fg.setup_check.diagnosis import build_of
 from tests.calibration.conftest import FPS, disturbed, off_by
 
 TIMES = FrameTimes.from_fps(FPS, 250)
@@ -37,7 +39,7 @@ def test_one_frame_is_one_look_and_a_minute_is_many():
 
 
 @pytest.mark.slow
-def test_disturbed_cameras_come_back(rig, recording):
+def test_disturbed_cameras_come_back(rig, recording, people):
     wrong = disturbed(rig, 0, focal=0.02)
     found = refine(recording, wrong, TIMES, range(250), Freedom(focal=0.02))
     turn, move = off_by(found.rig, rig)
@@ -51,6 +53,8 @@ def test_disturbed_cameras_come_back(rig, recording):
     assert (move < 2.8 * found.adjusted.sigma(MOVE)).all()
     wide, before = (np.linalg.norm(np.diff(each.centres, axis=0)) for each in (found.of_stature(1.8), found.rig))
     assert wide / before == pytest.approx(1.8 / found.stature_m)
+    bones = people[:, :, list(BODY_25.core)].reshape(-1, 15, 3)
+    assert found.stature_m == pytest.approx(build_of(bones, BODY_25).stature, rel=0.02)
 
 
 @pytest.mark.slow

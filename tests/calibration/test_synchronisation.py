@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 
 from shapepose_fg.calibration import synchronisation
+from shapepose_fg.calibration.in_space import InSpace
+from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.synchronisation import synchronise
+from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.cli.main import main
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.setup_check.matching import Sightings
 from tests.calibration.conftest import FPS, LATE_S, filmed, merged, moving
 
 
@@ -46,6 +50,25 @@ def test_two_cameras(rig, late):
         Recording(late.skeleton, [f.only(f.view < 2) for f in late.frames]), two, FPS, range(300), 8.0
     )
     assert abs(found.offset_s[1] - LATE_S[1]) < 0.02
+
+
+def test_a_camera_that_sees_somebody_else_beside_is_left_out_of_a_person(rig, two_people):
+    """Three cameras see one person; the fourth sees another, who comes as near as 10 cm, and goes again."""
+    times = np.arange(100) / FPS
+    one = np.stack([moving(two_people[0], t)[0] for t in times])
+    beside = 0.1 + 0.9 * np.abs(np.sin(np.pi * times / 2))
+    other = one + beside[:, None, None] * np.array([0.8, 0.6, 0.0])
+    parts = [merged(rig, [who[:, None]] * 4) for who in (one, other)]
+    frames = [a.only(a.view < 3) for a in parts[0].frames], [b.only(b.view == 3) for b in parts[1].frames]
+    seen = [Sightings.of(Recording(parts[0].skeleton, each), range(100)) for each in frames]
+    both = Sightings(
+        *(np.concatenate([getattr(s, n) for s in seen]) for n in ("frame", "view", "xy", "confidence"))
+    )
+    views = Views.of(rig)
+    tracks = [Tracks.of(both, views, view, FPS) for view in range(4)]
+    space = InSpace.of(Pairwise(tracks, views, np.zeros(4), FPS))
+    assert len(space.time) >= 45  # of 50 moments
+    assert (space.member[:, :3] == 0).all() and (space.member[:, 3] == -1).all()
 
 
 @pytest.mark.slow
@@ -87,6 +110,14 @@ def test_the_command_writes_what_reconstruct_takes(rig, late, two_people, tmp_pa
     with pytest.raises(SystemExit) as ended:
         main([*line.split()[2:], "--frames", "0:40", "--no-report"])
     assert ended.value.code == 0
+    asked = ["reconstruct", "--calibration", "rig.json", "--detections", "detection", "--output", "at-once"]
+    asked += ["--synchronise", "--frames", "0:40", "--no-report"]
+    for more, code in ((["--timestamps", "same.csv"], 2), (["--fps", "25"], 0)):
+        with pytest.raises(SystemExit) as ended:
+            main([*asked, *more])
+        assert ended.value.code == code
+    assert (tmp_path / "at-once" / "synchronised.csv").read_text() == (tmp_path / "same.csv").read_text()
+    np.testing.assert_array_equal(Reconstruction.load("at-once").joints, Reconstruction.load("results").joints)
     # The cameras' first common moment: what the first camera, which the times are of, calls 4 s.
     people, body = Reconstruction.load("results"), two_people[0] + np.array([0.45, 0.0, 0.0])
     start = people.time_s.min() - (LATE_S.max() - LATE_S.min())

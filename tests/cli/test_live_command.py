@@ -151,6 +151,42 @@ def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_peo
             np.testing.assert_allclose(joints, expected, rtol=1e-5, atol=1e-5)
 
 
+def test_people_can_be_looked_at_while_they_go_elsewhere(tmp_path, cameras, five_cameras, two_people, capfd):
+    """One person leaves after six of 30 pictures: rerun is told who is known in the newest moment."""
+    rerun = pytest.importorskip("rerun")
+    both, one = lines(five_cameras, two_people, 6), lines(five_cameras, two_people[:1], 30)
+    later = [json.loads(line) for line in one.splitlines()][6 * len(five_cameras) :]
+    (tmp_path / "in.jsonl").write_text(both + "\n".join(map(json.dumps, later)))
+    out, looked = tmp_path / "out.jsonl", tmp_path / "people.rrd"
+    given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]
+    with pytest.raises(SystemExit) as ended:
+        main([*given, "--output", str(out), "--output", str(looked)])
+    assert ended.value.code == 0 and "WARN" not in capfd.readouterr().err
+    told = [json.loads(line) for line in out.read_text().splitlines()]
+    now = {each["time_s"]: each["people"] for each in told if each["kind"] == "now"}
+    chunks = list(rerun.chunk.RrdReader(looked).stream())
+    assert {"/world/people/1/body", "/world/people/0/bones", "/world/cameras/cam2"} < {
+        each.entity_path for each in chunks
+    }
+    assert all(any(person["joints"]) for people in now.values() for person in people)
+    for who in (0, 1):
+        tables = [each.to_record_batch() for each in chunks if each.entity_path == f"/world/people/{who}/joints"]
+        rows = [row for table in tables for row in table.to_pylist()]
+        shown = {row["time"].total_seconds(): row["Points3D:positions"] for row in rows}
+        expected = {
+            time_s: [joint for joint in person["joints"] if joint]
+            for time_s, people in now.items()
+            for person in people
+            if person["person"] == who
+        }
+        assert sorted(shown) == pytest.approx(sorted(expected)) and len(shown) >= 6
+        for time_s, joints in zip(sorted(shown), (expected[each] for each in sorted(expected)), strict=True):
+            np.testing.assert_allclose(shown[time_s], joints, atol=1e-5)
+    (stays,) = (each["person"] for each in now[2.9])
+    cleared = {each.entity_path for each in chunks if each.entity_path in ("/world/people/0", "/world/people/1")}
+    assert cleared == {f"/world/people/{1 - stays}"}
+
+
 def test_a_socket_listens_on_this_machine_only_unless_told_otherwise():
     with _listening("tcp://:0") as own, _listening("tcp://0.0.0.0:0") as everybody:
         assert own.getsockname()[0] == "127.0.0.1" and everybody.getsockname()[0] == "0.0.0.0"

@@ -147,14 +147,14 @@ def test_detections_are_read_as_lines_are(tmp_path, five_cameras):
     with (tmp_path / "seen.mcap").open("wb") as stream, McapWriter(stream, None) as writer:
         writer.detections(name, [flat], 12.5, five_cameras)
         writer.detections(name, [], 12.6, five_cameras)
-    first, second = read_views(tmp_path / "seen.mcap", five_cameras, BODY_25)
+    first, second = read_views(tmp_path / "seen.mcap", five_cameras, BODY_25, print)
     assert (first[0], first[2]) == (name, 12.5) and len(first[1]) == 25 and len(second[1]) == 0
 
 
 def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, file, five_cameras):
     whole = file.read_bytes()
     with pytest.raises(InputError, match="there is no detection in it"):
-        list(read_views(file, five_cameras, BODY_25))
+        list(read_views(file, five_cameras, BODY_25, print))
     rng, damaged = np.random.default_rng(0), tmp_path / "damaged.mcap"
     for _ in range(60):
         spoiled = bytearray(whole[: rng.integers(0, len(whole))])
@@ -162,7 +162,7 @@ def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, file, five_cameras)
             spoiled[place : place + 1] = bytes([rng.integers(0, 256)])
         damaged.write_bytes(bytes(spoiled))
         with pytest.raises(InputError, match=r"damaged\.mcap: "):
-            list(read_views(damaged, five_cameras, BODY_25))
+            list(read_views(damaged, five_cameras, BODY_25, print))
 
 
 @pytest.mark.parametrize("how", ["zstd", "lz4", ""])
@@ -183,7 +183,7 @@ def test_a_chunk_that_claims_more_memory_than_it_may_is_not_unpacked(tmp_path, f
         (tmp_path / "bomb.mcap").write_bytes(b"\x89MCAP0\r\n" + records.end())
         tracemalloc.start()
         with pytest.raises(InputError, match=r"bomb\.mcap: cannot be read \(ValueError: a chunk claims 83886080 "):
-            list(read_views(tmp_path / "bomb.mcap", five_cameras, BODY_25))
+            list(read_views(tmp_path / "bomb.mcap", five_cameras, BODY_25, print))
         assert tracemalloc.get_traced_memory()[1] < 2**24
         tracemalloc.stop()
 

@@ -1,14 +1,17 @@
 """Cameras on a robot, whose poses come with what they see."""
 
+import json
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
 
+from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import covariance_calibration, match_people
+from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.detections.lines import read_view_line
 from shapepose_fg.live.online import OnlineReconstructor
 from tests.live.conftest import rows
@@ -86,6 +89,47 @@ def test_a_camera_that_carries_itself_goes_on_after_a_restart(made, start, tmp_p
         assert np.array_equal(live.people().joints, now.joints)
     apart = np.linalg.norm(now.joints[:, None] - made.people[FRAMES - 1], axis=-1).mean(axis=-1)
     assert (apart.min(axis=1) < 0.02).all()
+
+
+def test_a_robot_s_log_says_where_its_cameras_go(made, tmp_path):
+    """Detections, odometry and mounts as ROS 2 messages; the calibration knows the robot's lenses only."""
+    pytest.importorskip("mcap_ros2", reason='needs pip install "shapepose-fg[ros]"')
+    from tests.io.test_ros_poses import header, odometry, transform, write
+
+    robot = [camera for camera in made.rig.cameras if camera.carrier]
+    still = [replace(each, carrier="", bTc=np.eye(4), wTc=np.eye(4)) for each in robot]
+    write_rig(replace(made.rig, cameras=(*made.rig.cameras[:2], *still), trajectories=()), tmp_path / "rig.json")
+    mounts = [(each.name, gtsam.Pose3(each.bTc)) for each in robot]
+    messages = [("/tf_static", 0.0, transform("base", f"{name}_optical", 0.0, bTc)) for name, bTc in mounts]
+    for time_s in np.arange(0.0, FRAMES / FPS + 0.1, 0.02).tolist():
+        pose = gtsam.Pose3(made.true.at(np.array(time_s)))
+        messages.append(("/odom", time_s, odometry(time_s, pose, np.eye(6) * 1e-6)))
+    rng = np.random.default_rng(0)
+    for frame in range(FRAMES):
+        time_s = float(TIMES.time_s[frame])
+        rig = made.with_path(made.true.wTb).at(np.full(4, time_s))
+        xy, _ = rig.project(made.people[frame])
+        for view, camera in enumerate(rig.cameras):
+            noisy = xy[view] + rng.normal(0, 3, xy[view].shape)
+            flat = np.concatenate([noisy, np.full((*noisy.shape[:2], 1), 0.9)], axis=-1).reshape(2, -1)
+            people = [{"pose_keypoints_2d": each} for each in flat.tolist()]
+            seen = {"header": header(f"{camera.name}_optical", time_s), "camera": camera.name, "people": people}
+            messages.append(("/detections", time_s + 0.015, seen))
+    write(tmp_path / "robot.mcap", sorted(messages, key=lambda each: each[1]))
+    with pytest.raises(SystemExit) as ended:
+        given = ["--calibration", tmp_path / "rig.json", "--detections", tmp_path / "robot.mcap", "--workers", "1"]
+        main(["live", *map(str, given), "--output", str(tmp_path / "people.jsonl")])
+    assert ended.value.code == 0
+    told = [json.loads(line) for line in (tmp_path / "people.jsonl").read_text().splitlines()]
+    settled = [each for each in told if each["kind"] == "settled"]
+    assert len(settled) == FRAMES
+    for each in settled[4:]:
+        frame, off = round(each["time_s"] * FPS), []
+        for person in each["people"]:
+            joints = np.array([joint or [np.nan] * 3 for joint in person["joints"]], dtype=float)
+            off.append(np.nanmean(np.linalg.norm(joints - made.people[frame], axis=-1), axis=1).min())
+        # 3 px from four views at 3 to 4 m; the robot moves by 1 m, and its cameras are 0.6 m apart.
+        assert len(off) == 2 and max(off) < 0.015  # 3 px from four views at 3 to 4 m
 
 
 def test_misuse_is_refused(made, start):

@@ -230,3 +230,18 @@ def test_the_tracker_goes_on_from_refined_joints(start, dance):
     moved = np.linalg.norm(live.people().joints - before.joints, axis=-1)
     assert 0.001 < np.median(moved[before.person == 1]) < 0.03
     assert np.median(moved[before.person != 1]) < 1e-9
+
+
+def test_a_late_frame_leaves_what_was_refined_after_it(start, dance):
+    live = start()
+    for frame in (0, 1, 2, 3, 4, 5, 7, 8):
+        live.push(dance.recording[frame], frame / 30)
+    people, given = live.people(), live._state.slots[-2].given
+    joints = people.joints + np.array([0.05, 0.0, 0.0])
+    refined = replace(people, joints=joints, frame=np.full(len(people), given.frame))
+    live._restart(refined)
+    live.push(dance.recording[6], 6 / 30)
+    slot = live._state.slots[-2]
+    assert slot.given is given and live.report().late == 1
+    rows = [slot.moment.identity.tolist().index(who) for who in people.person.tolist()]
+    np.testing.assert_array_equal(slot.moment.tracks.joints.position[rows], joints)

@@ -82,7 +82,7 @@ def mirrored(detections: DetectionSequence, rig: Rig, view: int) -> Recording:
     def change(frame: int, xy: Array) -> Array:
         return np.column_stack([width - 1 - xy[:, 0], xy[:, 1]])
 
-    return _seen_as(detections, view, change)
+    return seen_as(detections, view, change)
 
 
 def turning(detections: DetectionSequence, rig: Rig, view: int, degrees: Callable[[int], float]) -> Recording:
@@ -94,7 +94,7 @@ def turning(detections: DetectionSequence, rig: Rig, view: int, degrees: Callabl
         h = np.column_stack([xy, np.ones(len(xy))]) @ (K @ turn @ np.linalg.inv(K)).T
         return h[:, :2] / h[:, 2:]
 
-    return _seen_as(detections, view, change)
+    return seen_as(detections, view, change)
 
 
 def shifted(rig: Rig, view: int, right_px: float, down_px: float) -> Rig:
@@ -118,7 +118,8 @@ def biased(
     return Recording(detections.skeleton, frames)
 
 
-def _seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]) -> Recording:
+def seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]) -> Recording:
+    """One camera's pixels after a `change` of frame and pixels (N, 2)."""
     frames = []
     for number in range(len(detections)):
         found = detections[number]

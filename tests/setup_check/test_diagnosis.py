@@ -13,6 +13,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
+from shapepose_fg.setup_check.hypotheses import Lag
 from shapepose_fg.setup_check.matching import Sightings, least_of_each
 from tests.marks import slow
 from tests.setup_check.spoiled_setups import (
@@ -105,6 +106,35 @@ def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, p
     np.testing.assert_allclose(found.shift_px, [(-pixels, 0.0)], atol=5)
 
 
+@pytest.mark.parametrize("of", ["turned", *slow("shifted")])
+def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recording, room, of):
+    # 0.6 degrees are 10 px here. A turn sideways is a shift of the picture, but for its perspective.
+    rig = turned(room, 2, 0.6, np.array([0.0, 1.0, 0.0])) if of == "turned" else shifted(room, 2, 10.0, 0.0)
+    found = only_finding(recording, rig)
+    told = {each.kind: each.sure for each in (found, *found.instead) if each.cameras == (2,)}
+    assert {Kind.TURNED, Kind.PRINCIPAL_POINT} <= set(told)
+    assert max(told.values()) == found.sure and min(told.values()) > 0.05 and sum(told.values()) <= 1 + 1e-9
+    words = sentence(found, rig)
+    for each in found.instead:
+        assert f"({each.sure:.2f})" in words and "; or " in words
+
+
+def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detector(room, people, look_at):
+    diagnosis = diagnose(look_at(room, people[:, :1]), shifted(room, 2, 15.0, 0.0))
+    assert diagnosis.findings == ()
+    (noted,) = diagnosis.biased
+    assert (noted.kind, noted.cameras) == (Kind.BIASED, (2,))
+    camera = {each.kind: each.sure for each in noted.instead}
+    assert Kind.PRINCIPAL_POINT in camera
+    assert noted.sure + sum(camera.values()) == pytest.approx(1, abs=0.06)  # those under 0.05 are not said
+
+
+def test_who_is_near_by_chance_at_an_offset_makes_no_camera_late():
+    """As in a simulated crowd before three cameras in time, and in one whose camera was late by 7 frames."""
+    assert not Lag(frames=2, gain=0.0068, likely=21.4, agreement=0.164, followed=-0.008).is_offset
+    assert Lag(frames=7, gain=0.0224, likely=59.0, agreement=0.261, followed=0.351).is_offset
+
+
 def test_no_step_of_a_focal_length_leaves_the_numbers(room):
     """As the fit of a camera takes them whose pose is far off: exp(1000) is none."""
     change = np.zeros((len(room), Q))
@@ -163,6 +193,15 @@ def test_cameras_that_see_nobody_are_named(recording, room):
     assert (found.kind, found.cameras) == (Kind.NOBODY, (1,))
     found = only_finding(Recording(BODY_25, [Detections.empty()] * 30), room)
     assert "no camera sees a person" in sentence(found, room).lower()
+
+
+def test_people_before_and_after_a_long_gap_are_looked_at(recording, room):
+    """Of a hundred frames spread over the recording next to none shows anybody."""
+    gap = [Detections.empty()] * 5000
+    late = delayed(recording, 1, 10)
+    for seen, kinds in ((recording, []), (late, [Kind.LATE])):
+        parted = Recording(BODY_25, [*seen.frames[:30], *gap, *seen.frames[30:]])
+        assert [each.kind for each in diagnose(parted, room).findings] == kinds
 
 
 def test_cameras_that_never_see_people_at_once_are_named(recording, room):

@@ -12,7 +12,7 @@ from shapepose_fg.core.trust import Trust, Trusted
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.setup_check.findings import Kind
 from shapepose_fg.setup_check.report import check_setup, result_check
-from tests.setup_check.spoiled_setups import mirrored, turning
+from tests.setup_check.spoiled_setups import mirrored, seen_as, turning
 from tests.setup_check.test_diagnosis import some_cameras
 
 
@@ -44,6 +44,26 @@ def test_a_camera_that_drifts_is_named(recording, room):
     assert (found.kind, found.cameras) == (Kind.DRIFTING, (3,))
     assert found.amount == pytest.approx(8, abs=0.8)
     assert report.trust.dark(30) == (3,)
+
+
+@pytest.mark.parametrize("degrees", [0.8])
+def test_a_small_drift_is_told_from_a_turn_that_lasts(recording, room, degrees):
+    found = only_finding(check_setup(turning(recording, room, 1, lambda t: degrees * t / 59), room))
+    assert (found.kind, found.cameras) == (Kind.DRIFTING, (1,)) and found.sure > 0.5
+    assert found.amount == pytest.approx(degrees, rel=0.3)  # the usual size of a turn pulls it to 0
+
+
+def test_cameras_that_fit_nothing_are_one_sentence(recording, room):
+    """Two of five whose pictures jump by some hundred pixels from frame to frame."""
+    jumps = np.random.default_rng(1).uniform(-500, 500, (2, 60, 2))
+    seen = recording
+    for view, way in zip((1, 3), jumps, strict=True):
+        seen = seen_as(seen, view, lambda frame, xy, way=way: xy + way[frame])
+    report = check_setup(seen, room)
+    found = only_finding(report)
+    assert (found.kind, found.cameras) == (Kind.UNFIT, (1, 3))
+    assert "cam1 and cam3 contradict the others" in report.warnings[0]
+    assert report.trust == Trust(left_out=((1, 0, 60), (3, 0, 60)))
 
 
 @pytest.mark.parametrize("views", [[0, 1, 2, 3, 4], [0, 2, 3]])

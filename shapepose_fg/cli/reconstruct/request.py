@@ -22,7 +22,7 @@ from shapepose_fg.cli.options import (
 )
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.result_files import MOMENTS, OBSERVATIONS, PEOPLE
+from shapepose_fg.core.result_files import CLOCKS, MOMENTS, OBSERVATIONS, PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
-OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, "report.html")
+OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, CLOCKS, "report.html")
 """The files that are left in the folder of results."""
 
 
@@ -47,6 +47,7 @@ class Request(DetectionOptions, TimeOptions):
     trajectory: list[str] | None = option(
         INPUT, "Poses of a camera that moves: TUM or CSV; may be given several times.", metavar="CAMERA=FILE"
     )
+    synchronise: bool = option(TIME, "Cameras were started by hand: find when, from the people.", False)
     readout: float | None = option(TIME, "Seconds that rolling shutters take from first to last row.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
@@ -158,6 +159,8 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
         raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
     check_fps(request.fps)
     request = replace(request, timestamps=times_beside(detections, request.fps, request.timestamps))
+    if request.synchronise and (request.fps is None or request.timestamps is not None):
+        raise InputError("--synchronise: needs --fps, the rate of all cameras, and no times of frames")
     if request.frames is not None:
         ends(request.frames)
     return Prepared(request, project, calibration, detections, output)

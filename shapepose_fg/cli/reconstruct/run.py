@@ -11,10 +11,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.cli.found_cameras import MOST_S, found_clocks, show_clocks
 from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary_table
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.stopping import Stopped
@@ -23,7 +26,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.result_files import MOMENTS, PEOPLE, set_aside
+from shapepose_fg.core.result_files import CLOCKS, MOMENTS, PEOPLE, set_aside
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
@@ -35,6 +38,7 @@ from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.recording import read_recording, write_moments
 from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.io.timestamps import write_timestamps
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
@@ -68,16 +72,18 @@ def carry_out(
     InputError, one sentence, for what cannot be used; `Stopped`, with where it stands, on Ctrl-C or a request to
     end.
     """
-    asked, output = known.request, known.output
-    poses = [Path(each.partition("=")[2]) for each in asked.trajectory or ()]
-    files = (known.calibration, asked.config, asked.body, asked.timestamps, *poses)
-    reading = ReadInputs((*files, known.detections))
-    rig = asked.rig()
+    output = known.output
     refuse_corrected(output)
     if (output / PEOPLE).exists() and not (overwrite or (resume and (output / manifest.PARTS).is_dir())):
         raise InputError(f"{output}: a finished result is here; give another --output, or --overwrite")
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
+        known = _synchronised(known, kept=resume and (output / manifest.PARTS).is_dir())
+        asked = known.request
+        poses = [Path(each.partition("=")[2]) for each in asked.trajectory or ()]
+        files = (known.calibration, asked.config, asked.body, asked.timestamps, *poses)
+        reading = ReadInputs((*files, known.detections))
+        rig = asked.rig()
         recording, times = read_recording(known.detections, rig, asked.skeleton, kept, asked.fps, asked.timestamps)
         note(*recording.notes)
         count = len(recording)
@@ -105,6 +111,23 @@ def carry_out(
         report = check_setup(known, task) if asked.check and not rig.moves else None
         task = task if report is None else replace(task, detections=Trusted(recording, report.trust))
         return _Run(task, recording, known, inputs, execution, report).carried_out(resume=resume, restart=restart)
+
+
+def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
+    """The request with the times of cameras that were started by hand, from the people, in synchronised.csv beside
+    the results; those that are there already where they are `kept`, of a run that goes on.
+    """
+    asked, file = known.request, known.output / CLOCKS
+    if not asked.synchronise or asked.fps is None:
+        return known
+    if not (kept and file.is_file()):
+        rig = asked.still_rig("--synchronise")
+        found, count = found_clocks(known.detections, rig, asked.skeleton, asked.fps, MOST_S)
+        show_clocks(found, rig)
+        if problems := found.undetermined(rig):
+            raise InputError(f"--synchronise: {'; '.join(problems)}")
+        write_timestamps(file, rig.names, found.at(np.arange(count) / asked.fps))
+    return replace(known, request=replace(asked, fps=None, timestamps=file))
 
 
 def _about_moving(task: Task) -> list[str]:
@@ -248,6 +271,8 @@ class _Run:
         # What the observations were seen with: to solve or draw them anew.
         if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
             write_rig(rig, output / CAMERAS)
+        if not self.known.request.synchronise:
+            (output / CLOCKS).unlink(missing_ok=True)
         used = self.known.detections / FOOTAGE
         if used.is_file():
             write_content(output / FOOTAGE, read_text(used))

@@ -13,11 +13,11 @@ from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
 from shapepose_fg.io.validation import is_number
 
-_FILES = ("cameras.txt", "images.txt")
+FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")
-_HALF_PIXEL = 0.5
+HALF_PIXEL = 0.5
 """COLMAP's (0, 0) is the corner of the first pixel; ours is its centre."""
-_MODELS: dict[str, tuple[str, Lens]] = {
+MODELS: dict[str, tuple[str, Lens]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "perspective"),
     "PINHOLE": ("fx fy cx cy", "perspective"),
     "SIMPLE_RADIAL": ("f cx cy k1", "perspective"),
@@ -40,15 +40,15 @@ def _read(content: Content) -> WrittenRig | None:
     """A camera per image, in the order of images.txt; called after the image, or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
     names = [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
-    if content.syntax not in ("folder", "text") or not set(names) & {*_FILES, *_BINARY}:
+    if content.syntax not in ("folder", "text") or not set(names) & {*FILES, *_BINARY}:
         return None
-    for name, binary in zip(_FILES, _BINARY, strict=True):
+    for name, binary in zip(FILES, _BINARY, strict=True):
         if not (folder / name).is_file():
             cure = "copy it there too"
             if (folder / binary).is_file():
                 cure = f"{binary} is COLMAP's binary: run colmap model_converter --output_type TXT"
             raise InputError(f"{folder / name}: this half of COLMAP's model is missing; {cure}")
-    return WrittenRig(_images(folder / _FILES[1], _lenses(folder / _FILES[0])), None, None, _CURES)
+    return WrittenRig(_images(folder / FILES[1], _lenses(folder / FILES[0])), None, None, _CURES)
 
 
 def _lenses(path: Path) -> dict[str, WrittenCamera]:
@@ -60,15 +60,15 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
             continue
         place = f"{path}: line {number}"
         model = words[1] if len(words) > 1 else ""
-        if model not in _MODELS:
-            known = " ".join(_MODELS)
+        if model not in MODELS:
+            known = " ".join(MODELS)
             raise InputError(f"{place}: camera model {model or 'missing'} is not read; use one of {known}")
-        parameters, lens = _MODELS[model]
+        parameters, lens = MODELS[model]
         names = parameters.split()
         width, height, *values = _numbers(words[2:], 2 + len(names), place)
         given = dict(zip(names, values, strict=True))
         fx, fy = (given.get(focal, given.get("f", 0.0)) for focal in ("fx", "fy"))
-        K = intrinsics(fx, fy, given["cx"] - _HALF_PIXEL, given["cy"] - _HALF_PIXEL)
+        K = intrinsics(fx, fy, given["cx"] - HALF_PIXEL, given["cy"] - HALF_PIXEL)
         distortion = values[names.index("cy") + 1 :]
         lenses[words[0]] = WrittenCamera("", K, np.eye(4), (round(width), round(height)), distortion, lens)
     return lenses

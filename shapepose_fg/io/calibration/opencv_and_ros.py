@@ -26,10 +26,14 @@ _AGAIN = {"": "save it with OpenCV's calibration again"}
 _STORAGE = {"": "write it with OpenCV's FileStorage"}
 _EASYMOCAP = {"": "write it with EasyMocap again"}
 
-_K, _R, _T = "camera_matrix K intrinsic_matrix", "R rvec rotation_matrix rotation", "T t tvec translation"
-_DISTORTION = "distortion_coefficients dist_coeffs distortion_vector dist D"
+INTRINSIC, TURN, SHIFT = (
+    "camera_matrix K intrinsic_matrix",
+    "R rvec rotation_matrix rotation",
+    "T t tvec translation",
+)
+BEND = "distortion_coefficients dist_coeffs distortion_vector dist D"
 _SIZE = "image_width img_width width", "image_height img_height height"
-_POSE = "camera_pose_matrix"
+POSE = "camera_pose_matrix"
 """Names that programs give to the parts of a camera; `camera_pose_matrix` is MC-Calib's world from camera."""
 
 
@@ -76,21 +80,23 @@ def _read_nodes(content: Content) -> WrittenRig | None:
     if content.syntax == "folder":
         files = _loaded(content, ".yml .yaml .xml").values()
         nodes = {each.path.stem: each.value if each.syntax == "OpenCV" else None for each in files}
-    known = {name: node for name, node in nodes.items() if isinstance(node, dict) and Node(node, "").named(_K)}
+    known = {
+        name: node for name, node in nodes.items() if isinstance(node, dict) and Node(node, "").named(INTRINSIC)
+    }
     if content.syntax != "OpenCV" and (len(known) == 0 or len(known) < len(nodes)):
         return None
     cameras = []
     for name, values in known.items():
         node = Node(values, f'{content.path}: camera "{name}"', _STORAGE)
-        if node.named(_POSE) is not None:
-            wTc = node.pose_of_matrix(_POSE)
-        elif node.named(_R) is None or node.named(_T) is None:
+        if node.named(POSE) is not None:
+            wTc = node.pose_of_matrix(POSE)
+        elif node.named(TURN) is None or node.named(SHIFT) is None:
             raise InputError(f"{node.place}: R and T are missing, the camera's pose; {_ONE_CAMERA}")
         else:
-            wTc = node.pose(_R, _T)
+            wTc = node.pose(TURN, SHIFT)
         fisheye = values.get("distortion_type") == 1 or values.get("fisheye") in (1, "true")
         lens: Lens = "fisheye" if fisheye else "perspective"
-        cameras.append(node.camera(name, _K, wTc, _SIZE, _DISTORTION, lens))
+        cameras.append(node.camera(name, INTRINSIC, wTc, _SIZE, BEND, lens))
     if len(cameras) == 0:
         named = " ".join(list(content.value)[:5]) or "nothing"
         raise InputError(f"{content.path}: no camera with a pose here, only {named}; {_ONE_CAMERA}")
@@ -141,7 +147,7 @@ _LENSES: dict[str, Lens] = {
 _POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
 
 
-def _is_info(value: Any) -> bool:
+def is_info(value: Any) -> bool:
     """Whether this is what ROS' camera_calibration writes, or an echoed CameraInfo message."""
     known = isinstance(value, dict)
     return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
@@ -153,18 +159,18 @@ def _read_ros(content: Content) -> WrittenRig | None:
     `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or TransformStamped: the
     camera's optical frame in the world, so world from camera.
     """
-    if content.syntax == "YAML" and (_is_info(content.value) or _message_of(content.value) is not None):
-        what = "the intrinsics" if _is_info(content.value) else "the pose"
+    if content.syntax == "YAML" and (is_info(content.value) or message_of(content.value) is not None):
+        what = "the intrinsics" if is_info(content.value) else "the pose"
         cure = "give the folder with <camera>.yaml and <camera>_pose.yaml of every camera"
         raise InputError(f"{content.path}: this is {what} of one camera of ROS; {cure}")
     files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
     values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
-    if not any(map(_is_info, values.values())):
+    if not any(map(is_info, values.values())):
         return None
-    poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not _is_info(value)}
+    poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not is_info(value)}
     cameras = []
     for path, value in values.items():
-        if not _is_info(value):
+        if not is_info(value):
             continue
         name = path.stem.removesuffix("_camera_info").removesuffix("_info")
         if name not in poses:
@@ -187,7 +193,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
 
 def _ros_pose(path: Path, value: Any) -> Array:
     """World from camera, of a message with translation and rotation."""
-    message = _message_of(value)
+    message = message_of(value)
     if message is None:
         raise InputError(f"{path}: neither a camera_info nor a pose of ROS; {_POSE_CURE}")
     child = str(value.get("child_frame_id", ""))
@@ -205,7 +211,7 @@ def _ros_pose(path: Path, value: Any) -> Array:
     return pose(rotation_of(q, "rotation", str(path)), t, "rotation", str(path), world_from_camera=True)
 
 
-def _message_of(value: Any) -> tuple[Any, Any] | None:
+def message_of(value: Any) -> tuple[Any, Any] | None:
     """Translation and rotation of a pose, however deep its message is stamped."""
     if isinstance(value, dict) and isinstance(value.get("transforms"), list):
         value = value["transforms"][0] if len(value["transforms"]) == 1 else None

@@ -1,7 +1,8 @@
-"""A calibration written again in the format it came in: JSON and TOML; all others become our own rig file."""
+"""A calibration written again in the format it came in; what that cannot hold becomes our own rig file."""
 
 import json
 import re
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,33 +15,72 @@ from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import write_rig
 from shapepose_fg.io.calibration.reading import FORMATS
-from shapepose_fg.io.calibration.written import METRES, Unit
+from shapepose_fg.io.calibration.rewriting import REWRITTEN
+from shapepose_fg.io.calibration.written import METRES, Unit, WrittenRig
 
+_DIGITS, _DIGITS_PX = 1e-6, 1e-4
+"""How far what reads back may be off: metres and no unit, pixels."""
 _TABLE = re.compile(r"\s*\[\s*(?P<key>[^\]]+?)\s*\]\s*(#.*)?$")
 _ENTRY = re.compile(r"(?P<head>\s*(?P<name>matrix|rotation|translation|distortions)\s*=\s*)")
 
 
-def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -> str:
-    """Write `rig`, which was read from `source` and changed, to `target`; returns the format's name.
+def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -> tuple[str, Path]:
+    """Write `rig`, which was read from `source` and changed, to `target`; returns the format's name and
+    where it is.
 
-    Poses, intrinsics and distortions are replaced, the rest of the file stays. `unit` is what `read_rig` was told.
-    Formats that are neither JSON nor TOML are written as our own rig file.
+    Poses, intrinsics and distortions are replaced, the rest stays. Formats of several files become a folder:
+    `target` has no ending then. `unit` is what `read_rig` was told. What does not read back as `rig`, because a
+    format has no place for it or is written in an unusual way, is written as our own rig file.
     """
     content = load(source)
     read = ((each, each.read(content)) for each in FORMATS)
     form, written = next((form, written) for form, written in read if written is not None)
     metres = METRES[unit or written.unit or "m"]
-    if content.syntax == "TOML":
-        write_content(target, _toml(source, content, rig, metres))
-        return form.name
     place = _PLACES.get(form.name)
-    if place is None:
-        write_rig(rig, target)
-        return FORMATS[0].name
-    for camera, entry in zip(rig.cameras, place(content.value), strict=True):
-        _fill(entry, camera, metres)
-    write_content(target, json.dumps(content.value, indent=1))
-    return form.name
+    if place is not None:
+        for camera, entry in zip(rig.cameras, place(content.value), strict=True):
+            _fill(entry, camera, metres)
+        files = {source: json.dumps(content.value, indent=1)}
+    elif content.syntax == "TOML":
+        files = {source: _toml(source, content, rig, metres)}
+    else:
+        files = REWRITTEN.get(form.name, lambda *_: {})(content, rig, metres)
+    several = len(files) > 1 or source.is_dir()
+    if files and not (several and target.suffix):
+        with tempfile.TemporaryDirectory() as folder:
+            draft = Path(folder) / ("cameras" if several else source.name)
+            _write(files, draft, several=several)
+            again = form.read(load(draft))
+            reads = again is not None and _same(again, rig, metres)
+        if reads:
+            _write(files, target, several=several)
+            return form.name, target
+    file = target if target.suffix else target.with_suffix(".json")
+    write_rig(rig, file)
+    return FORMATS[0].name, file
+
+
+def _write(files: dict[Path, str], target: Path, *, several: bool) -> None:
+    if several:
+        target.mkdir(parents=True, exist_ok=True)
+    for file, text in files.items():
+        write_content(target / file.name if several else target, text)
+
+
+def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
+    """Whether the cameras of a file are those of a rig, to what a file's digits hold."""
+    if [each.name for each in written.cameras] != list(rig.names):
+        return False
+    for each, camera in zip(written.cameras, rig.cameras, strict=True):
+        wTc, d = each.wTc.copy(), np.zeros(14)
+        wTc[:3, 3] *= metres
+        d[: len(each.distortion)] = each.distortion
+        own = np.r_[camera.distortion, np.zeros(14)][:14]
+        if not (np.allclose(wTc, camera.wTc, atol=_DIGITS) and np.allclose(d, own, atol=_DIGITS)):
+            return False
+        if not np.allclose(each.K, camera.K, atol=_DIGITS_PX):
+            return False
+    return True
 
 
 def _voxelpose(value: Any) -> list[dict[str, Any]]:

@@ -21,14 +21,16 @@ from shapepose_fg.io.calibration.written import (
 from shapepose_fg.io.validation import is_number
 
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
-_SUBPIXEL = 64.0
+QTM_CAMERAS, NEXUS_CAMERAS = ("cameras/camera", "model"), ("Camera", "TYPE")
+"""Where cameras are, and the attribute that tells those for video."""
+SUBPIXEL = 64.0
 """QTM counts focal lengths and centres in 64ths of a pixel."""
-_FULL = "1080p"
-_LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
+FULL = "1080p"
+LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
 """Lines of a picture of the whole sensor by `video_resolution`."""
-_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
-_DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
+DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
 
 
 def _cameras(
@@ -37,15 +39,19 @@ def _cameras(
     """The video cameras where the file tells them by `model` from marker cameras, else all of them."""
     if content.syntax != "XML" or content.value.tag != root or content.value.find(path.split("/")[0]) is None:
         return None
-    every = content.value.findall(path)
-    chosen = [camera for camera in every if "video" in camera.get(model, "").lower()] or every
     cameras = []
-    for number, camera in enumerate(chosen):
+    for number, camera in enumerate(chosen(content.value, path, model)):
         place = f"{content.path}: camera {number}"
         if not camera.get(name):
             raise InputError(f"{place}: {name} is missing; export the calibration again")
         cameras.append(read(camera, f'{place} "{camera.get(name)}"'))
     return WrittenRig(cameras, "mm", "z")
+
+
+def chosen(root: ET.Element, path: str, model: str) -> list[ET.Element]:
+    """The elements of the cameras that are read."""
+    every = root.findall(path)
+    return [camera for camera in every if "video" in camera.get(model, "").lower()] or every
 
 
 def _node(element: ET.Element | None, place: str, cure: str) -> Node:
@@ -72,19 +78,19 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
     window = values("fov_video", "left top right bottom")
     turn = values("transform", "r11 r12 r13 r21 r22 r23 r31 r32 r33").reshape(3, 3)
     # R = diag(1, -1, -1) M, and the centre is x y z.
-    R = _TO_OPENCV @ turn
+    R = TO_OPENCV @ turn
     wTc = pose(R, values("transform", "x y z"), "transform", place, centre=True)
-    fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / _SUBPIXEL
+    fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / SUBPIXEL
     # The numbers are of the whole sensor; smaller pictures are resized, as Pose2Sim's read_qca has it.
-    resolution = camera.get("video_resolution", _FULL)
-    if resolution not in _LINES:
+    resolution = camera.get("video_resolution", FULL)
+    if resolution not in LINES:
         raise InputError(
-            f"{place}: video_resolution must be one of {' '.join(_LINES)}, got {resolution[:20]!r}; film and"
+            f"{place}: video_resolution must be one of {' '.join(LINES)}, got {resolution[:20]!r}; film and"
             " calibrate at one of these, or delete it where pictures are as large as fov_video says"
         )
-    scale = _LINES[resolution] / _LINES[_FULL]
+    scale = LINES[resolution] / LINES[FULL]
     K = intrinsics(fx * scale, fy * scale, (cx - window[0]) * scale, (cy - window[1]) * scale)
-    distortion = values("intrinsic", _DISTORTION, dict.fromkeys(_DISTORTION.split(), 0.0)).tolist()
+    distortion = values("intrinsic", DISTORTION, dict.fromkeys(DISTORTION.split(), 0.0)).tolist()
     width, height = (window[2:] - window[:2] + 1) * scale
     return WrittenCamera(camera.attrib["serial"], K, wTc, (round(width), round(height)), distortion)
 
@@ -119,6 +125,6 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
 
 QUALISYS = Format(
     "Qualisys' .qca.txt",
-    lambda content: _cameras(content, "calibration", "cameras/camera", "model", "serial", _qualisys),
+    lambda content: _cameras(content, "calibration", *QTM_CAMERAS, "serial", _qualisys),
 )
-VICON = Format("Vicon's .xcp", lambda content: _cameras(content, "Cameras", "Camera", "TYPE", "DEVICEID", _vicon))
+VICON = Format("Vicon's .xcp", lambda content: _cameras(content, "Cameras", *NEXUS_CAMERAS, "DEVICEID", _vicon))

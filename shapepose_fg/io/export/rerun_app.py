@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.export.registry import Job, Written
@@ -38,17 +40,19 @@ def new_stream() -> Any:
 
 
 @contextmanager
-def shown(take: Take, url: str | None) -> Iterator[Any]:
-    """A recording that the viewer at `url`, or one that is started, shows; InputError where that fails."""
+def shown(first: Any, url: str | None) -> Iterator[Any]:
+    """A recording that the viewer at `url`, or one that is started, shows, at `first` in that layout; InputError
+    where that fails.
+    """
     stream, rr = new_stream(), optional("rerun", "view")
     try:
         if url is not None:
-            stream.connect_grpc(url, default_blueprint=layout(take))
+            stream.connect_grpc(url, default_blueprint=first)
             stream.flush(timeout_sec=_CONNECT_S)
         else:
             rr.spawn(
                 recording=stream,
-                default_blueprint=layout(take),
+                default_blueprint=first,
                 executable_path=viewer_file(),
                 hide_welcome_screen=True,  # it would ask the network for examples
             )
@@ -64,6 +68,14 @@ def viewer_file() -> str | None:
     return shutil.which("rerun", path=sysconfig.get_path("scripts")) or shutil.which("rerun")
 
 
+def quiet_viewer() -> list[str]:
+    """Switch the statistics of use off; what is to be said of it. InputError where they cannot be."""
+    viewer = viewer_file()
+    if viewer is None or not switch_off(viewer):
+        return []
+    return ["rerun's statistics of use were on and are off now; `rerun analytics enable` switches them on"]
+
+
 def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
     """The body model, or a note where its file is not there any more: the rest can be looked at without it."""
     try:
@@ -73,12 +85,12 @@ def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
 
 
 @contextmanager
-def written(path: Path, take: Take) -> Iterator[Any]:
+def written(path: Path, first: Any) -> Iterator[Any]:
     """A recording that is written to `path` when the block has filled it, whole or not at all."""
     stream = new_stream()
     with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
         draft = Path(folder) / "people.rrd"
-        stream.save(draft, default_blueprint=layout(take))
+        stream.save(draft, default_blueprint=first)
         yield stream
         stream.flush()
         stream.disconnect()
@@ -91,23 +103,32 @@ def write_rrd(job: Job) -> Written:
     take, path = job.take, job.folder / "people.rrd"
     arrays, notes = body_if_there(job)
     notes += ["no cameras, for there is no cameras.json"] if take.rig is None else []
-    with written(path, take) as stream:
+    with written(path, layout_of(take)) as stream:
         log_take(stream, take, arrays)
     return Written([path], [f"rrd: {note}" for note in notes])
 
 
-def layout(take: Take) -> Any:
-    """The viewer's first layout: the world, every camera with people drawn over what it saw, and two plots."""
+def layout_of(take: Take) -> Any:
+    """The viewer's first layout for a take."""
+    drawn = [f"{person_path(who)}/bones" for who in take.persons.tolist()]
+    return layout(take.up, take.rig, take.people.joints.reshape(-1, 3), drawn)
+
+
+def layout(up: Axis, rig: Rig | None, around: Array, drawn: Sequence[str]) -> Any:
+    """The viewer's first layout: the world, every camera with people drawn over what it saw, and two plots.
+
+    It looks at the points `around` (N, 3); `drawn` is what of people is drawn in cameras.
+    """
     optional("rerun", "view")
     import rerun.blueprint as rrb
 
-    cameras = () if take.rig is None else take.rig.cameras
+    cameras = () if rig is None else rig.cameras
     world = rrb.Spatial3DView(
         origin="world",
         name="world",
         contents=["$origin/**", *(f"- {camera_path(camera.name)}/seen/**" for camera in cameras)],
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=_eye(rrb, take),
+        eye_controls=_eye(rrb, up, around),
     )
     plots = [rrb.TimeSeriesView(origin="plots/sigma", name="median sigma, mm")]
     if len(cameras) > 0:
@@ -116,7 +137,7 @@ def layout(take: Take) -> Any:
         rrb.Spatial2DView(
             origin=camera_path(camera.name),
             name=camera.name,
-            contents=["$origin/**", *(f"{person_path(who)}/bones" for who in take.persons.tolist())],
+            contents=["$origin/**", *drawn],
             visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.image_size[0]], y_range=[0, camera.image_size[1]]),
         )
         for camera in cameras
@@ -130,13 +151,12 @@ def layout(take: Take) -> Any:
     )
 
 
-def _eye(rrb: Any, take: Take) -> Any:
-    """Looks down on the people from the side, from far enough to see all of them."""
-    joints = take.people.joints.reshape(-1, 3)
-    joints = joints[np.isfinite(joints).all(axis=1)]
-    low, high = np.quantile(joints, [0.02, 0.98], axis=0) if len(joints) > 0 else (np.zeros(3), np.ones(3))
+def _eye(rrb: Any, axis: Axis, around: Array) -> Any:
+    """Looks down on the points (N, 3) from the side, from far enough to see all of them."""
+    around = around[np.isfinite(around).all(axis=1)]
+    low, high = np.quantile(around, [0.02, 0.98], axis=0) if len(around) > 0 else (np.zeros(3), np.ones(3))
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.0)
-    up = y_up(take.up)[1]
+    up = y_up(axis)[1]
     side = np.roll(up, 1) + 0.6 * np.roll(up, 2)
     place = middle + reach * (side / np.linalg.norm(side) + 0.45 * up)
     return rrb.EyeControls3D(position=place, look_target=middle, eye_up=up)

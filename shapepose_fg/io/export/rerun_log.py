@@ -1,6 +1,7 @@
 """What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how it fits."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -12,11 +13,11 @@ from scipy.stats import chi2
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
 from shapepose_fg.core.errors import optional
 from shapepose_fg.core.observation_table import Gate
-from shapepose_fg.core.reconstruction import Known, sigma_m
+from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.io.export.skinned import motion_of, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage
@@ -65,26 +66,91 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
 
     Cameras and what they saw where they are known; bodies where `arrays`, the body model, is given.
     """
-    rr = optional("rerun", "view")
-    up = f"RIGHT_HAND_{take.up[-1].upper()}_{'DOWN' if take.up[0] == '-' else 'UP'}"
-    stream.log("world", getattr(rr.ViewCoordinates, up), static=True)
+    rr, skin_of = optional("rerun", "view"), None if arrays is None else Skin.of(arrays)
+    log_world(stream, take.up, take.rig)
     if take.rig is not None:
-        _log_cameras(rr, stream, take, take.rig)
+        _log_moving(rr, stream, take, take.rig)
         _log_observations(rr, stream, take, take.rig)
-    mesh = None if arrays is None else thinned(arrays.template, arrays.faces)[:2]
     for person in range(len(take.persons)):
+        _log_looks(rr, stream, int(take.persons[person]), skin_of)
         _log_person(rr, stream, take, person)
-        if arrays is not None and mesh is not None:
-            _log_bodies(rr, stream, take, person, arrays, mesh)
+        if skin_of is not None:
+            _log_bodies(rr, stream, take, person, skin_of)
     stream.reset_time()
+
+
+class LiveLog:
+    """What is logged of people who come moment by moment; the world and its cameras when it begins."""
+
+    def __init__(self, stream: Any, rig: Rig, arrays: SmplArrays) -> None:
+        self._rr, self._stream, self._rig = optional("rerun", "view"), stream, rig
+        self._skin, self._met, self._there = Skin.of(arrays), set[int](), set[int]()
+        log_world(stream, rig.up, rig)
+
+    def moment(self, rows: Reconstruction) -> None:
+        """Log one moment's people; who was there before and is not in `rows` is cleared."""
+        persons, time_s = rows.person.astype(np.int64), rows.time_s[:1]
+        if len(rows) > 0:
+            self._stream.set_time("time", duration=float(time_s[0]))
+        for who in self._there - set(persons.tolist()):
+            for gone in (person_path(who), _sigma_path(who)):
+                self._stream.log(gone, self._rr.Clear(recursive=True))
+        self._there = set(persons.tolist())
+        if len(rows) == 0:
+            return
+        places = np.arange(len(rows), dtype=np.intp)[:, None]
+        take = Take(rows, persons, places, rows.frame[:1].astype(np.int64), time_s, 1.0, self._rig.up, self._rig)
+        for person, who in enumerate(persons.tolist()):
+            if who not in self._met:
+                self._met.add(who)
+                _log_looks(self._rr, self._stream, who, self._skin)
+            _log_person(self._rr, self._stream, take, person)
+            _log_bodies(self._rr, self._stream, take, person, self._skin)
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A body model, and what is drawn of its skin."""
+
+    arrays: SmplArrays
+    kept: Index
+    """Its vertices that are drawn."""
+    faces: NDArray[np.int32]
+    """(F, 3) triangles between these."""
+
+    @classmethod
+    def of(cls, arrays: SmplArrays) -> "Skin":
+        """Coarse enough for a viewer."""
+        return cls(arrays, *thinned(arrays.template, arrays.faces)[:2])
+
+
+def log_world(stream: Any, up: Axis, rig: Rig | None) -> None:
+    """What does not change: which way is up, and cameras that are known."""
+    rr = optional("rerun", "view")
+    axes = f"RIGHT_HAND_{up[-1].upper()}_{'DOWN' if up[0] == '-' else 'UP'}"
+    stream.log("world", getattr(rr.ViewCoordinates, axes), static=True)
+    if rig is not None:
+        _log_cameras(rr, stream, rig)
+
+
+def _sigma_path(who: int) -> str:
+    return f"plots/sigma/person_{who}"
+
+
+def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> None:
+    """What does not change of a person: the line's colour, and the triangles of the skin."""
+    colour = _rgb8(np.array(colour_of(who)))
+    stream.log(_sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True)
+    if skin_of is not None:
+        shade = [*colour.tolist(), round(255 * 0.55)]
+        surface = rr.Mesh3D.from_fields(triangle_indices=skin_of.faces, albedo_factor=shade)
+        stream.log(f"{person_path(who)}/body", surface, static=True)
 
 
 def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
     """Joints, bones, ellipsoids and sigma of one person, frame by frame; what ends is cleared."""
     who, people, there_before = int(take.persons[person]), take.people, False
-    path, plot, colour = person_path(who), f"plots/sigma/person_{who}", np.array(colour_of(who))
-    line = rr.SeriesLines(colors=_rgb8(colour[None]), names=f"person {who}")
-    stream.log(plot, line, static=True)
+    path, plot, colour = person_path(who), _sigma_path(who), np.array(colour_of(who))
     bones, sigma = bones_of(tuple(people.joint_names.tolist())), 1e3 * sigma_m(people.covariance)
     for index, row in enumerate(take.rows[person].tolist()):
         if row < 0 and not there_before:
@@ -129,14 +195,9 @@ def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array
     )
 
 
-def _log_bodies(
-    rr: ModuleType, stream: Any, take: Take, person: int, arrays: SmplArrays, mesh: tuple[Index, NDArray[np.int32]]
-) -> None:
-    """The body of one person where there is one; of its skin the vertices and triangles `mesh`."""
-    (kept, faces), who = mesh, int(take.persons[person])
-    path, colour = f"{person_path(who)}/body", _rgb8(np.array(colour_of(who))).tolist()
-    surface = rr.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=[*colour, round(255 * 0.55)])
-    stream.log(path, surface, static=True)
+def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: Skin) -> None:
+    """The body of one person where there is one."""
+    path, arrays, faces = f"{person_path(int(take.persons[person]))}/body", skin_of.arrays, skin_of.faces
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
     for at in np.setdiff1d(np.flatnonzero(take.rows[person] >= 0), index).tolist():
@@ -147,21 +208,26 @@ def _log_bodies(
     betas = take.column("betas", person)[index]
     for start in range(0, len(index), _CHUNK):
         part = slice(start, start + _CHUNK)
-        vertices = skin(arrays, betas[part], motion.rotations[part], motion.pelvis[part], kept).astype(np.float32)
+        posed = motion.rotations[part], motion.pelvis[part]
+        vertices = skin(arrays, betas[part], *posed, skin_of.kept).astype(np.float32)
         for place, at in enumerate(index[part].tolist()):
             _set_time(stream, take, at)
             normals = vertex_normals(vertices[place], faces).astype(np.float32)
             stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))
 
 
-def _log_cameras(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
-    """The cameras, frame by frame those that move; their pictures are those of cameras without distortion."""
+def _log_moving(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
+    """Cameras that move, frame by frame."""
     for index, time_s in enumerate(take.times_s if rig.moves else ()):
         _set_time(stream, take, index)
         for camera, moves in zip(rig.at(np.full(len(rig), time_s)).cameras, rig.carrier >= 0, strict=True):
             if moves:
                 pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
                 stream.log(camera_path(camera.name), pose)
+
+
+def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
+    """Lenses, and where cameras stand; their pictures are those of cameras without distortion."""
     for camera in rig.cameras:
         pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
         lens = rr.Pinhole(

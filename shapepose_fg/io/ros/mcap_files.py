@@ -1,16 +1,23 @@
 """MCAP files of ROS 2 messages: people written, detections read, without a ROS installation."""
 
-from collections.abc import Iterator
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.errors import InputError, optional
+from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
+from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.lines import view_of
 from shapepose_fg.io.ros.definitions import definition, type_name
 from shapepose_fg.io.ros.messages import (
@@ -27,6 +34,7 @@ from shapepose_fg.io.ros.messages import (
     people_message,
     ros_name,
 )
+from shapepose_fg.io.ros.poses import KINDS, Frames, frame_of, stamp_ns
 
 _DETECTIONS = "shapepose_msgs/Detections"
 _LASTS_S = 0.2
@@ -34,6 +42,11 @@ _LASTS_S = 0.2
 _CHUNK = 2**26
 """Bytes that a chunk may unpack to; those of ROS 2 have one million."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
+_CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
+_POSES_KEPT_S = 3.0
+"""Poses are kept so long: detections that were logged later than what moved find theirs."""
+View = tuple[str, Detections, float, Array | None, Array | None]
+"""What `OnlineReconstructor.push_view` takes."""
 
 
 class McapWriter:
@@ -84,39 +97,85 @@ class McapWriter:
         self._file.write_message(topic, self._schemas[kind], message, log_time=nanoseconds(time_s))
 
 
-def read_views(file: Path, rig: Rig, skeleton: Skeleton) -> Iterator[tuple[str, Detections, float]]:
-    """What cameras saw, in the order in which it was logged: camera, detections, and when, seconds, by its stamp.
+def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]) -> Iterator[View]:
+    """What `OnlineReconstructor.push_view` takes, in the order in which it was logged: camera, detections, when by
+    its stamp, seconds, and of a camera that moves its pose with covariance, between those in the file.
 
-    InputError, one sentence, for a file that is none or holds no such message.
+    A picture waits for the pose after it. `note` is told of cameras whose pictures had none. InputError, one
+    sentence, for a file that is none or holds no detection.
     """
-    number = 0
+    number, frames, unplaced, begun_s, tidied_s = 0, Frames(), Counter[tuple[str, str]](), math.inf, -math.inf
+    waiting = deque[tuple[tuple[str, Detections, float], str]]()
+    carrier = {each.name: each.carrier for each in rig.cameras}
+
+    def placed(now_s: float) -> Iterator[View]:
+        while waiting:
+            (camera, seen, time_s), frame = waiting[0]
+            (pose,), (surely,), (there,) = frames.at(frame, np.array([time_s]))
+            stands = not (carrier[camera] or frames.moves(frame))
+            if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
+                return
+            waiting.popleft()
+            if there or stands:
+                yield camera, seen, time_s, None if stands else pose, None if stands else surely
+            else:
+                unplaced[camera, frame] += 1
+
     with open_regular(file, _CURE) as stream:
-        for number, message in enumerate(_detections(stream, file), start=1):
-            stamp = message.header.stamp
-            people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
-            time_s = (stamp.sec * NS + stamp.nanosec) / NS
-            yield view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
+        for topic, kind, logged_s, message in _decoded(stream, file, {type_name(_DETECTIONS), *KINDS}, _CURE):
+            begun_s = min(begun_s, logged_s)
+            if kind != type_name(_DETECTIONS):
+                frames.add(topic, kind, message, f"{file}: topic {topic}")
+            else:
+                number += 1
+                people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
+                time_s = stamp_ns(message.header) / NS
+                view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
+                goes = carrier[message.camera]
+                waiting.append((view, frame_of(goes) if goes else message.header.frame_id))
+            yield from placed(logged_s)
+            if logged_s > tidied_s + 1.0:
+                frames.forget(logged_s - _POSES_KEPT_S)
+                tidied_s = logged_s
+    yield from placed(math.inf)
+    for (camera, frame), count in unplaced.items():
+        what = f"frame {frame} has no pose within {LONGEST_GAP_S:g} s"
+        note(f"{file}: {count} pictures of {camera} are left out; {what}")
     if number == 0:
         raise InputError(f"{file}: there is no detection in it; {_CURE}")
 
 
-def _detections(stream: IO[bytes], file: Path) -> Iterator[Any]:
-    """Messages with detections; what is wrong with the file as an InputError."""
+def read_frame(file: Path, frame: str, name: str) -> Trajectory:
+    """Where a frame goes, or what a topic of poses tells; with no `frame`, the one that there is. InputError."""
+    frames = Frames()
+    with open_regular(file, _CURE_POSES) as stream:
+        for topic, kind, _, message in _decoded(stream, file, set(KINDS), _CURE_POSES):
+            frames.add(topic, kind, message, f"{file}: topic {topic}")
+    known, wanted = frames.moving, frame.lstrip("/")
+    if (not wanted and len(known) != 1) or (wanted and not frames.moves(wanted)):
+        which = listing(known) if known else "none"
+        raise InputError(f"{file}: frames that move in it are {which}; say which one, {file.name}#FRAME")
+    with naming(f"{file}: frame {wanted or known[0]}", "record more"):
+        return frames.trajectory(wanted or known[0], name)
+
+
+def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
+    """Topic, kind, time of the log, and content of messages; what is wrong with the file as an InputError."""
     factory = optional("mcap_ros2.decoder", "ros").DecoderFactory()
     try:
-        for schema, encoding, message in _messages(stream):
-            if schema is not None and schema.name == type_name(_DETECTIONS):
-                decode = factory.decoder_for(encoding, schema)
+        for schema, channel, message in _messages(stream):
+            if schema is not None and schema.name in wanted:
+                decode = factory.decoder_for(channel.message_encoding, schema)
                 if decode is None:
-                    raise ValueError(f"its encoding is {encoding}")
-                yield decode(message.data)
+                    raise ValueError(f"its encoding is {channel.message_encoding}")
+                yield channel.topic, schema.name, message.log_time / NS, decode(message.data)
     except Exception as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
         said = f"{type(error).__name__}: {str(error).strip()[:80]}"
-        raise InputError(f"{file}: cannot be read ({said}); {_CURE}") from None
+        raise InputError(f"{file}: cannot be read ({said}); {cure}") from None
 
 
-def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, str, Any]]:
-    """Schema, encoding and record of each message: chunk by chunk, so that one is in memory at a time, and in each
+def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
+    """Schema, channel and record of each message: chunk by chunk, so that one is in memory at a time, and in each
     by the time of the log. ValueError for a chunk that claims more than `_CHUNK` bytes, before it is unpacked.
     """
     reading, lz4, zstd = (optional(name, "ros") for name in ("mcap.stream_reader", "lz4.frame", "zstandard"))
@@ -139,4 +198,4 @@ def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, str, Any]]:
                 channels[each.id] = each
             elif isinstance(each, reading.Message):
                 channel = channels[each.channel_id]
-                yield schemas.get(channel.schema_id), channel.message_encoding, each
+                yield schemas.get(channel.schema_id), channel, each

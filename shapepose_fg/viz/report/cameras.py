@@ -1,7 +1,7 @@
 """The page of cameras that were calibrated or refined: where they stand, stood before, and people over them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,78 +10,90 @@ from scipy.optimize import linear_sum_assignment
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.export.take import Take, z_up
 from shapepose_fg.viz.report.figures import Residual
 from shapepose_fg.viz.report.page import filled
-from shapepose_fg.viz.report.scene import camera_of, scene_of
+from shapepose_fg.viz.report.scene import Scene, camera_of, scene_of
 
 _SCENE_BYTES = 4_000_000
 _NEAR_M = 1.5
 """Who is farther away a look later is somebody else."""
 
 
-def write_camera_page(
-    file: Path,
-    rig: Rig,
-    before: Rig | None,
-    points: Array,
-    frame: Index,
-    time_s: Array,
-    joints: Sequence[str],
-    heads: Sequence[str],
-    rows: Sequence[tuple[str, Sequence[str]]],
-    missed_px: Mapping[str, Array],
-    summary: str,
-    caption: str,
-    remarks: Sequence[str],
-) -> None:
-    """Write a self-contained page of the cameras `rig`, and of those `before`, into `file`.
+@dataclass(frozen=True, kw_only=True)
+class CameraPage:
+    """A self-contained page of cameras, and of people whom they see."""
 
-    People are `points` (P, J, 3) at `frame` (P,), which were taken at `time_s` (P,); `joints` are their names.
-    `rows` are each camera's figures under `heads`. `missed_px` are distances (N, V) of joints from where other
-    cameras put them, under a name; NaN where unknown.
-    """
-    scene = None
-    if np.isfinite(points).all(axis=-1).any():
-        P, J = points.shape[:2]
+    rig: Rig
+    """The cameras."""
+    before: Rig | None = None
+    """The same as they were given, to be drawn beside."""
+    points: Array
+    """(P, J, 3) people's joints, metres."""
+    frame: Index
+    """(P,) the frame of each."""
+    time_s: Array
+    """(T,) when frames were taken."""
+    skeleton: Skeleton
+    """Whose core joints `points` are."""
+    heads: Sequence[str]
+    """What the figures are."""
+    rows: Sequence[tuple[str, Sequence[str]]]
+    """Each camera's name and figures."""
+    missed_px: Mapping[str, Array]
+    """(N, V) distances of joints from where other cameras put them, under a name; NaN where unknown."""
+    lines: Sequence[str]
+    """The figures' caption, and what is said above them."""
+    remarks: Sequence[str] = ()
+    """What is weak, a sentence each."""
+
+    def write(self, file: Path) -> None:
+        """Write the page."""
+        residuals = [
+            (name, [Residual.of(each) for each in distances.reshape(-1, len(self.rig)).T])
+            for name, distances in self.missed_px.items()
+        ]
+        text = filled(
+            "cameras.html",
+            self._scene(),
+            title=file.stem,
+            summary="; ".join(self.lines[1:]),
+            caption=f"{self.lines[0]}.",
+            remarks=[*self.remarks],
+            heads=[*self.heads],
+            rows=[(name, [*figures]) for name, figures in self.rows],
+            residuals=residuals,
+            longest=max((each.high_px or 0.0 for _, of in residuals for each in of), default=0.0),
+        )
+        write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
+
+    def _scene(self) -> Scene | None:
+        if not np.isfinite(self.points).all(axis=-1).any():
+            return None
+        P, J = self.points.shape[:2]
         people = Reconstruction(
-            frame=frame.astype(np.int64),
-            person=_followed(points, frame),
-            joint_names=np.array(joints),
-            joints=points,
+            frame=self.frame.astype(np.int64),
+            person=_followed(self.points, self.frame),
+            joint_names=np.array([self.skeleton.joints[joint] for joint in self.skeleton.core]),
+            joints=self.points,
             covariance=np.full((P, J, 3, 3), np.nan),
             confidence=np.ones((P, J)),
             status=np.full(P, str(Status.OK)),
-            time_s=time_s,
-            known=np.where(np.isfinite(points[..., 0]), Known.SEEN, Known.UNKNOWN).astype(np.uint8),
+            time_s=self.time_s[self.frame],
+            known=np.where(np.isfinite(self.points[..., 0]), Known.SEEN, Known.UNKNOWN).astype(np.uint8),
             betas=np.full((P, 10), np.nan),
             global_orient=np.full((P, 3), np.nan),
             body_pose=np.full((P, 23, 3), np.nan),
             transl=np.full((P, 3), np.nan),
         )
-        scene = scene_of(Take.of(people, rig.up, rig=rig), None, _SCENE_BYTES)
-        if before is not None:
-            data = scene.data | {"before": [camera_of(each, z_up(rig.up)) for each in before.cameras]}
-            scene = replace(scene, data=data)
-    residuals = [
-        (name, [Residual.of(each) for each in distances.reshape(-1, len(rig)).T])
-        for name, distances in missed_px.items()
-    ]
-    longest = max((each.high_px or 0.0 for _, of in residuals for each in of), default=0.0)
-    text = filled(
-        "cameras.html",
-        scene,
-        title=file.stem,
-        summary=summary,
-        caption=caption,
-        remarks=[*remarks],
-        heads=[*heads],
-        rows=[(name, [*figures]) for name, figures in rows],
-        residuals=residuals,
-        longest=longest,
-    )
-    write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
+        up = self.rig.up
+        scene = scene_of(Take.of(people, up, rig=self.rig), None, _SCENE_BYTES)
+        if self.before is None:
+            return scene
+        before = [camera_of(each, z_up(up)) for each in self.before.cameras]
+        return replace(scene, data=scene.data | {"before": before})
 
 
 def _followed(points: Array, frame: Index) -> Index:

@@ -1,0 +1,261 @@
+"""The files of a calibration with the numbers of its cameras replaced: XML, OpenCV's and ROS' YAML, COLMAP's text.
+
+Each function returns the texts of the files by where these were read; what does not fit is left as it was, and who
+calls reads it back.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike
+
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.io.calibration.colmap import COLMAP, FILES, HALF_PIXEL, MODELS
+from shapepose_fg.io.calibration.content import Content, load
+from shapepose_fg.io.calibration.opencv_and_ros import (
+    BEND,
+    INTRINSIC,
+    OPENCV,
+    POSE,
+    ROS,
+    SHIFT,
+    TURN,
+    is_info,
+    message_of,
+)
+from shapepose_fg.io.calibration.xml_files import (
+    DISTORTION,
+    FULL,
+    LINES,
+    NEXUS_CAMERAS,
+    QTM_CAMERAS,
+    QUALISYS,
+    SUBPIXEL,
+    TO_OPENCV,
+    VICON,
+    chosen,
+)
+
+Files = dict[Path, str]
+_KEY = re.compile(r"(?P<indent>\s*)(- )?[\"']?(?P<key>[^\"':#]+?)[\"']?\s*:\s*(?P<rest>.*)$")
+_DATA = re.compile(r"(?P<head>\s*data\s*:\s*)\[(?P<numbers>[^\]]*)\]", re.DOTALL)
+
+
+def _numbers(values: ArrayLike) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def _set(element: ET.Element | None, names: str, values: ArrayLike) -> None:
+    """Attributes, a number each."""
+    if element is not None:
+        for name, value in zip(names.split(), np.ravel(values).tolist(), strict=True):
+            element.set(name, repr(value))
+
+
+def _qualisys(content: Content, rig: Rig, metres: float) -> Files:
+    for element, camera in zip(chosen(content.value, *QTM_CAMERAS), rig.cameras, strict=True):
+        scale = LINES[element.get("video_resolution", FULL)] / LINES[FULL]
+        window = element.find("fov_video")
+        first = [float("nan") if window is None else float(window.get(side, "nan")) for side in ("left", "top")]
+        _set(element.find("transform"), "r11 r12 r13 r21 r22 r23 r31 r32 r33", TO_OPENCV @ camera.cTw[:, :3])
+        _set(element.find("transform"), "x y z", camera.centre / metres)
+        inner, K = element.find("intrinsic"), camera.K / scale
+        _set(inner, "focalLengthU focalLengthV", SUBPIXEL * K[[0, 1], [0, 1]])
+        _set(inner, "centerPointU centerPointV", SUBPIXEL * (K[:2, 2] + first))
+        _set(inner, DISTORTION, camera.distortion[:5])
+    return {content.path: ET.tostring(content.value, encoding="unicode")}
+
+
+def _vicon(content: Content, rig: Rig, metres: float) -> Files:
+    from scipy.spatial.transform import Rotation
+
+    for element, camera in zip(chosen(content.value, *NEXUS_CAMERAS), rig.cameras, strict=True):
+        frame = element.find("KeyFrames/KeyFrame")
+        if frame is None:
+            continue
+        frame.set("FOCAL_LENGTH", repr(float(camera.K[0, 0])))
+        frame.set("PRINCIPAL_POINT", _numbers(camera.K[:2, 2]))
+        frame.set("ORIENTATION", _numbers(Rotation.from_matrix(camera.cTw[:, :3]).as_quat()))
+        frame.set("POSITION", _numbers(camera.centre / metres))
+        words = frame.get("VICON_RADIAL2", "").split()
+        if len(words) >= 3:  # a name, a centre, and radial coefficients
+            frame.set("VICON_RADIAL2", " ".join([*words[:3], _numbers(camera.distortion[[0, 1, 4]])]))
+    return {content.path: ET.tostring(content.value, encoding="unicode")}
+
+
+def _matrices(text: str, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
+    """FileStorage's text; matrices are replaced for which `value(keys, count)` is one, keys from the outermost."""
+    if text.lstrip().startswith("<"):
+        return _matrices_of_xml(text, value)
+    pieces, above, place = list[str](), list[tuple[int, str]](), 0
+    for line in re.finditer(r"[^\n]*\n?", text):
+        found = _KEY.match(line.group().rstrip("\n"))
+        if line.start() < place or found is None:
+            continue
+        indent = len(found["indent"])
+        above = [(depth, key) for depth, key in above if depth < indent] + [(indent, found["key"])]
+        data = _DATA.search(text, line.end()) if found["rest"].startswith("!!opencv-") else None
+        if data is not None:
+            count = len(data["numbers"].split(","))
+            new = value(tuple(key for _, key in above), count)
+            if new is not None and np.size(new) == count:
+                head = text[place : data.start()].replace("dt: f", "dt: d")
+                pieces.append(f"{head}{data['head']}[ {', '.join(_numbers(new).split())} ]")
+                place = data.end()
+    return "".join(pieces) + text[place:]
+
+
+def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
+    root = ET.fromstring(text)
+
+    def fill(element: ET.Element, keys: tuple[str, ...]) -> None:
+        for child in element:
+            data = child.find("data") if str(child.get("type_id", "")).startswith("opencv-") else None
+            if data is None:
+                fill(child, (*keys, child.tag))
+                continue
+            count = len((data.text or "").split())
+            new = value((*keys, child.tag), count)
+            if new is not None and np.size(new) == count:
+                data.text = _numbers(new)
+
+    fill(root, ())
+    return ET.tostring(root, encoding="unicode")
+
+
+def _part(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
+    """A camera's numbers, `count` of them, by a name that programs give them."""
+    R, t = camera.cTw[:, :3], camera.cTw[:, 3] / metres
+    wTc = camera.wTc.copy()
+    wTc[:3, 3] /= metres
+    kinds = {INTRINSIC: camera.K, TURN: R if count == 9 else cv2.Rodrigues(R)[0], SHIFT: t, POSE: wTc}
+    kinds |= {BEND: np.r_[camera.distortion, np.zeros(14)][:count]}
+    return next((each for names, each in kinds.items() if name in names.split()), None)
+
+
+def _nodes(content: Content, rig: Rig, metres: float) -> Files:
+    cameras = dict(zip(rig.names, rig.cameras, strict=True))
+
+    def file(path: Path, inside: tuple[str, ...]) -> str:
+        def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
+            whose = (*inside, *keys)[-2:]
+            return _part(keys[-1], cameras[whose[0]], metres, count) if whose[0] in cameras else None
+
+        return _matrices(read_text(path), value)
+
+    if content.syntax != "folder":
+        return {content.path: file(content.path, ())}
+    return {path: file(path, (path.stem,)) for path in content.value if path.stem in cameras}
+
+
+def _multiview(content: Content, rig: Rig, metres: float) -> Files:
+    V = len(rig)
+
+    def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
+        names = {"Ks": INTRINSIC, "Rs": TURN, "Ts": SHIFT, "distortions": BEND}
+        kind = names.get(keys[-1])
+        if kind is None:
+            return None
+        # Four coefficients of a fisheye, equally many of every other camera.
+        four = [kind == BEND and camera.lens == "fisheye" for camera in rig.cameras]
+        each, rest = divmod(count - 4 * sum(four), max(V - sum(four), 1))
+        if rest != 0:
+            return None
+        counts = [4 if short else each for short in four]
+        parts = [_part(kind.split()[0], *both) for both in zip(rig.cameras, [metres] * V, counts, strict=True)]
+        return np.concatenate([np.ravel(part) for part in parts if part is not None])
+
+    return {content.path: _matrices(read_text(content.path), value)}
+
+
+def _easymocap(content: Content, rig: Rig, metres: float) -> Files:
+    tags = {tag: camera for n, camera in enumerate(rig.cameras, 1) for tag in (camera.name, str(n))}
+    tags |= {camera.name: camera for camera in rig.cameras}
+    kinds = {"K": INTRINSIC, "dist": BEND, "R": TURN, "Rot": TURN, "T": SHIFT}
+
+    def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
+        kind, _, tag = keys[-1].partition("_")
+        known = kind in kinds and tag in tags
+        return _part(kinds[kind].split()[0], tags[tag], metres, count) if known else None
+
+    folder = content.path if content.syntax == "folder" else content.path.parent
+    halves = [path for path in folder.iterdir() if re.fullmatch(r"(intri|extri)\.ya?ml", path.name)]
+    return {path: _matrices(read_text(path), value) for path in sorted(halves)}
+
+
+def _ros(content: Content, rig: Rig, metres: float) -> Files:
+    from scipy.spatial.transform import Rotation
+
+    files, cameras = dict[Path, str](), dict(zip(rig.names, rig.cameras, strict=True))
+    for path in content.value:
+        if path.suffix not in (".yaml", ".yml"):
+            continue
+        value: Any = load(path).value
+        name = path.stem.removesuffix("_pose").removesuffix("_camera_info").removesuffix("_info")
+        camera = cameras.get(name)
+        if camera is not None and is_info(value):
+            P = np.column_stack([camera.K, np.zeros(3)])
+            kinds = {"camera_matrix k K": camera.K, "projection_matrix p P": P}
+            kinds |= {"distortion_coefficients d D": camera.distortion}
+            for key in [key for names in kinds for key in names.split() if key in value]:
+                new = next(each for names, each in kinds.items() if key in names.split())
+                old = value[key]["data"] if isinstance(value[key], dict) else value[key]
+                numbers = np.r_[np.ravel(new), np.zeros(14)][: np.size(old)].tolist()
+                value[key] = value[key] | {"data": numbers} if isinstance(value[key], dict) else numbers
+        elif camera is not None and (parts := message_of(value)) is not None:
+            turn = Rotation.from_matrix(camera.wTc[:3, :3]).as_quat()
+            for part, axes, numbers in zip(parts, ("xyz", "xyzw"), (camera.centre / metres, turn), strict=True):
+                part |= dict(zip(axes, numbers.tolist(), strict=True))
+        else:
+            continue
+        files[path] = yaml.safe_dump(value, sort_keys=False, default_flow_style=None, width=1000)
+    return files
+
+
+def _colmap(content: Content, rig: Rig, metres: float) -> Files:
+    from scipy.spatial.transform import Rotation
+
+    folder = content.path if content.syntax == "folder" else content.path.parent
+    inner, outer = (read_text(folder / name).splitlines() for name in FILES)
+    cameras, place, of = list(rig.cameras), 0, dict[str, Camera]()
+    for number, line in enumerate(outer):
+        words = line.split(maxsplit=9)
+        # Every image is followed by a line of points, which may be empty.
+        if line.startswith("#") or place % 2 == 1 or len(words) != 10:
+            place += not line.startswith("#") and place % 2 == 1
+            continue
+        camera, place = cameras[place // 2], place + 1
+        x, y, z, w = Rotation.from_matrix(camera.cTw[:, :3]).as_quat()
+        words[1:8] = _numbers([w, x, y, z, *(camera.cTw[:, 3] / metres)]).split()
+        outer[number], of[words[8]] = " ".join(words), camera
+    for number, line in enumerate(inner):
+        words = line.split()
+        if line.startswith("#") or not words or words[0] not in of:
+            continue
+        camera, names = of[words[0]], MODELS[words[1]][0].split()
+        (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
+        known = {"f": fx, "fx": fx, "fy": fy, "cx": cx + HALF_PIXEL, "cy": cy + HALF_PIXEL}
+        bend = np.r_[camera.distortion, np.zeros(14)][: sum(name not in known for name in names)]
+        inner[number] = " ".join(
+            [*words[:4], _numbers([known[name] for name in names if name in known]), _numbers(bend)]
+        )
+    return {folder / FILES[0]: "\n".join(inner) + "\n", folder / FILES[1]: "\n".join(outer) + "\n"}
+
+
+REWRITTEN: dict[str, Callable[[Content, Rig, float], Files]] = {
+    QUALISYS.name: _qualisys,
+    VICON.name: _vicon,
+    OPENCV[0].name: _easymocap,
+    OPENCV[1].name: _multiview,
+    OPENCV[2].name: _nodes,
+    COLMAP.name: _colmap,
+    ROS.name: _ros,
+}
+"""How each format is written again, by its name."""

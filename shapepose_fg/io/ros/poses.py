@@ -1,0 +1,184 @@
+"""Where a robot says that its parts are: transforms, odometry and poses in ROS 2 messages, as a tree of frames."""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.io.ros.definitions import type_name
+from shapepose_fg.io.ros.messages import NS, WORLD, ros_name
+
+TREE = "tf2_msgs/TFMessage"
+_WITH_CHILD = "nav_msgs/Odometry"
+_ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")
+KINDS = tuple(map(type_name, (TREE, _WITH_CHILD, *_ALONE)))
+"""Messages that hold poses."""
+_STATIC = "tf_static"
+_UNIT = 0.01
+"""How far the length of a quaternion may be from 1."""
+_MOST_METRES = 1e6
+_TURN_THEN_WAY = np.array([3, 4, 5, 0, 1, 2])
+"""ROS's covariances are of the way, then of the turn."""
+
+
+class Frames:
+    """Poses of frames in their parents, as they are told; what is asked for is put together along the tree."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+        self._told: dict[str, dict[int, tuple[Array, Array | None]]] = defaultdict(dict)
+        self._fixed: dict[str, Array] = {}
+        self._sure = set[str]()
+        self._known: dict[str, Trajectory] = {}
+
+    def add(self, topic: str, kind: str, message: Any, place: str) -> None:
+        """Take in a message of one of `KINDS`. InputError naming `place` where a pose in it is none.
+
+        Odometry comes before transforms of the same frame: it says how surely.
+        """
+        for parent, child, stamp, pose, covariance in _links(topic, kind, message):
+            if topic.endswith(_STATIC):
+                self._fixed[child], self._parent[child] = _matrix(pose, f"{place}, frame {child}"), parent
+                continue
+            surely = _covariance(covariance, pose, f"{place}, frame {child}")
+            if surely is None and child in self._sure:
+                continue
+            if surely is not None and child not in self._sure:
+                self._sure.add(child)
+                self._told[child].clear()
+            self._told[child][stamp] = _matrix(pose, f"{place}, frame {child}"), surely
+            self._parent[child] = parent
+            self._known.pop(child, None)
+
+    @property
+    def moving(self) -> list[str]:
+        """Frames that move in their parents and carry no other that does."""
+        carries = {self._parent[child] for child in self._told}
+        return sorted(child for child in self._told if child not in carries)
+
+    def chain(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on, up to the one below `world` or the last that has a parent."""
+        found = list[str]()
+        while frame in self._parent and frame != WORLD and frame not in found:
+            found.append(frame)
+            frame = self._parent[frame]
+        return found
+
+    def moves(self, frame: str) -> bool:
+        """Whether it, or what it is on, has told poses over time."""
+        return any(each in self._told for each in self.chain(frame))
+
+    def at(self, frame: str, time_s: Array) -> tuple[Array, Array, Mask]:
+        """A frame in the root of its tree at times (N,): poses (N, 4, 4), their covariances (N, 6, 6), turn then
+        way along its own axes, 0 where nothing is said, and (N,) whether poses were told near enough.
+        """
+        poses = np.tile(np.eye(4), (len(time_s), 1, 1))
+        surely, there = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
+        for each in self.chain(frame):
+            # Of A B, what errs is A's error seen from B, and B's own.
+            link = self._trajectory(each) if each in self._told else None
+            if link is not None:
+                there &= link.covers(time_s)
+                carry = _of_inverse(poses)
+                surely += carry @ link.covariance_at(time_s) @ carry.mT
+            elif each in self._told:
+                there[:] = False
+            poses = (self._fixed.get(each, np.eye(4)) if link is None else link.at(time_s)) @ poses
+        return poses, surely, there
+
+    def trajectory(self, frame: str, name: str) -> Trajectory:
+        """Where a frame goes, at the times at which what moves most often under it was told. ValueError."""
+        moved = [each for each in self.chain(frame) if each in self._told]
+        most = max(moved, key=lambda each: len(self._told[each]))
+        time_s = np.array(sorted(self._told[most])) / NS
+        poses, surely, there = self.at(frame, time_s)
+        if there.sum() < 2:
+            raise ValueError(f"2 poses are needed, known along {' in '.join(self.chain(frame))} at the same time")
+        says = surely[there].any()
+        return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
+
+    def forget(self, before_s: float) -> None:
+        """Drop what was told before, but for the last of it."""
+        for child, told in self._told.items():
+            for stamp in sorted(stamp for stamp in told if stamp < before_s * NS)[:-1]:
+                del told[stamp]
+                self._known.pop(child, None)
+
+    def _trajectory(self, child: str) -> Trajectory | None:
+        """One link over time; None where it was told once only."""
+        if child not in self._known and len(self._told[child]) > 1:
+            told = sorted(self._told[child].items())
+            time_s, poses = np.array([at for at, _ in told]) / NS, np.stack([pose for _, (pose, _) in told])
+            says = [surely for _, (_, surely) in told if surely is not None]
+            self._known[child] = Trajectory(child, time_s, poses, np.stack(says) if says else None)
+        return self._known.get(child)
+
+
+def _links(topic: str, kind: str, message: Any) -> Iterator[tuple[str, str, int, Array, Any]]:
+    """Parent, child, stamp in nanoseconds, x y z qx qy qz qw and 36 numbers or None, of each pose in a message."""
+    stamped = message.transforms if kind == type_name(TREE) else [message]
+    for each in stamped:
+        covariance = None
+        if kind == type_name(TREE):
+            child, place, turn = each.child_frame_id, each.transform.translation, each.transform.rotation
+        else:
+            child = each.child_frame_id if kind == type_name(_WITH_CHILD) else topic
+            pose, covariance = each.pose, getattr(each.pose, "covariance", None)
+            pose = pose.pose if covariance is not None else pose
+            place, turn = pose.position, pose.orientation
+        numbers = np.array([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+        yield each.header.frame_id.lstrip("/"), child.lstrip("/"), stamp_ns(each.header), numbers, covariance
+
+
+def stamp_ns(header: Any) -> int:
+    """When, of a std_msgs/Header, nanoseconds."""
+    return header.stamp.sec * NS + header.stamp.nanosec
+
+
+def frame_of(carrier: str) -> str:
+    """The frame of a carrier: what is behind the # of a file's name, else its own name."""
+    file, _, frame = carrier.partition("#")
+    return frame.lstrip("/") if frame else ros_name(file)
+
+
+def _matrix(pose: Array, place: str) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > _UNIT:
+        raise InputError(f"{place}: a pose must be finite, its quaternion of length 1; leave it out")
+    if np.abs(pose[:3]).max() > _MOST_METRES:
+        raise InputError(f"{place}: a pose is over {_MOST_METRES:g} m away; write metres")
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
+    return found
+
+
+def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
+    """(6, 6) turn then way along the frame's own axes, of ROS's 36 numbers, along the parent's; None where these
+    are zero, which says that nothing is known, or begin with -1.
+    """
+    if numbers is None:
+        return None
+    parents = np.array(list(numbers), dtype=np.float64).reshape(6, 6)[np.ix_(_TURN_THEN_WAY, _TURN_THEN_WAY)]
+    if not parents.any() or parents[3, 3] == -1:
+        return None
+    if not np.isfinite(parents).all() or np.linalg.eigvalsh(parents)[0] < -1e-9 * max(1.0, parents.max()):
+        raise InputError(f"{place}: a covariance must be finite, without negative eigenvalues; write zeros")
+    turn = np.kron(np.eye(2), _matrix(pose, place)[:3, :3])
+    return np.asarray(turn.T @ (parents + parents.T) / 2 @ turn)
+
+
+def _of_inverse(poses: Array) -> Array:
+    """(N, 6, 6) the adjoints of inverses of poses (N, 4, 4): how a turn and a way along a parent's axes look from
+    the frame.
+    """
+    R, (x, y, z) = poses[:, :3, :3].mT, poses[:, :3, 3].T
+    none = np.zeros_like(x)
+    found = np.zeros((len(poses), 6, 6))
+    found[:, :3, :3] = found[:, 3:, 3:] = R
+    found[:, 3:, :3] = R @ np.stack([none, z, -y, -z, none, x, y, -x, none], axis=-1).reshape(-1, 3, 3)
+    return found
