@@ -55,7 +55,7 @@ class Clues:
 
     @property
     def person(self) -> Array:
-        """(N, 1) squared logarithm of the mean sigma of a person's joints over `SURE_M`, from 1 to `PERSON_MOST`."""
+        """(N, 1) squared logarithm of a person's mean sigma over `SURE_M`, from 1 to `PERSON_MOST`."""
         known = np.isfinite(self.covariance).all(axis=(-2, -1))
         variance = np.where(known, np.trace(self.covariance, axis1=-2, axis2=-1) / 3, 0.0)
         sigma_m = np.sqrt(variance).sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)

@@ -208,6 +208,7 @@ def test_a_camera_of_which_hardly_anything_was_taken(scene):
     """
     rig, recording = with_turned(scene.rig, 3, 4.0), simulate(scene, seed=3)
     found = reconstruct(recording, rig)
+    assert found.observations is not None
     assert found.observations.used[:, :, 3].mean() < 0.05
     person, _, _ = seen_by_many(found)
     told = explain(found, rig, person=person, joint="LElbow", frame=5, detections=recording)
