@@ -22,7 +22,6 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.io.detections.lines import read_view_line
-from shapepose_fg.io.export import rerun_app, rerun_log
 from shapepose_fg.io.ros.mcap_files import McapWriter, read_views
 from shapepose_fg.io.solved_setup import body_of
 
@@ -75,6 +74,8 @@ def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publi
             yield lambda kind, people: _by_time(people, lambda rows, time_s: written.frame(rows, time_s, kind))
             return
         if where == "rerun" or where.startswith("rerun+") or where.endswith(".rrd"):
+            from shapepose_fg.io.export import rerun_app, rerun_log  # with scipy.stats: half a second
+
             first = rerun_app.layout(rig.up, rig, rig.centres, ["world/people/**"])
             if where.endswith(".rrd"):
                 stream = files.enter_context(rerun_app.written(Path(where), first))

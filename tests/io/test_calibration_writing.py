@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.io.calibration import read_rig, write_like, write_rig
+from shapepose_fg.io.calibration.rewriting import REWRITTEN
+from shapepose_fg.io.calibration.xml_files import QUALISYS
 from shapepose_fg.simulation import built_in_scene
 from tests.io.test_calibration_formats import WRITERS, easymocap
 
@@ -81,6 +83,17 @@ def test_a_folder_s_format_goes_into_a_file_as_our_own(tmp_path):
     rig = read_rig(source)
     assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "our own rig file"
     same(read_rig(tmp_path / "new.json"), changed(rig))
+
+
+def test_what_does_not_read_back_is_written_as_our_own(tmp_path, monkeypatch):
+    """Whatever a format's writer makes of it, nobody is left with a file that cannot be read."""
+    write, how, _ = WRITERS["Qualisys"]
+    source = write(tmp_path)
+    rig = read_rig(source, **how)
+    for text in ("", "<calibration><cameras><camera serial='1'/></cameras></calibration>"):
+        monkeypatch.setitem(REWRITTEN, QUALISYS.name, lambda content, *_, text=text: {content.path: text})
+        assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "our own rig file"
+        same(read_rig(tmp_path / "new.json"), changed(rig))
 
 
 def test_a_lens_that_two_pictures_share_cannot_be_written_as_two(tmp_path):

@@ -177,7 +177,7 @@ def test_views_come_with_the_pose_of_their_moment(tmp_path):
     sure, messages = np.eye(6) * 1e-4, [("/tf_static", 0.0, transform("base", "eye", 0.0, MOUNT))]
     for t, b in zip(TIMES.tolist(), ODOM, strict=True):
         messages.append(("/odom", t, odometry(t, b, sure)))
-        for camera, frame in (("cam0", "eye"), ("cam1", "wall"), ("cam2", "eye")):
+        for camera, frame in (("cam0", "/eye"), ("cam1", "wall"), ("cam2", "eye")):
             seen = {"header": header(frame, t + 0.05), "camera": camera, "people": [{"pose_keypoints_2d": flat}]}
             messages.append(("/detections", t + 0.06, seen))
     told: list[str] = []

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import write_rig
@@ -50,8 +51,11 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
         with tempfile.TemporaryDirectory() as folder:
             draft = Path(folder) / ("cameras" if several else source.name)
             _write(files, draft, several=several)
-            again = form.read(load(draft))
-            reads = again is not None and _same(again, rig, metres)
+            try:
+                again = form.read(load(draft))
+                reads = again is not None and _same(again, rig, metres)
+            except InputError:
+                reads = False
         if reads:
             _write(files, target, several=several)
             return form.name, target

@@ -132,7 +132,7 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
                 time_s = stamp_ns(message.header) / NS
                 view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
                 goes = carrier[message.camera]
-                waiting.append((view, frame_of(goes) if goes else message.header.frame_id))
+                waiting.append((view, frame_of(goes) if goes else message.header.frame_id.lstrip("/")))
             yield from placed(logged_s)
             if logged_s > tidied_s + 1.0:
                 frames.forget(logged_s - _POSES_KEPT_S)
