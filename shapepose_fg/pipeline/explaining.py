@@ -8,6 +8,7 @@ import numpy as np
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
@@ -149,7 +150,7 @@ def _with_strays(
     for v in np.unique(view).tolist():
         mine = np.flatnonzero(view == v)
         off = np.linalg.norm(away[mine] - _commonest(away[mine]), axis=-1)
-        order = np.argsort(-off)  # the nearest is written last
+        order = np.argsort(-off, kind="stable")  # the nearest is written last
         mine = mine[order[off[order] < _BESIDE_RAD]]
         xy[row[mine], joint[mine], v], confidence[row[mine], joint[mine], v] = at[mine], score[mine]
     return replace(rows, xy=xy, confidence=confidence)
@@ -222,7 +223,7 @@ def _view_reasons(
         like = ""
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
             least = np.eye(3)  # a metre
-            without = inverses(_positive(whole - information[v]) + least)
+            without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
             away = residual[v] + slope[v] @ without @ gradient[v]
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
             off_px = float(np.linalg.norm(away))
@@ -416,12 +417,6 @@ def _mirrored(name: str) -> str:
             if name.startswith(one):
                 return other + name.removeprefix(one)
     return name
-
-
-def _positive(matrix: Array) -> Array:
-    """The nearest positive semi-definite matrix."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def _pair(values: Array) -> tuple[float, float] | None:

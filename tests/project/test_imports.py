@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.compiled core.errors",
-    "core.skeleton core.pieces core.assignment core.lens core.trajectory",
+    "core.decompositions core.skeleton core.pieces core.assignment core.lens core.trajectory",
     "core.camera",
     "core.drawing",
     "core.storage.files core.bounds",
@@ -158,6 +158,34 @@ def test_torch_is_imported_for_training_only():
     users = {name for name, tree in LIBRARY.items() if "torch" in imports(tree)}
     training = {name for name in users if "simulation.training" in name}
     assert users - training <= {"shapepose_fg.cli.train_fitter", "cli.train_fitter"} and training
+
+
+NOT_UNIQUE = {"eig", "eigh", "svd", "qr", "schur", "multivariate_normal"}
+"""Functions whose vectors have signs, and bases of repeated values, that the processor's kernels choose."""
+WITHOUT_CHOICE = {
+    "shapepose_fg.core.decompositions": "removes it",
+    "factors.camera_of": "gives signs: depth and focal lengths are positive",
+    "factors.lasting": "makes symmetric roots and projectors",
+}
+
+
+def test_what_a_processor_may_choose_is_left_to_none():
+    """Signs of eigenvectors (use `core.decompositions`) and the order of equal values (sort stably): a seed would
+    give another recording on another processor.
+    """
+    users = set()
+    for module, tree in [*LIBRARY.items(), *modules("factors"), *modules("scripts")]:
+        for node in ast.walk(tree):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            if node.func.attr in NOT_UNIQUE:
+                users.add(module)
+            if node.func.attr in ("argsort", "argpartition"):
+                stable = any(
+                    isinstance(each.value, ast.Constant) and each.value.value == "stable" for each in node.keywords
+                )
+                assert stable, f"{module}, line {node.lineno}: give argsort kind='stable'"
+    assert users == set(WITHOUT_CHOICE)
 
 
 LIGHT = {
