@@ -1,4 +1,4 @@
-"""Networks that name other files, in every spelling and place of the format, are refused before anything reads them."""
+"""Networks that name other files are refused, in every spelling and place of the format."""
 
 import os
 import time
