@@ -39,8 +39,8 @@ STANDING = np.array(
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _torch_is_loaded_once_for_all_processes() -> None:
-    """Worker processes of any test are forked off one that has torch; the first test's would leave it out."""
+def _modules_are_loaded_once_for_all_processes() -> None:
+    """Fork the worker processes of all tests off one that has imported the pipeline."""
     get_ready("shapepose_fg.pipeline.pipeline")
 
 

@@ -21,7 +21,7 @@ LEVELS = (
     "core.storage.npz",
     "core.storage.schema",
     "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
-    " core.run_summary viz.rendering pipeline.workers cli.terminal cli.stopping",
+    " core.run_summary core.rig_file viz.rendering pipeline.workers cli.terminal cli.stopping",
     "core.result_files",
     "body.kernels",
     "body.model",
