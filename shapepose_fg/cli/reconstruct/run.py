@@ -84,7 +84,7 @@ def carry_out(
         files = (known.calibration, asked.config, asked.body, asked.timestamps, *poses)
         reading = ReadInputs((*files, known.detections))
         rig = asked.rig()
-        recording, times = read_recording(known.detections, rig, asked.skeleton, kept, asked.fps, asked.timestamps)
+        recording, times = read_recording(known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps)
         note(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
@@ -122,7 +122,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")
-        found, count = found_clocks(known.detections, rig, asked.skeleton, asked.fps, MOST_S)
+        found, count = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
         show_clocks(found, rig)
         if problems := found.undetermined(rig):
             raise InputError(f"--synchronise: {'; '.join(problems)}")
