@@ -320,9 +320,11 @@ def _findings(
     found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
     if wrong is not None and all(views[wrong.view].camera not in each.cameras for each in found):
         name = views[wrong.view].camera
+        (turn, turn_sigma), (shift, shift_sigma) = wrong.turn_deg, wrong.shift_m
         words = (
-            f"Camera {name} is off with whatever it sees around this time: turned by {wrong.turn_deg:.1f} degrees"
-            f" and moved by {100 * wrong.shift_m:.0f} cm it would fit the others. Check its pose, lens and clock."
+            f"Camera {name} is off with whatever it sees around this time: turned by {turn:.1f} ± {turn_sigma:.1f}"
+            f" degrees and moved by {100 * shift:.0f} ± {100 * shift_sigma:.0f} cm it would fit the others."
+            " Check its pose, lens and clock."
         )
         found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
