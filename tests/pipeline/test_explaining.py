@@ -159,7 +159,7 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     # Of what was given to them neither is seen.
     assert not done & {(each.cause, *each.cameras[:1]) for each in asked(found, scene.rig, who).findings}
     untouched = explain(people, scene.rig, person=person, joint="LElbow", frame=5, detections=recording)
-    assert untouched.findings == ()
+    assert not done & {(each.cause, *each.cameras[:1]) for each in untouched.findings}
 
 
 def test_views_that_the_body_contradicts(people, scene):
