@@ -64,13 +64,12 @@ def overlay(
         raise InputError("--stills and --frames: both say which frames; give one of them")
     from shapepose_fg.core.camera import choose
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.calibration import read_rig
-    from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.io.solved_setup import cameras_of
     from shapepose_fg.viz.overlay.frames import Overlay, write_overlay
 
     folder = results_folder(results)
     with Reconstruction.open(folder) as people:
-        rig, run = read_rig(folder / CAMERAS), people.run
+        rig, run = cameras_of(folder), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
         with naming("--without"):
             names = choose(names, without=names_of(drawn.without) or ())

@@ -72,7 +72,9 @@ def reconstruct(
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
-    return reconstruct_parts(InMemory(), task, execution).reconstruction(consume=True)
+    kept = InMemory()
+    people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
+    return replace(people, rig=kept_rig(kept, rig) or rig)
 
 
 def refine_trajectories(

@@ -20,9 +20,8 @@ from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
-from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
-from shapepose_fg.io.solved_setup import CAMERAS
+from shapepose_fg.io.solved_setup import CAMERAS, cameras_of
 from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
@@ -57,7 +56,7 @@ class Solver:
     @classmethod
     def read(cls, folder: Path, people: Reconstruction) -> "Solver":
         """The same of a result that was loaded from `folder`; InputError too where its cameras are others."""
-        rig, table = read_rig(folder / CAMERAS), people.observations
+        rig, table = cameras_of(folder), people.observations
         if table is not None and tuple(table.view_names.tolist()) != rig.names:
             problem = "the cameras are not those of observations.npz"
             raise InputError(f"{folder / CAMERAS}: {problem}; reconstruct the recording again")

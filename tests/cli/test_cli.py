@@ -493,6 +493,13 @@ def test_importing_and_help_load_no_torch():
     assert "reconstruct" in result.stdout
 
 
+def test_train_fitter_without_torch_names_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert run("train-fitter", "--body", tmp_path / "SMPL_NEUTRAL.pkl") == 2
+    said = capsys.readouterr().err
+    assert said == 'error: torch is not installed; pip install "shapepose-fg[train]"\n'
+
+
 def test_a_reader_that_stops_reading_is_no_error():
     """`shapepose-fg version | head -n 0`: no traceback, no sentence."""
     reader, writer = os.pipe()

@@ -208,7 +208,7 @@ def test_openpose_frames_may_be_missing_in_between_and_it_is_said(openpose_folde
     for frame in (0, 2):
         np.testing.assert_array_equal(table[frame].xy, whole[frame].xy)
     assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); no people are seen there" in table.notes
-    assert whole.notes == ()
+    assert not any("no file" in note for note in whole.notes)
 
 
 def test_openpose_numbers_that_are_no_frames_are_refused(openpose_folder, rig):

@@ -86,7 +86,7 @@ def carry_out(
         rig, own = asked.rig(), output / CAMERAS
         if (asked.cameras or asked.without) and own.exists() and own.samefile(known.calibration):
             raise InputError(f"{own}: results replace this file, all of whose cameras are needed; copy it first")
-        recording, times = read_recording(known.detections, rig, asked.skeleton, kept, asked.fps, asked.timestamps)
+        recording, times = read_recording(known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps)
         note(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
@@ -124,7 +124,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")
-        found, count = found_clocks(known.detections, rig, asked.skeleton, asked.fps, MOST_S)
+        found, count = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
         show_clocks(found, rig)
         if problems := found.undetermined(rig):
             raise InputError(f"--synchronise: {'; '.join(problems)}")

@@ -1,6 +1,5 @@
 """Calibrations in JSON (our own rig file, 4D Association, CMU Panoptic, VoxelPose) and AniPose's kind of TOML."""
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,18 +10,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from shapepose_fg.core.camera import Axis, Rig
+from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
-from shapepose_fg.core.storage.files import write_content
+from shapepose_fg.core.rig_file import RIG_FORMAT
 from shapepose_fg.core.trajectory import DRIFT, Trajectory
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, Node, Unit, WrittenCamera, WrittenRig, intrinsics
-from shapepose_fg.io.trajectories import read_trajectory, write_trajectory
+from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.io.validation import describe, validated
-
-RIG_FORMAT = "shapepose-fg rig 1"
-"""The tag by which a rig file of our own is known."""
 
 _MATRIX = "write the 3x3 intrinsic matrix row by row, in pixels"
 _CAMERA_FROM_WORLD = "write the 3x4 camera-from-world matrix row by row"
@@ -42,45 +38,6 @@ _CURES = {
     "lens": "write perspective or fisheye",
 }
 """What to do about a value, by its name in any of the formats."""
-
-
-def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write `rig` as a rig file of our own, which `read_rig` reads back to the last digit.
-
-    Trajectories go into the folder `trajectories` beside it, as CSV with covariances and as TUM's text.
-    """
-    stems = [Path(each.name).stem for each in rig.trajectories]
-    files = {
-        each.name: f"trajectories/{stem if stems.count(stem) == 1 else f'{n}-{stem}'}.csv"
-        for n, (each, stem) in enumerate(zip(rig.trajectories, stems, strict=True))
-    }
-    cameras = [
-        {
-            "name": camera.name,
-            "image_size": list(camera.image_size),
-            "K": camera.K.tolist(),
-            "lens": camera.lens,
-            "distortion": camera.distortion.tolist(),
-        }
-        | (
-            {"trajectory": files[camera.carrier], "bTc": camera.bTc.tolist()}
-            if camera.carrier
-            else {"wTc": camera.wTc.tolist()}
-        )
-        | ({"readout_s": camera.readout_s} if camera.readout_s > 0 else {})
-        for camera in rig.cameras
-    ]
-    content = {"format": RIG_FORMAT, "unit": "m", "up": rig.up, "cameras": cameras}
-    if rig.moves:
-        content["trajectories"] = {
-            files[each.name]: {"drift": each.drift, "refined": each.refined} for each in rig.trajectories
-        }
-        (Path(path).parent / "trajectories").mkdir(parents=True, exist_ok=True)
-        for each in rig.trajectories:
-            file = Path(path).parent / files[each.name]
-            write_trajectory(each, file)
-            write_trajectory(each, file.with_suffix(".tum"))
-    write_content(Path(path), json.dumps(content, indent=1, allow_nan=False))
 
 
 class _Camera(BaseModel):

@@ -12,10 +12,10 @@ import numpy as np
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.rig_file import write_rig
 from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
-from shapepose_fg.io.calibration.json_and_toml import write_rig
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
 from shapepose_fg.io.calibration.reading import FORMATS
 from shapepose_fg.io.calibration.rewriting import REWRITTEN
