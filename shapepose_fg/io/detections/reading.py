@@ -109,7 +109,7 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
             missing = rig.names[found.index(None)]
             raise InputError(
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}" are missing,'
-                f" {folder} holds {holds}; add them, or take the camera out of the calibration"
+                f" {folder} holds {holds}; add them, or choose cameras by --without {missing}"
             )
     # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
     offered = [each for each in entries if each.is_dir() or each.suffix == ".json"]
