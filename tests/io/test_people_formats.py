@@ -523,7 +523,7 @@ def test_a_few_joints_far_outside_the_picture_are_left_out_and_said(tmp_path, ri
     assert len(table[0]) == 249
     _, note = table.notes
     assert "frame 0 has a joint at pixel (5000, 5000), far outside the 1001 x 801" in note
-    assert "1 such joints of 125 were left out" in note
+    assert "1 joint of 125 (0.8%) left out" in note
 
 
 def test_ids_of_pictures_that_are_no_frames(tmp_path, rig):
