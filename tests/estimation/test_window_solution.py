@@ -83,17 +83,20 @@ def test_what_a_graph_cannot_be_made_of_is_refused(people, scene):
 
 
 def test_the_reported_error_lasts_from_frame_to_frame(people, scene):
-    """Two measurements of the same detector are no two: the error of neighbouring frames is nearly one."""
-    solution = solutions(people, scene)[0]
-    found = gtsam.Marginals(solution.graph, solution.values)
-    keys = gtsam.KeyVector(solution.keys[[4, 5, 11], WRIST].tolist())
-    joint = found.jointMarginalCovariance(keys)
-
-    def correlation(a: int, b: int) -> float:
-        blocks = [np.trace(joint.at(keys[i], keys[k])) for i, k in ((a, b), (a, a), (b, b))]
-        return blocks[0] / np.sqrt(blocks[1] * blocks[2])
-
-    assert correlation(0, 1) > 0.6 and correlation(0, 1) > correlation(0, 2) > 0.2
+    """Two measurements of the same detector are no two: the errors of neighbouring frames correlate, of frames
+    farther apart less (0.64 and 0.23, mean of all joints).
+    """
+    near, far = [], []
+    for solution in solutions(people, scene):
+        found = gtsam.Marginals(solution.graph, solution.values)
+        for keys in solution.keys[[4, 5, 11]].T.tolist():
+            joint = found.jointMarginalCovariance(gtsam.KeyVector(keys))
+            sizes = [np.trace(joint.at(key, key)) for key in keys]
+            for other, correlations in ((1, near), (2, far)):
+                both = np.trace(joint.at(keys[0], keys[other]))
+                correlations.append(both / np.sqrt(sizes[0] * sizes[other]))
+    assert (np.array(near) > far).mean() > 0.9
+    assert 0.5 < np.mean(near) < 0.8 and 0.1 < np.mean(far) < 0.4
 
 
 def test_a_users_isam2_takes_a_person_and_learns_of_a_wrist(people, scene):
