@@ -139,6 +139,6 @@ def test_fast_results_are_solved_anew(scene, results):
     np.testing.assert_array_equal(again.frame, fast.frame)
     np.testing.assert_array_equal(again.person, fast.person)
     assert (again.status == Status.OK).all()
-    assert np.nanmedian(np.linalg.norm(again.joints - fast.joints, axis=-1)) < 0.001
+    assert np.nanmedian(np.linalg.norm(again.joints - fast.joints, axis=-1)) < 0.003
     # A gate falls the other way where a joint is on its edge: 2 of 3,450 on one kind of processor, 0 on another.
     assert ((again.known == Known.MOTION) != (fast.known == Known.MOTION)).mean() < 0.002
