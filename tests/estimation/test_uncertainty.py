@@ -120,6 +120,7 @@ def test_any_ellipsoid_is_as_drawn():
     assert float(found.quantile(0.9)) == pytest.approx(np.quantile(drawn, 0.9), rel=0.02)
 
 
+@pytest.mark.slow
 def test_an_interval_holds_the_truth_at_any_distance():
     """300 measurements of each distance, from contact on: 1.3 in 100 more or less are chance, of all 0.6."""
     rng = np.random.default_rng(1)

@@ -311,6 +311,7 @@ def test_a_foot_that_stands_still_stays_still(walk, five_cameras, two_people):
     assert np.isfinite(found.covariance).all()
 
 
+@pytest.mark.slow
 def test_velocities_take_factors_too(walk, five_cameras, two_people):
     """Wrists that stand still by decree; in a frame alone there are no velocities, and the factors rest."""
     observations, _ = walk
@@ -331,6 +332,7 @@ def box(window, keys):
         yield gtsam.RangeFactor3(right, left, 0.4, gtsam.noiseModel.Isotropic.Sigma(1, 0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
 def test_joints_tied_to_each_other_get_the_body_without_any_of_their_targets(
     walk, five_cameras, two_people, temporal

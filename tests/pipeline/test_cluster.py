@@ -41,6 +41,7 @@ def installed():
     pytest.importorskip("distributed", reason="Dask is an extra")
 
 
+@pytest.mark.slow
 def test_results_come_in_order_whoever_does_them():
     with Cluster(None, 2, "") as cluster:
         assert list(cluster.map(late, range(6))) == list(range(6))

@@ -120,6 +120,7 @@ def test_fast_finds_the_same_people_as_surely(scene, results):
     assert inside[0.5] < 0.8
 
 
+@pytest.mark.slow
 def test_fast_is_the_same_with_processes(scene, results):
     again = reconstruct(
         simulate(scene),
