@@ -39,8 +39,8 @@ STANDING = np.array(
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _torch_is_loaded_once_for_all_processes() -> None:
-    """Worker processes of any test are forked off one that has torch; the first test's would leave it out."""
+def _modules_are_loaded_once_for_all_processes() -> None:
+    """Fork the worker processes of all tests off one that has imported the pipeline."""
     get_ready("shapepose_fg.pipeline.pipeline")
 
 
@@ -51,6 +51,15 @@ def shared_data() -> Path:
     if not (root / "data").is_dir():
         pytest.skip(f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test")
     return root / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_cases(shared_data) -> Path:
+    """The folder of files that other programs wrote, and of what people reported; skips where there is none."""
+    cases = shared_data.parent / "cases"
+    if not cases.is_dir():
+        pytest.skip(f"no cases at {cases}")
+    return cases
 
 
 @dataclass(frozen=True)

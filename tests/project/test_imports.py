@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[2]
 LEVELS = (
     "factors core.arrays core.compiled core.errors",
     "core.skeleton core.pieces core.assignment core.lens core.trajectory",
+    "core.joint_names",
     "core.camera",
     "core.drawing",
     "core.storage.files core.bounds",
