@@ -46,6 +46,15 @@ def shared_data() -> Path:
     return root / "data"
 
 
+@pytest.fixture(scope="session")
+def shared_cases(shared_data) -> Path:
+    """The folder of files that other programs wrote, and of what people reported; skips where there is none."""
+    cases = shared_data.parent / "cases"
+    if not cases.is_dir():
+        pytest.skip(f"no cases at {cases}")
+    return cases
+
+
 @dataclass(frozen=True)
 class Dance:
     """Four people in close motion before six cameras, 1.6 s, and their reconstruction by default."""
