@@ -146,8 +146,8 @@ def _children(build: Build | None) -> list[str]:
         return []
     lengths = f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they should be"
     return [
-        f"people come out {build.stature:.2f} m tall, as children are; if they are adults, {lengths}: check the size"
-        " of the board's squares"
+        f"people come out {build.stature:.2f} m tall, as children are; if they are adults, {lengths}: check the"
+        " size of the board's squares"
     ]
 
 
