@@ -19,7 +19,6 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.pipeline.pipeline import reconstruct
-from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
@@ -56,12 +55,6 @@ STANDING = np.array(
         [0.19, -0.12, 0.02], [0.12, 0.08, 0.03], [-0.14, -0.15, 0.02], [-0.19, -0.12, 0.02], [-0.12, 0.08, 0.03],
     ]
 )  # fmt: skip
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _modules_are_loaded_once_for_all_processes() -> None:
-    """Fork the worker processes of all tests off one that has imported the pipeline."""
-    get_ready("shapepose_fg.pipeline.pipeline")
 
 
 @pytest.fixture(scope="session")

@@ -44,7 +44,6 @@ from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
-from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
@@ -91,8 +90,6 @@ def carry_out(
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
-        if execution.workers != 1 and execution.cluster is None:
-            get_ready("shapepose_fg.pipeline.pipeline")
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
