@@ -61,8 +61,9 @@ def test_disturbed_cameras_come_back(rig, recording, people):
 def test_a_sound_rig_stays_within_its_sigma(rig, recording):
     found = refine(recording, rig, TIMES, range(250))
     turn, move = off_by(found.rig, rig)
-    assert (turn < 2 * np.degrees(found.adjusted.sigma(TURN))).all()
-    assert (move < 2 * found.adjusted.sigma(MOVE)).all() and abs(found.after_px / found.before_px - 1) < 0.05
+    for off, sigma in ((turn, np.degrees(found.adjusted.sigma(TURN))), (move, found.adjusted.sigma(MOVE))):
+        assert (off < 3 * sigma).all() and np.median(off / sigma) < 2
+    assert abs(found.after_px / found.before_px - 1) < 0.1
 
 
 def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
