@@ -2,17 +2,63 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 SPEED_S = 0.1
-"""Speeds are taken over this time before and after a step, so that noise does not pass for speed."""
+"""Time before and after a frame or a step over which motion is averaged, s."""
+_HOP_S = 0.045
+"""Shortest time over which a displacement counts as motion, s: over less, noise is larger."""
+_KNOWN_M = 0.1
+"""Points that are less certain along an axis say nothing of motion, m."""
 
 
-def speeds(points: Array, times_s: Array) -> Array:
-    """(T - 1, J) how fast points (T, J, 3) are in each step, m/s, over `SPEED_S` on either side."""
-    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S, side="left")
-    last = np.searchsorted(times_s, times_s[1:] + SPEED_S, side="right") - 1
-    return np.linalg.norm(points[last] - points[first], axis=2) / (times_s[last] - times_s[first])[:, None]
+def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
+    """(T - 1, J) speed, m/s, and (T - 1, J) power spectral density of the acceleration along an axis, m²/s³, of
+    points (T, J, 3), metres, around each step.
+
+    The speed is the length of the path per second: a limb that swings to and fro is fast. The density is that of
+    second differences, without what noise of `variance` (T, J) along an axis, m², adds to them. Both are medians
+    over time, which a few wrong points do not change, from points known to `_KNOWN_M`; 0 where there are too few.
+    """
+    T, J = variance.shape
+    known = np.asarray(np.isfinite(points).all(axis=2) & (variance < _KNOWN_M**2))
+    at, joint = np.arange(T)[:, None], np.arange(J)
+    # The nearest known points that are at least a hop away; row T is none.
+    later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1]
+    earlier = np.maximum.accumulate(np.where(known, at, -1))
+    after = np.append(later, np.full((1, J), T), axis=0)[
+        np.maximum(np.searchsorted(times_s, times_s + _HOP_S), at[:, 0] + 1)
+    ]
+    before = np.append(earlier, np.full((1, J), -1), axis=0)[
+        np.minimum(np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1, at[:, 0] - 1)
+    ]
+    velocity, lasts, noise = [], [], 0.0
+    for there in (after, before):
+        fine, end = known & (there >= 0) & (there < T), np.clip(there, 0, T - 1)
+        h = np.where(fine, times_s[end] - times_s[:, None], np.nan)
+        h[np.abs(h) > 2 * SPEED_S + 1e-6] = np.nan
+        velocity.append((points[end, joint] - points) / h[..., None])
+        lasts.append(np.abs(h))
+        noise = noise + variance[end, joint] / h**2
+    noise = noise + variance * (1 / lasts[0] + 1 / lasts[1]) ** 2
+    turned = np.square(velocity[0] - velocity[1]).sum(axis=2) / 3 - noise
+    turning = 3 * turned / (lasts[0] + lasts[1])
+    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S - 1e-6)
+    until = np.searchsorted(times_s, times_s[1:] + SPEED_S + 1e-6)
+    return _median(np.linalg.norm(np.array(velocity), axis=3), first, until), _median(turning[None], first, until)
+
+
+def _median(values: Array, first: Index, until: Index) -> Array:
+    """(S, J) medians of `values` (K, T, J), K alike, each from frames `first` (S,) `until` (S,); NaN does not
+    count, and without any value it is 0.
+    """
+    near = first[:, None] + np.arange(int((until - first).max(initial=0)))
+    each = values[:, np.minimum(near, values.shape[1] - 1)]
+    each = np.where((near < until[:, None])[..., None], each, np.nan)
+    each = np.sort(np.moveaxis(each, 0, 1).reshape(len(first), -1, values.shape[2]), axis=1)
+    count = (~np.isnan(each)).sum(axis=1, keepdims=True)
+    middle = np.take_along_axis(each, np.minimum(count // 2, np.maximum(count - 1, 0)), axis=1)[:, 0]
+    return np.where(count[:, 0] > 0, np.maximum(middle, 0.0), 0.0)
 
 
 def velocities(points: Array, times_s: Array) -> Array:
