@@ -5,11 +5,13 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SPEED_S = 0.1
-"""Time before and after a frame or a step over which motion is averaged, s."""
+"""Time before and after a frame over which a velocity is taken, s."""
+_AROUND_S = 0.3
+"""Time before and after a step over which motion is averaged, s: what is wrong for a quarter of it does not count."""
 _HOP_S = 0.045
 """Shortest time over which a displacement counts as motion, s: over less, noise is larger."""
 _KNOWN_M = 0.1
-"""Points that are less certain along an axis say nothing of motion, m."""
+"""Standard deviation along an axis above which a point says nothing of motion, m."""
 
 
 def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
@@ -18,47 +20,45 @@ def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Ar
 
     The speed is the length of the path per second: a limb that swings to and fro is fast. The density is that of
     second differences, without what noise of `variance` (T, J) along an axis, m², adds to them. Both are medians
-    over time, which a few wrong points do not change, from points known to `_KNOWN_M`; 0 where there are too few.
+    over time, which a few wrong points do not change, from points known to `_KNOWN_M`; 0 where there are none.
     """
-    T, J = variance.shape
+    at, joint = np.arange(len(times_s))[:, None], np.arange(points.shape[1])
     known = np.asarray(np.isfinite(points).all(axis=2) & (variance < _KNOWN_M**2))
-    at, joint = np.arange(T)[:, None], np.arange(J)
-    # The nearest known points that are at least a hop away; row T is none.
-    later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1]
-    earlier = np.maximum.accumulate(np.where(known, at, -1))
-    after = np.append(later, np.full((1, J), T), axis=0)[
-        np.maximum(np.searchsorted(times_s, times_s + _HOP_S), at[:, 0] + 1)
-    ]
-    before = np.append(earlier, np.full((1, J), -1), axis=0)[
-        np.minimum(np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1, at[:, 0] - 1)
-    ]
-    velocity, lasts, noise = [], [], 0.0
-    for there in (after, before):
-        fine, end = known & (there >= 0) & (there < T), np.clip(there, 0, T - 1)
-        h = np.where(fine, times_s[end] - times_s[:, None], np.nan)
-        h[np.abs(h) > 2 * SPEED_S + 1e-6] = np.nan
-        velocity.append((points[end, joint] - points) / h[..., None])
-        lasts.append(np.abs(h))
-        noise = noise + variance[end, joint] / h**2
-    noise = noise + variance * (1 / lasts[0] + 1 / lasts[1]) ** 2
-    turned = np.square(velocity[0] - velocity[1]).sum(axis=2) / 3 - noise
-    turning = 3 * turned / (lasts[0] + lasts[1])
-    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S - 1e-6)
-    until = np.searchsorted(times_s, times_s[1:] + SPEED_S + 1e-6)
-    return _median(np.linalg.norm(np.array(velocity), axis=3), first, until), _median(turning[None], first, until)
+    velocity, hops, noise = [], [], [variance]
+    for end in _hop_ends(known, times_s):
+        hop = np.where(known & (end != at), times_s[end] - times_s[:, None], np.nan)
+        hops.append(np.where(np.abs(hop) < 2 * SPEED_S, hop, np.nan))
+        velocity.append((points[end, joint] - points) / hops[-1][..., None])
+        noise.append(variance[end, joint] / hops[-1] ** 2)
+    noise[0] = variance * (1 / hops[1] - 1 / hops[0]) ** 2
+    turned = np.square(velocity[1] - velocity[0]).sum(axis=2) - 3 * np.sum(noise, axis=0)
+    first = np.searchsorted(times_s, times_s[:-1] - _AROUND_S - 1e-6)
+    until = np.searchsorted(times_s, times_s[1:] + _AROUND_S + 1e-6)
+    speed = np.linalg.norm(velocity, axis=3)
+    return _median(speed, first, until), _median(turned[None] / (hops[1] - hops[0]), first, until)
+
+
+def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
+    """(T, J) the nearest frame at least `_HOP_S` before each in which a joint is `known` (T, J), and after it; the
+    frame itself where there is none.
+    """
+    T, at = len(times_s), np.arange(len(times_s))[:, None]
+    before = np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1
+    after = np.searchsorted(times_s, times_s + _HOP_S)
+    earlier = np.maximum.accumulate(np.where(known, at, -1))[np.minimum(before, at[:, 0] - 1)]
+    later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][np.clip(after, at[:, 0] + 1, T) % T]
+    return np.where((0 <= earlier) & (earlier < at), earlier, at), np.where((at < later) & (later < T), later, at)
 
 
 def _median(values: Array, first: Index, until: Index) -> Array:
-    """(S, J) medians of `values` (K, T, J), K alike, each from frames `first` (S,) `until` (S,); NaN does not
-    count, and without any value it is 0.
+    """(S, J) medians of `values` (K, T, J), K alike, from frames `first` (S,) `until` (S,), at least 0; NaN does
+    not count, and without any value it is 0.
     """
     near = first[:, None] + np.arange(int((until - first).max(initial=0)))
-    each = values[:, np.minimum(near, values.shape[1] - 1)]
-    each = np.where((near < until[:, None])[..., None], each, np.nan)
+    each = np.where((near < until[:, None])[..., None], values[:, np.minimum(near, values.shape[1] - 1)], np.nan)
     each = np.sort(np.moveaxis(each, 0, 1).reshape(len(first), -1, values.shape[2]), axis=1)
-    count = (~np.isnan(each)).sum(axis=1, keepdims=True)
-    middle = np.take_along_axis(each, np.minimum(count // 2, np.maximum(count - 1, 0)), axis=1)[:, 0]
-    return np.where(count[:, 0] > 0, np.maximum(middle, 0.0), 0.0)
+    middle = np.isfinite(each).sum(axis=1, keepdims=True) // 2
+    return np.nan_to_num(np.maximum(np.take_along_axis(each, middle, axis=1)[:, 0], 0.0))
 
 
 def velocities(points: Array, times_s: Array) -> Array:

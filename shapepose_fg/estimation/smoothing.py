@@ -33,14 +33,11 @@ def smoothed(
     place, variance = np.full((len(people), J, T, 3), np.nan), np.full((len(people), J, T), np.nan)
     place[who, :, at] = joints
     variance[who, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
+    by_time = np.moveaxis(place, 2, 0).reshape(T, C, 3), np.moveaxis(variance, 2, 0).reshape(T, C)
+    speed, turning = (each.reshape(T - 1, len(people), J) for each in motion_of(*by_time, times))
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
     information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(C, T)
-    unknown = np.where(known[..., None], place, np.nan)
-    speed, turning = (
-        each.reshape(T - 1, len(people), J)
-        for each in motion_of(np.moveaxis(unknown, 2, 0).reshape(T, C, 3), np.moveaxis(variance, 2, 0).reshape(T, C), times)
-    )
     density = motion.density_of(np.maximum(speed, SPEED_M_S), turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     unseen = np.zeros((1, 0, 3, 4)), np.zeros((T, 1, 0, 2)), np.zeros((T, 1, 0)), np.zeros((T, 1, 0)), 0, 1.0
