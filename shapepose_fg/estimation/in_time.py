@@ -27,7 +27,7 @@ def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Ar
     velocity, hops, noise = [], [], [variance]
     for end in _hop_ends(known, times_s):
         hop = np.where(known & (end != at), times_s[end] - times_s[:, None], np.nan)
-        hops.append(np.where(np.abs(hop) < 2 * SPEED_S, hop, np.nan))
+        hops.append(np.where((np.abs(hop) < _AROUND_S) | (np.abs(end - at) == 1), hop, np.nan))
         velocity.append((points[end, joint] - points) / hops[-1][..., None])
         noise.append(variance[end, joint] / hops[-1] ** 2)
     noise[0] = variance * (1 / hops[1] - 1 / hops[0]) ** 2
@@ -54,9 +54,9 @@ def _median(values: Array, first: Index, until: Index) -> Array:
     """(S, J) medians of `values` (K, T, J), K alike, from frames `first` (S,) `until` (S,), at least 0; NaN does
     not count, and without any value it is 0.
     """
-    near = first[:, None] + np.arange(int((until - first).max(initial=0)))
+    near = first[:, None] + np.arange(int((until - first).max(initial=1)))
     each = np.where((near < until[:, None])[..., None], values[:, np.minimum(near, values.shape[1] - 1)], np.nan)
-    each = np.sort(np.moveaxis(each, 0, 1).reshape(len(first), -1, values.shape[2]), axis=1)
+    each = np.sort(np.concatenate(list(each), axis=1), axis=1)
     middle = np.isfinite(each).sum(axis=1, keepdims=True) // 2
     return np.nan_to_num(np.maximum(np.take_along_axis(each, middle, axis=1)[:, 0], 0.0))
 

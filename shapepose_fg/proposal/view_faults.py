@@ -7,11 +7,11 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.people_2d import group_people
 
-_LEAST_JOINTS = 4
+_LEAST_JOINTS = 3
 """Number of common joints from which on two 2D people are compared."""
-_SAME = 0.05
+_SAME = 0.03
 """Median distance of the common joints of two detections of one person, as a share of the person's size in the
-picture: two boxes around one person differ by a few hundredths, two people in line with the camera by more."""
+picture: two boxes around one person differ by one or two hundredths, two people in line with the camera by more."""
 _BORDER_PX = 1.0
 """Distance from the edge of the picture up to which a joint is on the edge, px."""
 _LINE_PX = 0.01
@@ -52,7 +52,7 @@ def _at_the_end(along: Array) -> Mask:
     end = along > along.max() - _LINE_PX
     if end.sum() > 1:
         rest = np.round(along[~end] / _LINE_PX)
-        end &= len(np.unique(rest)) >= max(_LEAST_JOINTS, _DISTINCT * len(rest))
+        end &= len(np.unique(rest)) >= max(1, _DISTINCT * len(rest))
     return end & (end.sum() > 1)
 
 

@@ -30,7 +30,8 @@ def test_what_is_right_stays(seen, five_cameras):
 def test_who_is_found_twice_in_some_views_is_found_once(seen, five_cameras, away_px):
     """A second box around a person: joints a few pixels off, a little less certain, some of them missing."""
     rng = np.random.default_rng(0)
-    twice = seen.only((seen.view < 3) & (rng.random(len(seen)) < 0.8))
+    ends = np.isin(seen.joint, [4, 7, *range(15, 25)])
+    twice = seen.only((seen.view < 3) & ((rng.random(len(seen)) < 0.6) | ~ends))
     turn = rng.uniform(0, 2 * np.pi, len(twice))
     away = away_px * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     every = joined(seen, replace(twice, xy=twice.xy + away, confidence=0.95 * twice.confidence))
@@ -41,9 +42,10 @@ def test_who_is_found_twice_in_some_views_is_found_once(seen, five_cameras, away
 
 
 def test_people_behind_each_other_are_two(five_cameras, two_people, seen_exactly):
-    """One steps up to the other's back: in line with a camera, and 30 cm away."""
+    """One stands behind the other in the same pose, in line with a camera, 40 cm farther away."""
     away = five_cameras.centres[0] - two_people[0, 8]
-    close = np.stack([two_people[0], two_people[0] - 0.3 * away / np.linalg.norm(away)])
+    away[2] = 0.0
+    close = np.stack([two_people[0], two_people[0] - 0.4 * away / np.linalg.norm(away)])
     assert not doubled(seen_exactly(five_cameras, close), five_cameras).any()
 
 
