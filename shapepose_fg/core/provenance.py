@@ -14,7 +14,6 @@ _PACKAGES = {
     "numpy": ("numpy",),
     "scipy": ("scipy",),
     "gtsam": ("gtsam",),
-    "torch": ("torch",),
     "numba": ("numba",),
     "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python"),
 }

@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import read_bytes
+from shapepose_fg.detection2d.onnx_file import read_onnx
 
 Backend = Literal["opencv", "onnxruntime"]
 """What runs the network."""
@@ -22,13 +21,8 @@ Blob = NDArray[np.float32]
 """What it takes and gives."""
 PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
 """onnxruntime's names of devices."""
-MOST_BYTES = 2**29
-"""Networks of people's joints have 2 to 400 MB."""
 _BATCH = 32
 """Pictures at once: a crowd fills no memory."""
-_ELSEWHERE = re.compile(rb"(?:\x0a|\x8a\x80*\0)(?:\x08|\x88\x80*\0)location")
-"""How protobuf writes the key under which a tensor says which file its numbers are in: field 1, 8 bytes; both
-numbers may be spelt with zeros behind."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +52,7 @@ class OnnxNetwork:
         weights lie in other files: their paths are looked up wherever this program runs, and may lead anywhere.
         """
         file = Path(file)
-        content = read_bytes(file, MOST_BYTES)
-        if b"location" in content and _ELSEWHERE.search(content):
-            raise InputError(
-                f"{file}: its weights lie in another file; give a network that holds them itself, as"
-                " onnx.save_model(onnx.load(FILE), NEW) writes it"
-            )
+        content = read_onnx(file)
         run_by = _with_opencv if backend == "opencv" else _with_onnxruntime
         return cls(file, hashlib.sha256(content).hexdigest(), *run_by(file, content, device))
 
@@ -113,9 +102,12 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
     options: Any = onnxruntime.SessionOptions()
     options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
     options.log_severity_level = 4
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # what `read_onnx` has looked through
     try:
         providers = [(provider, {"device_id": number} if number else {})]
-        session: Any = onnxruntime.InferenceSession(content, options, providers=providers)
+        session: Any = onnxruntime.InferenceSession(
+            content, options, providers=providers, read_config_from_model=0
+        )
     except Exception as error:
         raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({_first_line(error)})") from None
     if provider not in session.get_providers():  # it goes on with the CPU in silence

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d import onnx_network
+from shapepose_fg.detection2d import onnx_file as reading
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from tests.detection2d.conftest import blob, onnx_file, varint
 
@@ -83,7 +83,7 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     file = onnx_file(tmp_path / "n.onnx", means(78))
-    monkeypatch.setattr(onnx_network, "MOST_BYTES", file.stat().st_size)
+    monkeypatch.setattr(reading, "MOST_BYTES", file.stat().st_size)
     assert HeatMapNetwork.load(file).layout.channels == 78
     with file.open("ab") as stream:
         stream.truncate(2**40)  # a hole: takes no room on the disk

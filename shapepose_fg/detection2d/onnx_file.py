@@ -1,0 +1,108 @@
+"""Read an ONNX file that holds all of its weights itself.
+
+What runs a network looks up the files that a tensor names wherever this program runs. Every tensor of the file is
+therefore visited, by the wire format of protobuf and the messages of onnx.proto, before the bytes go to a library.
+"""
+
+from pathlib import Path
+
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_bytes
+
+MOST_BYTES = 2**29
+"""Largest file, bytes; networks of people's joints have 2 to 400 MB."""
+_MOST_DEPTH = 100
+"""Messages in messages; protobuf's own bound."""
+_MOST_FIELDS = 2**20
+"""Fields of the messages visited; networks have ten thousand to a hundred thousand."""
+_LONGEST = 2**31
+"""Bytes of a field, exclusive; protobuf's own bound."""
+_FIXED_BYTES = {1: 8, 5: 4}
+"""Lengths of the wire types that have a fixed one."""
+
+_MESSAGES: dict[str, dict[int, str]] = {
+    "model": {7: "graph", 20: "training", 25: "function"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse tensor", 23: "sparse tensor"},
+    "sparse tensor": {1: "tensor", 2: "tensor"},
+    "training": {1: "graph", 2: "graph"},
+    "function": {7: "node", 11: "attribute"},
+    "tensor": {},
+}
+"""The messages of onnx.proto that lead to tensors: which fields hold which messages."""
+_EXTERNAL_DATA, _DATA_LOCATION = 13, 14
+"""Fields of a tensor: where its numbers are in another file, and whether they are."""
+
+
+class _Broken(Exception):
+    """These bytes are no message that a writer of protobuf makes."""
+
+
+def read_onnx(file: Path) -> bytes:
+    """Content of the ONNX file at `file`, at most `MOST_BYTES`, in which no tensor names another file.
+
+    InputError where the file cannot be read, is no ONNX network, or keeps weights in other files. Spellings on
+    which two parsers may disagree (tags of more bytes than needed, groups) are not an ONNX network: no program
+    writes them.
+    """
+    content = read_bytes(file, MOST_BYTES)
+    try:
+        whole = _is_whole(memoryview(content))
+    except _Broken as error:
+        raise InputError(f"{file}: not an ONNX network ({error}); give the ONNX file of a network") from None
+    if not whole:
+        raise InputError(
+            f"{file}: its weights lie in another file; give a network that holds them itself, as"
+            " onnx.save_model(onnx.load(FILE), NEW) writes it"
+        )
+    return content
+
+
+def _is_whole(content: memoryview) -> bool:
+    """Whether no tensor of a ModelProto says that its numbers are elsewhere."""
+    waiting, fields = [("model", 0, len(content), 0)], 0
+    while len(waiting) > 0:
+        message, at, end, depth = waiting.pop()
+        if depth > _MOST_DEPTH:
+            raise _Broken(f"its graphs are over {_MOST_DEPTH} messages deep")
+        inner = _MESSAGES[message]
+        while at < end:
+            fields += 1
+            if fields > _MOST_FIELDS:
+                raise _Broken(f"it has over {_MOST_FIELDS} fields")
+            start, (tag, at) = at, _varint(content, at, end)
+            field, kind = tag >> 3, tag & 7
+            if field == 0 or tag >= 2**32 or at - start > max(1, -(-tag.bit_length() // 7)):
+                raise _Broken(f"byte {start} begins no field")
+            value = 1
+            if kind == 0:
+                value, at = _varint(content, at, end)
+            elif kind == 2:
+                length, at = _varint(content, at, end)
+                if length >= _LONGEST:
+                    raise _Broken(f"the field at byte {start} ends behind its message")
+                if field in inner:
+                    waiting.append((inner[field], at, at + length, depth + 1))
+                at += length
+            elif kind in _FIXED_BYTES:
+                at += _FIXED_BYTES[kind]
+            else:
+                raise _Broken(f"byte {start} begins a group")
+            if at > end:
+                raise _Broken(f"the field at byte {start} ends behind its message")
+            if message == "tensor" and (field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value != 0)):
+                return False
+    return True
+
+
+def _varint(content: memoryview, at: int, end: int) -> tuple[int, int]:
+    """A whole number at byte `at`, and where the next thing begins."""
+    value = shift = 0
+    while at < end and shift < 70:
+        byte = content[at]
+        value |= (byte & 127) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 128:
+            return value, at
+    raise _Broken(f"there is no whole number at byte {at}")
