@@ -7,7 +7,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 SPEED_S = 0.1
 """Time before and after a frame over which a velocity is taken, s."""
 _AROUND_S = 0.3
-"""Time before and after a step over which motion is averaged, s: what is wrong for a quarter of it does not count."""
+"""Time before and after a step over which motion is averaged, s: what is wrong for a quarter of it does not
+count."""
 _HOP_S = 0.045
 """Shortest time over which a displacement counts as motion, s: over less, noise is larger."""
 _KNOWN_M = 0.1
@@ -47,7 +48,7 @@ def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
     after = np.searchsorted(times_s, times_s + _HOP_S)
     earlier = np.maximum.accumulate(np.where(known, at, -1))[np.minimum(before, at[:, 0] - 1)]
     later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][np.clip(after, at[:, 0] + 1, T) % T]
-    return np.where((0 <= earlier) & (earlier < at), earlier, at), np.where((at < later) & (later < T), later, at)
+    return np.where((earlier >= 0) & (earlier < at), earlier, at), np.where((at < later) & (later < T), later, at)
 
 
 def _median(values: Array, first: Index, until: Index) -> Array:

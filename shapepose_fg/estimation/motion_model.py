@@ -86,8 +86,8 @@ class MotionModel:
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
     def density_of(self, speed_m_s: Array, turning: Array) -> Array:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations have
-        a power spectral density of at least `turning` (..., J), m²/s³.
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
+        have a power spectral density of at least `turning` (..., J), m²/s³.
         """
         return self.law.density(np.maximum(self.acceleration(speed_m_s), turning))
 

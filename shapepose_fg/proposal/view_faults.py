@@ -11,7 +11,7 @@ _LEAST_JOINTS = 3
 """Number of common joints from which on two 2D people are compared."""
 _SAME = 0.03
 """Median distance of the common joints of two detections of one person, as a share of the person's size in the
-picture: two boxes around one person differ by one or two hundredths, two people in line with the camera by more."""
+picture: two boxes around one person differ by one or two hundredths, people in line with the camera by more."""
 _BORDER_PX = 1.0
 """Distance from the edge of the picture up to which a joint is on the edge, px."""
 _LINE_PX = 0.01

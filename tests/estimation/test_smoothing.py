@@ -71,7 +71,7 @@ def test_a_limb_that_swings_is_followed(fps):
     true[:, WRIST, 0] = 0.5 * np.sin(2 * np.pi * 3 * times)
     drafts = true + np.random.default_rng(2).normal(0, 0.01, true.shape)
     covariance = np.broadcast_to(0.01**2 * np.eye(3), (2 * fps, J, 3, 3))
-    mean, found = smoothing.smoothed(drafts, covariance, np.zeros(2 * fps, dtype=int), times, MOTION)
+    mean, _ = smoothing.smoothed(drafts, covariance, np.zeros(2 * fps, dtype=int), times, MOTION)
     error = np.linalg.norm(mean - true, axis=-1)[5:-5]
     assert error[:, WRIST].mean() < 0.03
     assert np.delete(error, WRIST, axis=1).mean() < 0.01, "joints that stand are smoothed as before"

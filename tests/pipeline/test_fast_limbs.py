@@ -56,9 +56,7 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
     people = swinging(times, frequency_hz)
     recording = seen(rig, people, np.random.default_rng(0))
     clock = FrameTimes.from_fps(fps, len(people))
-    over_time, alone = (
-        reconstruct(recording, rig, config, times=clock) for config in (PipelineConfig(), ALONE)
-    )
+    over_time, alone = (reconstruct(recording, rig, config, times=clock) for config in (PipelineConfig(), ALONE))
     error, without = errors(over_time, people), errors(alone, people)
     limbs = [*ARM, *LEG]
     assert error[:, limbs].mean() < 1.15 * without[:, limbs].mean()
