@@ -19,6 +19,8 @@ _M_A_RAD, _M_A_S = 0.5, 0.05
 _RAD_A_M = 0.5
 """An odometry errs by so many radians where it errs by a metre: after 10 m of a straight way both count alike."""
 _ROTATION_TOLERANCE = 1e-3
+_MOST_METRES = 1e6
+"""Largest coordinate of a place, m, as in `core.camera`: farther away doubles are too coarse for joints."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Trajectory:
             )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
+        if (most := float(np.abs(wTb[:, :3, 3]).max())) > _MOST_METRES:
+            raise refuse(f"poses must be at most {_MOST_METRES:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
             raise refuse(f"times must rise, at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1} they do not")
         R = wTb[:, :3, :3]
