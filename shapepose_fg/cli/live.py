@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from shapepose_fg.cli.options import INPUT, RESULT, RUN, TIME, CameraOptions, check_workers, grouped, option
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import naming
+from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
     from shapepose_fg.live.online import OnlineReconstructor, Said
@@ -61,10 +61,15 @@ def live(
                 of_cameras(f"all cameras jumped to {view[2]:.2f} s")
             said = _say(people, said, of_cameras)
 
-        feed(detections, rig, joints, of_lines, push)
+        try:
+            feed(detections, rig, joints, of_lines, push)
+        except InputError:
+            publish("settled", people.finish())
+            raise
         publish("settled", people.finish())
         report = people.report()
-    note(f"{report.frames} frames, {report.late} of them late; {report.dropped} came too late or twice")
+    out = f"{report.dropped} came too late, twice or at another time"
+    note(f"{report.frames} frames, {report.late} of them late; {out}")
 
 
 def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]) -> "Said | None":

@@ -1,7 +1,8 @@
 """Where detections come from while they come: lines of JSON from a file, a pipe or clients of a socket; MCAP.
 
-One line does not end the service. A line that cannot be used is left out with a note. Who begins with such a line,
-or sends ten in a row, is given up: a client is cut off and the others go on, a file is an `InputError`.
+One line does not end the service. A line that cannot be used is left out with a note. Who begins with a line that
+cannot be read, or sends ten in a row, is given up: a client is cut off and the others go on, a file is an
+`InputError`.
 """
 
 import selectors
@@ -50,6 +51,7 @@ def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push
         sender = _Sender(where, given)
         for view in read_views(Path(where), rig, skeleton, note):
             sender.take(lambda place, view=view: view)
+        sender.end()
     elif where in (None, "-"):
         if sys.stdin is None:
             raise InputError("standard input is closed; name a file or a socket with --detections")
@@ -78,9 +80,11 @@ class _Sender:
     given: _Given
     good: int = 0
     """Lines that were taken."""
+    refused: InputError | None = None
+    """Why the first of those lines was not taken that say what lines should say."""
     _number: int = 0
     _bad: int = 0
-    """Lines in a row that could not be used."""
+    """Lines in a row that could not be read."""
 
     def line(self, line: bytes | None) -> None:
         """Take the next line, None for one that is too long. InputError where the sender is to be given up."""
@@ -97,15 +101,26 @@ class _Sender:
         place = f"{self.name}, line {self._number}"
         try:
             view = read(place)
-            with naming(place):
-                self.given.push(*view)
         except InputError as error:
             self._bad += 1
             if self.good == 0 or self._bad >= _MOST_BAD:
                 raise
             self.given.note(f"{error}; the line is left out")
+            return
+        self._bad = 0
+        try:
+            with naming(place):
+                self.given.push(*view)
+        except InputError as error:  # which may be another client's doing
+            self.refused = self.refused or error
+            self.given.note(f"{error}; the line is left out")
         else:
-            self.good, self._bad = self.good + 1, 0
+            self.good += 1
+
+    def end(self) -> None:
+        """InputError where lines came and none was taken."""
+        if self.good == 0 and self.refused is not None:
+            raise self.refused
 
     def _read(self, line: bytes | None, place: str) -> tuple[Any, ...]:
         if line is None:
@@ -150,6 +165,7 @@ def _from_file(stream: IO[bytes], sender: _Sender) -> None:
         piece = stream.read1(_PIECE) if hasattr(stream, "read1") else stream.read(_PIECE)  # pyright: ignore
         for line in lines.split(piece):
             sender.line(line)
+    sender.end()
 
 
 @dataclass(eq=False)

@@ -40,8 +40,8 @@ _ROUNDS = 1
 rounds take a seventh to a fifth more for the same figures (Shelf, crossing)."""
 _KEPT_S = 10.0
 """What is settled and nobody takes is kept for so long."""
-_MOST_KEPT = 1000
-"""Windows of rows that are kept at the most, whatever their times."""
+_SETTLES = 2 / 3
+"""What a window settles at least, of the lag, where there are several frames in a lag."""
 _BEFORE = 7.0
 """A window has the lag over this before what it settles: a frame or two. With a third of the lag it takes an
 eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
@@ -51,7 +51,7 @@ _MOST_SAID = 1000
 _OFF_CLOCK = 10
 """Views in a row whose time is elsewhere, after which a camera is named, and the frames of `push` are believed."""
 _STANDS = 30
-"""Views in a row without a pose, after which a camera that came with poses is where the rig has it again."""
+"""So many more views without a pose than with one say that a camera is where the rig has it after all."""
 _MOST_S = 1e12
 """Largest time, seconds: behind it, doubles are too coarse for pictures."""
 _BACK_S = 1.0
@@ -195,9 +195,9 @@ class OnlineReconstructor:
         with self._lock:
             slots = self._state.slots
             self._check_places(detections, times)
-            behind = len(slots) > 0 and float(times.mean()) < slots[-1].time_s - JUMP_S
-            self._behind = self._behind + 1 if behind else 0
-            if self._behind >= _OFF_CLOCK:
+            ahead_s = float(times.mean()) - slots[-1].time_s if len(slots) > 0 else 0.0
+            self._behind = self._behind + 1 if ahead_s < -JUMP_S else 0
+            if self._behind >= _OFF_CLOCK or ahead_s > self._config.stitching.longest_gap_s:
                 self._begin_anew()
                 self._behind, self._state.jumps = 0, self._state.jumps + 1
             self._take(detections, times)
@@ -255,7 +255,7 @@ class OnlineReconstructor:
         state, name = self._state, self.rig.names[view]
         moves, alone = bool(state.rig.cameras[view].carrier), not self.rig.cameras[view].carrier
         if pose is None:
-            state.without_pose[view] += 1
+            state.without_pose[view] = min(state.without_pose[view] + 1, _STANDS)
             if moves and alone and state.without_pose[view] >= _STANDS:
                 stands = replace(state.rig.cameras[view], carrier="", bTc=np.eye(4))
                 others = tuple(each for each in state.rig.trajectories if each.name != name)
@@ -275,7 +275,7 @@ class OnlineReconstructor:
         """A view whose time fits, into its frame."""
         if pose is not None:
             self._state.rig = self._placed(view, time_s, pose, covariance)
-            self._state.without_pose[view] = 0
+            self._state.without_pose[view] = max(self._state.without_pose[view] - 1, 0)
         if self._state.views.is_late(view, time_s):
             self._state.views.heard(view, time_s)
             self._join(view, own, time_s)
@@ -510,11 +510,8 @@ class OnlineReconstructor:
                 self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
                 self._restart(refined.newest)
-        newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
         settled = self._state.settled
-        while len(settled) > 0 and (
-            newest_s - float(settled[0].time_s.max()) > _KEPT_S or len(settled) > _MOST_KEPT
-        ):
+        while len(settled) > _KEPT_S / (_SETTLES * self.lag_s):
             self._state.not_taken += len(settled.popleft())
         self._show()
 

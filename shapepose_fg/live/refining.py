@@ -58,7 +58,7 @@ class LiveState:
     begin: Moment
     """The people before the first frame: nobody, and the next identity. Not saved."""
     without_pose: Counter[int] = field(default_factory=Counter)
-    """By view: how many were given without a pose since the last one with. Not saved."""
+    """By view: how many more were given without a pose than with one. Not saved."""
     slots: list[Slot] = field(default_factory=list)
     """The last frames, in order of time: those that are not settled, and what a window needs before them."""
     before: Detections | None = None

@@ -73,6 +73,7 @@ class ViewsInStep:
             return []
         every = [time_s for _, time_s in self.waiting.values()]
         most = max(every, key=lambda time_s: sum(abs(other - time_s) <= JUMP_S for other in every))
+        self.heard_s = np.where(np.abs(self.heard_s - most) <= JUMP_S, self.heard_s, -np.inf)
         self.waiting = {view: each for view, each in self.waiting.items() if abs(each[1] - most) <= JUMP_S}
         mean = float(np.mean([time_s for _, time_s in self.waiting.values()]))
         times = np.full(self.views, mean)
