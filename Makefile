@@ -8,25 +8,27 @@ JOBS ?= 2
 # One thread each, too. A file's tests share what they have made: one process runs them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-all check format benchmark clean
+.PHONY: demo test test-all lint check format benchmark clean
 .DEFAULT_GOAL := demo
 
 ## Reconstruct the built-in scene: prints a table against the truth, leaves a picture in demo/.
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Lint, types, and the tests that are not marked slow: three minutes on two cores.
-test: check
+## Run the linter and the fast tests: three minutes on two cores.
+test: lint
 	$(PYTEST) -m "not slow"
 
-## What CI runs: all tests.
+## Run what CI runs: linter, type checker and all tests, with all extras installed (torch among them).
 test-all: check
 	$(PYTEST)
 
-check: $(VENV)/installed
+lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/basedpyright --level error
+
+check: lint $(VENV)/installed-all
+	$(BIN)/basedpyright --pythonpath $(BIN)/python --level error
 
 format: $(VENV)/installed
 	$(BIN)/ruff check --fix .
@@ -36,11 +38,17 @@ format: $(VENV)/installed
 benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
 
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_ARGS)
+
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_ARGS) -e ".[dev]"
+	$(INSTALL) -e ".[dev]"
 	# Done at the first start otherwise, or at every one where Python may write nothing beside the sources.
 	$(BIN)/python -m compileall -q shapepose_fg factors
+	touch $@
+
+$(VENV)/installed-all: $(VENV)/installed
+	$(INSTALL) -e ".[ci]"
 	touch $@
 
 clean:

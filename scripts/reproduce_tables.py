@@ -19,8 +19,6 @@ import re
 import subprocess
 from pathlib import Path
 
-import torch
-
 from shapepose_fg.evaluation.experiments.experiment import measured
 from shapepose_fg.evaluation.experiments.registry import experiments
 from shapepose_fg.evaluation.experiments.scenes import RECORDINGS, Scale
@@ -52,7 +50,6 @@ def main() -> None:
     if data is None and arguments.data is not None:
         wanted = " or ".join(RECORDINGS)
         parser.error(f"--data: neither {arguments.data} nor {arguments.data / 'data'} has a folder {wanted}")
-    torch.set_num_threads(1)
     scale = Scale(arguments.quick, data, arguments.split, *[tuple(arguments.seeds)] if arguments.seeds else [])
     commit = code_commit()
     results = arguments.results / commit / ("quick" if arguments.quick else arguments.split)

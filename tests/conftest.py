@@ -19,7 +19,6 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.pipeline.pipeline import reconstruct
-from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
@@ -38,12 +37,6 @@ STANDING = np.array(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _torch_is_loaded_once_for_all_processes() -> None:
-    """Worker processes of any test are forked off one that has torch; the first test's would leave it out."""
-    get_ready("shapepose_fg.pipeline.pipeline")
-
-
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings (`SHAPEPOSE_DATA`, else ../shared); skips where there is none."""
@@ -51,6 +44,15 @@ def shared_data() -> Path:
     if not (root / "data").is_dir():
         pytest.skip(f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test")
     return root / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_cases(shared_data) -> Path:
+    """The folder of files that other programs wrote, and of what people reported; skips where there is none."""
+    cases = shared_data.parent / "cases"
+    if not cases.is_dir():
+        pytest.skip(f"no cases at {cases}")
+    return cases
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from rich.table import Table
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics, match_people
-from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import reconstruct
@@ -69,7 +68,6 @@ class Demo:
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
         """Write people.npz, what belongs to it, and the report; returns what to tell the user."""
         self.people.save(folder)
-        write_rig(self.scene.rig, folder / CAMERAS)
         told = [
             f"{folder / 'people.npz'}  joints, covariances and bodies",
             f"{folder / 'run.json'}  settings, times",

@@ -27,15 +27,14 @@ def explain(
     """Say why a joint is where it is: what each camera, the body and motion say, and what is the matter."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.core.result_files import results_folder
-    from shapepose_fg.io.calibration import read_rig
     from shapepose_fg.io.detections.reading import read_detections
-    from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.io.solved_setup import cameras_of
     from shapepose_fg.pipeline.explaining import explain
 
     if (frame is None) == (time is None):
         raise InputError("--frame, --time: give one of them")
     folder = results_folder(results)
-    rig, people = read_rig(folder / CAMERAS), Reconstruction.load(folder)
+    rig, people = cameras_of(folder), Reconstruction.load(folder)
     seen = None if detections is None else read_detections(detections, rig)
     found = explain(people, rig, person=person, joint=joint, frame=frame, time_s=time, detections=seen)
     if as_json:

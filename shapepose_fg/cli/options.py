@@ -3,7 +3,7 @@
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from functools import wraps
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 import typer
 
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Axis, Rig
@@ -144,6 +144,8 @@ class CameraOptions:
     up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
     image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
+    cameras: str | None = option(INPUT, "Only these of the calibration's cameras.", metavar="A,B")
+    without: str | None = option(INPUT, "All of its cameras but these.", metavar="A,B")
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used."""
@@ -153,7 +155,22 @@ class CameraOptions:
             raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
         size = picture_size(self.image_size)
         up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
-        return read_rig(self.calibration, up=up, unit=unit, image_size=size)
+        chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
+        found = read_rig(self.calibration, up=up, unit=unit, image_size=size, **chosen)
+        note(*found.notes)
+        return found
+
+    def chosen(self, names: Sequence[str]) -> list[str]:
+        """The names of cameras that are wanted among those of videos, which no calibration names."""
+        from shapepose_fg.core.camera import choose
+
+        with naming("--cameras, --without"):
+            return choose(names, names_of(self.cameras), names_of(self.without) or ())
+
+    def said(self) -> dict[str, object]:
+        """What is said of the calibration, as options of the next command."""
+        names = ("up", "unit", "image_size", "cameras", "without")
+        return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,6 +275,11 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
     """How to go on, as a line to copy: `reconstruct` with those options that are given."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def names_of(text: str | None) -> list[str] | None:
+    """Names of cameras, apart by commas; None where no text is given."""
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def picture_size(text: str | None) -> tuple[int, int] | None:

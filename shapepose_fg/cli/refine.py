@@ -113,9 +113,8 @@ def refine_calibration(
         print("\n".join(lines[1:]))
         print(f"{output}: {form}")
         # Our own file says axis, unit and size itself.
-        said = {"--up": seen.up, "--unit": seen.unit, "--image-size": seen.image_size}
         options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
-        options |= {} if form == "our own rig file" else said
+        options |= {} if form == "our own rig file" else seen.said()
         print(next_reconstruct(options | rate.given() | {"--output": "results"}))
 
 

@@ -63,7 +63,7 @@ def synchronise(
         )
         if output is not None:
             options = {"--calibration": seen.calibration, "--detections": seen.detections}
-            options |= {"--skeleton": seen.skeleton, "--up": seen.up, "--unit": seen.unit}
-            options |= {"--image-size": seen.image_size, "--timestamps": output, "--output": "results"}
+            options |= {"--skeleton": seen.skeleton} | seen.said()
+            options |= {"--timestamps": output, "--output": "results"}
             print(f"{output}: times of {count} frames")
             print(next_reconstruct(options))

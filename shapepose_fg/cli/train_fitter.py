@@ -5,7 +5,7 @@ from pathlib import Path
 
 from shapepose_fg.cli.options import INPUT, REQUIRED, RESULT, RUN, grouped, option
 from shapepose_fg.cli.terminal import note, progress, show, table, warn
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.output_folder import prepare_output
 
 _DRAWN = 30_000
@@ -27,8 +27,7 @@ def train_fitter(
 
     It begins with the weights that ship with the package, and is compared with the plain optimiser at the end.
     """
-    import torch
-
+    torch = optional("torch", "train")
     from shapepose_fg.body.fitting.weights import FitterWeights, adapted_file, fingerprint
     from shapepose_fg.body.model.body_model import BodyModel
     from shapepose_fg.simulation.training.adaptation import PLAIN, TRAINED, adapted

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
+from shapepose_fg.core.rig_file import CAMERAS, is_replaceable, write_rig
 from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25, check_joint_names
@@ -107,6 +109,9 @@ class Reconstruction(Table):
     """What each row was solved from, row by row (goes to observations.npz); None where that is not recorded."""
     shapes: SubjectShapes | None = None
     """The shape of each identity with its covariance, named by its number; `save` leaves them out."""
+    rig: Rig | None = None
+    """The cameras that it was solved with, from `reconstruct`; None where unknown. `load` does not read them
+    (`read_rig(folder / "cameras.json")`)."""
 
     ROWS: ClassVar = (
         "frame person time_s joints covariance velocity velocity_covariance known confidence"
@@ -134,8 +139,8 @@ class Reconstruction(Table):
         """The rows of `parts`, one after the other.
 
         `run` says what all parts together are (`merged_run`): ValueError where their configurations differ or
-        two of them cover the same frame. `observations` are kept where every part that has rows has them, `shapes`
-        are not.
+        two of them cover the same frame. `observations` are kept where every part that has rows has them, `rig`
+        where it is the same of all parts, `shapes` are not.
         """
         if len(parts) == 0:
             return cls.empty()
@@ -144,7 +149,8 @@ class Reconstruction(Table):
         together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
         # A part without rows and without a run has nothing to say of the whole.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
-        return Reconstruction.joined(parts, observations=together, shapes=None, run=merged_run(runs))
+        rig = parts[0].rig if all(part.rig is parts[0].rig for part in parts) else None
+        return Reconstruction.joined(parts, observations=together, shapes=None, rig=rig, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows that `index` picks: a mask (N,) or row numbers."""
@@ -182,15 +188,28 @@ class Reconstruction(Table):
         """What run.json says of the rows: how many, with which status, and how their joints are known."""
         return count_rows([(self.status, self.known)])
 
-    def save(self, folder: str | Path) -> None:
-        """Write people.npz, run.json and observations.npz into `folder`, each whole or not at all.
+    def save(self, folder: str | Path, rig: Rig | None = None) -> None:
+        """Write people.npz, run.json, observations.npz and cameras.json into `folder`, each whole or not at all.
 
-        A process killed on the way leaves each file as it was or as it shall be, and `load` says where they do not
-        belong together (docs/conventions.md). Without `observations`, those of an earlier result are removed.
-        InputError where `load` would refuse them, OSError where `folder` cannot be written.
+        `rig` are the cameras, by default those that it was solved with (`self.rig`); where neither is known, a
+        cameras.json that is there stays. A process killed on the way leaves each file as it was or as it shall be,
+        and `load` says where they do not belong together (docs/conventions.md). Without `observations`, those of
+        an earlier result are removed. InputError where `load` would refuse them, or cameras.json is another
+        program's; OSError where `folder` cannot be written; ValueError where `rig` are not the cameras of the
+        observations.
         """
+        rig = self.rig if rig is None else rig
+        if rig is not None and self.observations is not None:
+            names = tuple(self.observations.view_names.tolist())
+            if names != rig.names:
+                raise ValueError(f"rig must have the cameras of the observations, {names}, got {rig.names}")
         observations = None if self.observations is None else self.observations.columns()
+        cameras = Path(folder) / CAMERAS
+        if rig is not None and not is_replaceable(cameras):
+            raise InputError(f"{cameras}: this is no rig file of a result and would be lost; give another folder")
         write_result(Path(folder), self.columns(), observations, self.run, check_files)
+        if rig is not None:
+            write_rig(rig, cameras)
 
     @classmethod
     def load(cls, path: str | Path) -> "Reconstruction":

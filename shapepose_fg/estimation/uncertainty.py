@@ -3,10 +3,11 @@
 Of any `Reconstruction`: saved, handed out by `OnlineReconstructor.people`, or solved with factors of your own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,6 +23,7 @@ from shapepose_fg.estimation.linearisation import (
     observation_sigmas,
     symmetric_roots,
 )
+from shapepose_fg.estimation.window_solution import PersonGraph
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
@@ -181,13 +183,17 @@ class SurfaceDistance:
         return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
 
 
-def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -> Marginal:
+def marginal(
+    people: Reconstruction, *joints: JointAt, rig: Rig | None = None, graphs: Iterable[PersonGraph] = ()
+) -> Marginal:
     """Joints of any people and frames together.
 
     Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
     correlate as was measured (`correlation`). With the `rig` that people were solved with (`cameras.json`), what
-    comes of the poses of cameras that move is shared by all that they see. NotDetermined for a joint without a
-    place, ValueError for one that is not there.
+    comes of the poses of cameras that move is shared by all that they see. With the `graphs` of a result that was
+    solved with factors of your own (`window_solutions(people, rig, extra_factors=...)`), joints that these tie to
+    each other correlate as the graph has it, also those of two people. NotDetermined for a joint without a place,
+    ValueError for one that is not there.
     """
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
     K = len(joints)
@@ -199,8 +205,44 @@ def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -
     names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
     rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
     rho *= people.person[rows][:, None] == people.person[rows]
-    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots) + shared
+    errors = np.einsum("ab,ij->aibj", rho, np.eye(3))
+    found = _of_graphs(list(graphs), joints, numbers, errors)
+    covariance = np.einsum("aik,akbl,bjl->aibj", roots, found, roots) + shared
     return Marginal(people.joints[rows, numbers], covariance.reshape(3 * K, 3 * K))
+
+
+def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers: Index, errors: Array) -> Array:
+    """Correlations `errors` (K, 3, K, 3) of K joints, in standard deviations; from the graph where factors of the
+    user's own tie two of them.
+    """
+    K, found, tied = len(joints), errors.copy(), False
+    for graph in {id(each.window.ties): each for each in graphs if len(each.window.ties.active) > 0}.values():
+        members = {each.person: each for each in graph.together or [graph]}
+        keys = dict[int, int]()
+        for n, asked in enumerate(joints):
+            person = members.get(asked.person)
+            if person is not None and asked.frame in person.frames:
+                key = int(person.keys[np.flatnonzero(person.frames == asked.frame)[0], numbers[n]])
+                keys |= {n: key} if graph.values.exists(key) else {}
+        parts = graph.window.ties.parts
+        nodes = {n: (joints[n].person, int(numbers[n])) for n in keys}
+        pairs = [(a, b) for a in keys for b in keys if a < b and keys[a] != keys[b]]
+        pairs = [(a, b) for a, b in pairs if any({nodes[a], nodes[b]} <= part for part in parts)]
+        asked = sorted({keys[n] for pair in pairs for n in pair})
+        if len(asked) == 0:
+            continue
+        joint = gtsam.Marginals(graph.graph, graph.values).jointMarginalCovariance(gtsam.KeyVector(asked))
+        white = {key: np.linalg.inv(symmetric_roots(joint.at(key, key)[None])[0]) for key in asked}
+        tied = True
+        for a, b in pairs:
+            across = white[keys[a]] @ joint.at(keys[a], keys[b]) @ white[keys[b]].T
+            found[a, :, b], found[b, :, a] = across, across.T
+    if not tied:
+        return errors
+    # Correlations from two sources: no stronger than leaves the whole positive definite.
+    apart = found.reshape(3 * K, 3 * K) - np.eye(3 * K)
+    least = np.linalg.eigvalsh(apart).min(initial=0.0)
+    return (np.eye(3 * K) + apart / max(1.0, -least)).reshape(K, 3, K, 3)
 
 
 def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
@@ -227,13 +269,18 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
 
 
 def distance(
-    people: Reconstruction, one: JointAt, other: JointAt | ArrayLike, *, rig: Rig | None = None
+    people: Reconstruction,
+    one: JointAt,
+    other: JointAt | ArrayLike,
+    *,
+    rig: Rig | None = None,
+    graphs: Iterable[PersonGraph] = (),
 ) -> Distance:
-    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` as of
-    `marginal`.
+    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` and `graphs` as
+    of `marginal`.
     """
     if isinstance(other, JointAt):
-        both = marginal(people, one, other, rig=rig)
+        both = marginal(people, one, other, rig=rig, graphs=graphs)
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance)

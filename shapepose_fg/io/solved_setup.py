@@ -6,10 +6,21 @@ from typing import Any
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.rig_file import CAMERAS as CAMERAS
+from shapepose_fg.io.calibration import read_rig
 
-CAMERAS = "cameras.json"
-"""The cameras of a result, as a rig file of our own, beside its people.npz."""
+
+def cameras_of(folder: Path) -> Rig:
+    """The cameras of the result in `folder`; InputError, which says where to get them, where there are none."""
+    file = folder / CAMERAS
+    if not file.exists():
+        raise InputError(
+            f"{file}: there is none, and this needs the cameras of the result: write them with"
+            " `people.save(folder, rig)` or `write_rig(rig, file)`, or copy the calibration there under this name"
+        )
+    return read_rig(file)
 
 
 def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:

@@ -7,15 +7,11 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError, naming
-from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.core.rig_file import COVARIANCE, POSE
+from shapepose_fg.core.storage.files import read_text
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.validation import is_number
 
-POSE = ("time_s", "x", "y", "z", "qx", "qy", "qz", "qw")
-"""The columns of a pose: TUM's eight numbers, in its order."""
-_ERRORS = ("rx", "ry", "rz", "x", "y", "z")
-COVARIANCE = tuple(f"{a}_{b}" for n, a in enumerate(_ERRORS) for b in _ERRORS[n:])
-"""The columns of a covariance: `rx_rx` to `z_z`, its upper triangle, rad and m along the carrier's own axes."""
 _MOST_BYTES = 2**28
 _MOST_METRES = 1e6
 _UNIT = 0.01
@@ -72,23 +68,6 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
 
 
-def write_trajectory(trajectory: Trajectory, path: Path) -> None:
-    """Write a trajectory as CSV with a header, covariances in it; or, `.tum`, as TUM's text, without."""
-    from scipy.spatial.transform import Rotation
-
-    quaternions = Rotation.from_matrix(trajectory.wTb[:, :3, :3]).as_quat(canonical=True)
-    numbers = np.column_stack([trajectory.time_s, trajectory.wTb[:, :3, 3], quaternions])
-    if path.suffix == ".tum":
-        write_content(path, "".join(" ".join(map(repr, row)) + "\n" for row in numbers.tolist()))
-        return
-    header = list(POSE)
-    if trajectory.covariance is not None:
-        row, column = np.triu_indices(6)
-        numbers, header = np.column_stack([numbers, trajectory.covariance[:, row, column]]), [*POSE, *COVARIANCE]
-    text = "".join(",".join(map(repr, row)) + "\n" for row in numbers.tolist())
-    write_content(path, ",".join(header) + "\n" + text)
-
-
 def _table(path: Path) -> tuple[list[str], Array, Index]:
     """Names of the columns, the numbers (F, C), and the line of the file that each row is from."""
     names, rows, lines = list[str](), list[list[float]](), list[int]()
@@ -125,7 +104,7 @@ def _check_columns(path: Path, line: int, names: list[str]) -> None:
         raise InputError(
             f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and of covariances rx_rx ..."
         )
-    diagonal = [f"{each}_{each}" for each in _ERRORS]
+    diagonal = [name for name in COVARIANCE if len(set(name.split("_"))) == 1]
     lacks = next((name for name in diagonal if name not in names), None)
     if lacks is not None and any(name in names for name in COVARIANCE):
         raise InputError(f"{path}: line {line}: the covariance lacks {lacks}; give {' '.join(diagonal)} at least")

@@ -161,7 +161,8 @@ def _duplicate(finding: Finding, side_px: int) -> str:
     return f"{{first}} and {{second}} have {same}; one of them has the other's {others}: give its own"
 
 
-_ADULT_M = 1.7
+ADULT_M = 1.7
+"""Mean stature of adults, metres, of the body model as of the world's women and men."""
 _UNITS = (
     (1e-3, "m", "mm"),
     (1e3, "mm", "m"),
@@ -174,7 +175,7 @@ _UNITS = (
 
 
 def _unit(finding: Finding, side_px: int) -> str:
-    factor = finding.amount / _ADULT_M
+    factor = finding.amount / ADULT_M
     for times, truth, taken in _UNITS:
         if 0.55 < factor / times < 1.45:
             unit = f"the calibration is probably in {truth}, and was read as {taken}; say its unit with --unit"

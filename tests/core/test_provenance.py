@@ -14,7 +14,7 @@ def test_versions_are_those_that_run():
     found = versions()
     assert found["python"] == platform.python_version()
     assert found["numpy"] == np.__version__
-    assert set(found) == {"python", "shapepose-fg", "numpy", "scipy", "gtsam", "torch", "numba", "opencv"}
+    assert set(found) == {"python", "shapepose-fg", "numpy", "scipy", "gtsam", "numba", "opencv"}
     assert "not installed" not in found.values()
 
 

@@ -18,6 +18,7 @@ from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.rig_file import POSE
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.opening import read_form
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
@@ -32,7 +33,7 @@ from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.recording import read_moments, write_moments
 from shapepose_fg.io.skeleton_file import read_skeleton
 from shapepose_fg.io.timestamps import read_timestamps
-from shapepose_fg.io.trajectories import POSE, read_trajectory
+from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit

@@ -9,9 +9,10 @@ import pytest
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.rig_file import write_trajectory
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.calibration import read_rig, with_trajectories, write_rig
-from shapepose_fg.io.trajectories import read_trajectory, write_trajectory
+from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.simulation.scene import ring_of_cameras
 
 TUM = "# time x y z qx qy qz qw\n10.0 1 2 3 0 0 0 1\n10.5 1 2 4 0 0 0.70710678 0.70710678\n"

@@ -14,13 +14,14 @@ ROOT = Path(__file__).parents[2]
 LEVELS = (
     "factors core.arrays core.compiled core.errors",
     "core.skeleton core.pieces core.assignment core.lens core.trajectory",
+    "core.joint_names",
     "core.camera",
     "core.drawing",
     "core.storage.files core.bounds",
     "core.storage.npz",
     "core.storage.schema",
     "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
-    " core.run_summary viz.rendering pipeline.workers cli.terminal cli.stopping",
+    " core.run_summary core.rig_file viz.rendering pipeline.workers cli.terminal cli.stopping",
     "core.result_files",
     "body.kernels",
     "body.model",

@@ -84,7 +84,7 @@ def test_an_error_in_a_worker_is_raised_here(worker: VisibilityWorker, people: l
 def test_a_worker_that_dies_is_no_endless_wait(worker: VisibilityWorker, people: list[FramePeople]):
     with closing(worker.all(people * 9, 2)) as seen:
         next(seen)
-        multiprocessing.active_children()[0].kill()
+        os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
         with pytest.raises(RuntimeError, match="worker process was killed"):
             list(seen)
 

@@ -1,7 +1,7 @@
 """Where the cameras stand: calibration files of many programs to one `Rig`, and our own rig file written."""
 
-from shapepose_fg.io.calibration.json_and_toml import RIG_FORMAT as RIG_FORMAT
-from shapepose_fg.io.calibration.json_and_toml import write_rig as write_rig
+from shapepose_fg.core.rig_file import RIG_FORMAT as RIG_FORMAT
+from shapepose_fg.core.rig_file import write_rig as write_rig
 from shapepose_fg.io.calibration.reading import read_rig as read_rig
 from shapepose_fg.io.calibration.reading import with_trajectories as with_trajectories
 from shapepose_fg.io.calibration.writing import write_like as write_like

@@ -75,6 +75,8 @@ class WrittenRig:
     """How the user can say what the file does not, by field: "unit", "up" or "image_size"."""
     trajectories: Sequence[Trajectory] = ()
     """Where the carriers of cameras go."""
+    notes: Sequence[str] = ()
+    """What of the file was left out or taken for granted, a sentence each."""
 
 
 @dataclass(frozen=True)

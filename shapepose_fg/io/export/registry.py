@@ -191,7 +191,10 @@ def read_take(
         rig = read_rig(cameras) if cameras.is_file() else None
         axis: Any = up or (None if rig is None else rig.up)
         if axis is None:
-            raise InputError(f"{cameras}: it is not there to say which axis is up; give --up, such as --up z")
+            raise InputError(
+                f"{cameras}: it is not there to say which axis is up: give --up, such as --up z, or write them"
+                " with `people.save(folder, rig)`"
+            )
         people = opened.rows(chosen_rows(opened, path, frames, persons), observations=observations)
     if frames is not None:  # of those that were reconstructed the ones that are asked for
         spans = covered_frames(people.run) or []

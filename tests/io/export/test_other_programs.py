@@ -48,6 +48,7 @@ def exported(filmed, scene, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("walk")
     filmed.save(folder)
     write_rig(scene.rig, folder / "cameras.json")
+    pytest.importorskip("pyarrow", reason='needs pip install "shapepose-fg[archive]"')
     names = ("amass", "trc", "c3d", "bvh", "glb", "csv", "parquet")
     export_result(folder, [FORMATS[name] for name in names], folder)
     return folder

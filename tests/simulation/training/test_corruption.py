@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
-import torch
 
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
+
+pytest.importorskip("torch", reason='needs pip install "shapepose-fg[train]"')
+import torch
+
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 
 COUNT, K = 400, len(BODY_POINTS)

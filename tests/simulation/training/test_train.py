@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import chi2
 
 from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale
@@ -15,8 +14,12 @@ from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.simulation.training.differentiable import TrainedNetwork, exp_so3, inverse_3x3, positions, unroll
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
+
+pytest.importorskip("torch", reason='needs pip install "shapepose-fg[train]"')
+import torch
+
+from shapepose_fg.simulation.training.differentiable import TrainedNetwork, exp_so3, inverse_3x3, positions, unroll
 from shapepose_fg.simulation.training.train import (
     INSIDE,
     PeopleSource,

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.sparse import csr_array
 
 from shapepose_fg.body.fitting import optimisers
@@ -21,10 +20,14 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
-from shapepose_fg.simulation.training import adaptation
 from shapepose_fg.simulation.training.motions import drawn_motions
-from shapepose_fg.simulation.training.train import PeopleSource, TrainingConfig, compared
 from tests.foreign import Proportions, reshaped
+
+pytest.importorskip("torch", reason='needs pip install "shapepose-fg[train]"')
+import torch
+
+from shapepose_fg.simulation.training import adaptation
+from shapepose_fg.simulation.training.train import PeopleSource, TrainingConfig, compared
 
 LIMBS = ((0,), (1, 2), (4, 5), (7, 8, 10, 11), (3, 6, 9), (12, 15), (13, 14, 16, 17), (18, 19), (20, 21, 22, 23))
 """Joints whose bones are longer or shorter together."""
