@@ -15,7 +15,7 @@ from shapepose_fg.io.footage.placement import read_used_footage
 _NARROWEST, _WIDEST = 5.0, 150.0
 """Degrees from left to right that a lens without distortion can see."""
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-_FORMATS = ("JPEG", "MPO", "PNG", "TIFF")
+_FORMATS = ("JPEG", "PNG", "TIFF")
 """Pillow's names of what these hold: its other readers, of which some start programs, are not tried."""
 _MOST_BYTES = 2**28
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
