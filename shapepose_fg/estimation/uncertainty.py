@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.carried_error import POSES_LAST_S, goes_with_poses
@@ -21,7 +22,6 @@ from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     linearise,
     observation_sigmas,
-    symmetric_roots,
 )
 from shapepose_fg.estimation.window_solution import PersonGraph
 
@@ -94,7 +94,7 @@ class Distance:
         Gauss and Legendre's rule.
         """
         limit = np.asarray(limit_m, dtype=np.float64)
-        values, axes = np.linalg.eigh(self.covariance)
+        values, axes = principal_axes(self.covariance)
         sigma = np.sqrt(np.maximum(values, 1e-12))
         mean = np.einsum("...ij,...i->...j", axes, self.apart)
         shape = np.broadcast_shapes(limit.shape, mean.shape[:-1])
@@ -201,7 +201,7 @@ def marginal(
     shared = np.zeros((K, 3, K, 3))
     if rig is not None and rig.trajectories and K > 0:
         shared = _of_poses(people, rig, rows, numbers, reported)
-    roots = symmetric_roots(reported - np.einsum("aiaj->aij", shared))
+    roots = symmetric_root(reported - np.einsum("aiaj->aij", shared))
     names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
     rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
     rho *= people.person[rows][:, None] == people.person[rows]
@@ -232,7 +232,7 @@ def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers
         if len(asked) == 0:
             continue
         joint = gtsam.Marginals(graph.graph, graph.values).jointMarginalCovariance(gtsam.KeyVector(asked))
-        white = {key: np.linalg.inv(symmetric_roots(joint.at(key, key)[None])[0]) for key in asked}
+        white = {key: np.linalg.inv(symmetric_root(joint.at(key, key)[None])[0]) for key in asked}
         tied = True
         for a, b in pairs:
             across = white[keys[a]] @ joint.at(keys[a], keys[b]) @ white[keys[b]].T
@@ -258,10 +258,10 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     sigmas = observation_sigmas(seen, own.joints, views, config, own.joint_names.tolist())
     evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
     goes = goes_with_poses(evidence, Message(own.joints, nothing), sigmas, views, config)
-    goes = goes[np.arange(len(rows)), numbers] @ symmetric_roots(views.carried.covariance)
-    ends = symmetric_roots(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(
-        goes, 1, 2
-    ).reshape(len(rows), 3, -1)
+    goes = goes[np.arange(len(rows)), numbers] @ symmetric_root(views.carried.covariance)
+    ends = symmetric_root(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(goes, 1, 2).reshape(
+        len(rows), 3, -1
+    )
     most = np.linalg.eigvalsh(ends @ ends.mT)[:, -1]
     goes /= np.sqrt(np.maximum(most, 1.0))[:, None, None, None]
     lasting = np.exp(-np.abs(own.time_s[:, None] - own.time_s) / POSES_LAST_S)
@@ -326,7 +326,7 @@ def surface_distance(
     known = np.isfinite(people.covariance[row]).all(axis=(1, 2)) & np.isfinite(people.joints[row]).all(axis=1)
     weight = np.exp(-0.5 * ((people.joints[row] - nearest) ** 2).sum(axis=1) / _REACH_M**2)
     weight = np.where(known, weight, 0.0)
-    chosen = np.argsort(-weight)[:4]
+    chosen = np.argsort(-weight, kind="stable")[:4]
     chosen = chosen[known[chosen]]
     if len(chosen) == 0:
         raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a place")

@@ -349,7 +349,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         return []
     shift = shifted.shift_deg.copy()
     shift[list(known)] = 0.0
-    order, findings = np.argsort(-shift), list[Finding]()
+    order, findings = np.argsort(-shift, kind="stable"), list[Finding]()
     first, second = shift[order[:2]]
     alone = problem.likely(int(order[0])) > 0 and first > _OUTLIER_RATIO * second
     if tells_apart and first > _OUTLIER_DEG and alone:

@@ -119,11 +119,14 @@ def _words(finding: Finding, rig: Rig) -> str:
     )
 
 
+_POSE_AGAIN = "calibrate its pose again, or let shapepose-fg refine-calibration find it by the people"
+
+
 def _turned(finding: Finding, side_px: int) -> str:
     return (
         "{who} looks turned by about {degrees} degrees"
         + (" and moved by {moved}" if finding.moved > 0.1 else "")
-        + "; calibrate its pose again"
+        + f"; {_POSE_AGAIN}"
     )
 
 
@@ -208,7 +211,7 @@ def _unfit(finding: Finding, side_px: int) -> str:
 
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TURNED: _turned,
-    Kind.MOVED: "{who} looks moved by about {moved} and turned by {amount:.1f} degrees; calibrate its pose again",
+    Kind.MOVED: f"{{who}} looks moved by about {{moved}} and turned by {{amount:.1f}} degrees; {_POSE_AGAIN}",
     Kind.LATE: _late,
     Kind.EXCHANGED: "{who} look exchanged: each sees what the other should see; exchange their names in the"
     " calibration, or their detections",
