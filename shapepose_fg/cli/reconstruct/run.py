@@ -203,7 +203,7 @@ class _Run:
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
-            "cameras": _digest(asdict(task.rig)),
+            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "versions": versions(),
             "program": program_digest(),
         }
