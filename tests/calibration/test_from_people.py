@@ -116,6 +116,7 @@ def test_measured_distances_say_the_scale(adjusted):
         Measured(distances=wrong).size_of(adjusted)
 
 
+@pytest.mark.slow
 def test_joints_behind_a_camera_are_no_fit(rig, recording, capfd):
     people = Footage.of(recording, rig, TIMES, range(0, 250, 25)).people(rig)
     # The first camera starts turned about: everybody is behind it.
@@ -125,6 +126,7 @@ def test_joints_behind_a_camera_are_no_fit(rig, recording, capfd):
     assert np.isfinite(found.covariance).all() and capfd.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_a_camera_that_shares_no_moment_is_named(rig, recording):
     apart = only(recording, lambda view, t: (view == 3) == (t >= 125))
     with pytest.raises(Undetermined, match="camera cam3: too few people are seen at the same moments") as refused:

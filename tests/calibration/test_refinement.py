@@ -66,6 +66,7 @@ def test_a_sound_rig_stays_within_its_sigma(rig, recording):
     assert abs(found.after_px / found.before_px - 1) < 0.1
 
 
+@pytest.mark.slow
 def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
     bumped = replace(rig, cameras=(disturbed(rig, 1, degrees=2.5).cameras[0], *rig.cameras[1:]))
     footage, now = Footage.of(recording, rig, TIMES, range(250)), bumped
@@ -86,6 +87,7 @@ def test_a_camera_that_was_knocked_far_off_is_found_again(rig, recording):
     assert found.change()["turn"][0] == pytest.approx(15, abs=1) and found.change()["turn"][1:].max() < 1
 
 
+@pytest.mark.slow
 def test_joints_behind_a_camera_are_no_trouble(rig, recording):
     """Where cameras are far off, joints end behind them; what these say is nothing, and nothing fails."""
     people = Footage.of(recording, rig, TIMES, range(250)).people(rig)

@@ -213,6 +213,7 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     assert ((nose - np.minimum(right, left) > 1.1) & (nose - np.minimum(right, left) < 1.8)).all()
 
 
+@pytest.mark.slow
 def test_four_people_around_a_pizza(shared_data, network, tmp_path):
     """CMU Panoptic's demo: five letterboxed pictures of one moment. At least three of four, and nobody else."""
     data = shared_data / "panoptic_pizza"

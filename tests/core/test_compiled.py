@@ -68,6 +68,7 @@ def test_compiling_is_logged_once_and_not_when_it_is_read_from_the_cache(tmp_pat
     assert lines() == first[1:]
 
 
+@pytest.mark.slow
 def test_what_no_cache_has_is_compiled_side_by_side_by_other_processes(tmp_path):
     """All kernels that are imported, when the first is called; and the same result as here."""
     for name in ("one", "two"):
