@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import shapepose_fg
 from shapepose_fg.core.compiled import KERNELS, signature
 from shapepose_fg.core.frame_times import FrameTimes

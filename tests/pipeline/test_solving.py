@@ -52,8 +52,8 @@ def moved_mm(one: Reconstruction, other: Reconstruction) -> np.ndarray:
 
 
 def test_solved_anew_nobody_moves(scene, people):
-    """The same observations, from where the views put them: the alternation settles to the same, but for joints that
-    views hardly see.
+    """The same observations, from where the views put them: the alternation settles to the same, but for joints
+    that views hardly see.
     """
     again = solve_anew(replace_changed(people, frozenset(people.person.tolist())), lambda rows: solve(rows, scene))
     assert np.nanmedian(moved_mm(again, people)) < 1.5
