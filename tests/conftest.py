@@ -26,7 +26,7 @@ from shapepose_fg.simulation import Scene, built_in_scene, simulate
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 SEED = int(os.environ.get("SHAPEPOSE_TEST_SEED", "0"))
-"""Another number here makes everything that tests and the simulator draw another draw: bounds must hold for all."""
+"""Another number here changes all that tests and the simulator draw: bounds must hold for each."""
 
 
 def pytest_configure() -> None:
@@ -39,7 +39,7 @@ _seeded = np.random.default_rng
 
 
 def _other_generator(seed: object = None) -> np.random.Generator:
-    """The generator of a seed, a number or several, together with `SEED`; what the program draws stays as it is."""
+    """The generator of a seed together with `SEED`; what the program itself draws stays as it is."""
     caller = sys._getframe(1).f_globals.get("__name__", "")
     drawn = caller.startswith("shapepose_fg.simulation") or not caller.startswith(("shapepose_fg", "factors"))
     if not drawn or not isinstance(seed, int | np.integer | list | tuple):
