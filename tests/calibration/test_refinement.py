@@ -99,6 +99,7 @@ def test_joints_behind_a_camera_are_no_trouble(rig, recording):
     assert np.isfinite(adjusted.covariance).all() and np.isfinite(adjusted.rig.centres).all()
 
 
+@pytest.mark.slow
 def test_the_reference_camera_keeps_its_pose(rig, recording):
     wrong, footage = disturbed(rig, 2), Footage.of(recording, rig, TIMES, range(250))
     adjusted = adjust(wrong, wrong, footage.people(wrong), Freedom(), 12.0, reference=1)

@@ -114,6 +114,7 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     assert "there are detections already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_project_is_detected_in_and_goes_on_as_a_project(kitchen, capsys, monkeypatch):
     """Cameras, videos and places come from it; the next line is the project's, quoted, from any folder."""
     rig, project = read_rig("calibration.json"), kitchen / "my walk"

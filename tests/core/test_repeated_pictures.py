@@ -128,6 +128,7 @@ def test_the_check_names_a_camera_that_stops(scene, recording, stopped):
     assert check_setup(recording, scene.rig).findings == ()
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_from_the_first_frame_is_not_said_to_see_nobody(scene, recording):
     frozen = showing(recording, 1, np.zeros(FRAMES, dtype=int))
     kinds = [each.kind for each in check_setup(frozen, scene.rig).findings]

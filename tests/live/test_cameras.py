@@ -63,6 +63,7 @@ def test_a_frozen_camera_is_left_out_while_it_repeats_itself(five_cameras, steps
     assert people.person.tolist() == [0, 1]
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_bumped_into_is_named_and_left_out_until_it_agrees(five_cameras, steps, two_people):
     frames = [steps(n) for n in range(50)]
     for n in range(10, 30):  # 80 pixels: some 4 degrees

@@ -55,6 +55,7 @@ def test_nothing_is_said_where_nothing_is_wrong(recording, room):
     np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [[0, 1], [0, 2, 3], [0, 1, 2, 4]])
 def test_nothing_is_said_of_fewer_cameras(recording, room, views):
     assert diagnose(*some_cameras(recording, room, views)).findings == ()
@@ -69,6 +70,7 @@ def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     assert found.amount == pytest.approx(degrees, rel=0.05, abs=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [10, *slow(3, 6, -8, 15)])
 def test_a_late_camera_is_named_with_its_frames(recording, room, frames):
     found = only_finding(delayed(recording, 1, frames), room)

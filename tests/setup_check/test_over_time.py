@@ -80,6 +80,7 @@ def test_a_mirrored_camera_is_named_and_left_out(recording, room, views):
     assert report.trust == Trust(left_out=((1, 0, 60),))
 
 
+@pytest.mark.slow
 def test_of_two_cameras_nothing_says_which_is_wrong(recording, room):
     seen, rig = some_cameras(recording, room, [0, 2])
     assert check_setup(seen, rig).trust == Trust()
