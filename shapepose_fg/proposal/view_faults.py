@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.people_2d import group_people
@@ -11,7 +11,7 @@ _LEAST_JOINTS = 3
 """Number of common joints from which on two 2D people are compared."""
 _SAME = 0.03
 """Median distance of the common joints of two detections of one person, as a share of the person's size in the
-picture: two boxes around one person differ by one or two hundredths, people in line with the camera by more."""
+picture: two boxes around one person differ by a hundredth or two, people in line with the camera by more."""
 _SAME_OF_PICTURE = 0.005
 """Such a distance as a share of the picture's width: people who are small in the picture differ by a few pixels."""
 _BORDER_PX = 1.0
