@@ -13,7 +13,7 @@ _SAME = 0.03
 """Median distance of the common joints of two detections of one person, as a share of the person's size in the
 picture: two boxes around one person differ by a hundredth or two, people in line with the camera by more."""
 _SAME_OF_PICTURE = 0.005
-"""Such a distance as a share of the picture's width: people who are small in the picture differ by a few pixels."""
+"""Such a distance as a share of the picture's width: small people differ by a few pixels."""
 _BORDER_PX = 1.0
 """Distance from the edge of the picture up to which a joint is on the edge, px."""
 _LINE_PX = 0.01
