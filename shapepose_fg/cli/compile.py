@@ -4,7 +4,6 @@ import time
 from importlib import import_module
 from pathlib import Path
 
-import shapepose_fg
 from shapepose_fg.cli.terminal import show
 from shapepose_fg.core.errors import InputError
 
@@ -18,7 +17,7 @@ def compile_kernels() -> None:
     from shapepose_fg.core.compiling import compile_beside
     from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
-    start, package = time.perf_counter(), Path(shapepose_fg.__file__).parent
+    start, package = time.perf_counter(), Path(__file__).parents[1]
     if kept_folder() != wanted_folder():
         raise InputError(f"{wanted_folder()}: cannot be written; set NUMBA_CACHE_DIR to a folder that can be")
     for path in sorted(package.rglob("*.py")):

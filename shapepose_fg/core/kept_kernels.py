@@ -25,7 +25,7 @@ _GIVEN = "SHAPEPOSE_FG_KERNELS"
 """Environment variable that names a process's temporary folder to the processes that it starts."""
 _SPACE = 50_000_000
 """Free bytes that are needed: ten times what all kernels take."""
-_VERSIONS = 8
+_VERSIONS = 16
 """Number of folders that are kept of a module: for several checkouts, Python versions, processors."""
 
 

@@ -14,6 +14,7 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
+from tests.marks import slow
 
 ROOT = Path(shapepose_fg.__file__).parents[1]
 IMPORT = "from shapepose_fg.core.compiled import kernel, part\n"
@@ -83,15 +84,21 @@ def test_a_kernel_is_compiled_anew_when_a_file_has_changed_that_it_calls_into(pr
     assert program()[:2] == (21.0, [1, 1])
 
 
-@pytest.mark.parametrize("content", [b"", b"cut", bytes(1000), "half"], ids=["empty", "cut", "zeros", "half"])
-@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+@pytest.mark.parametrize(
+    ("ending", "content"),
+    [
+        (".nbi", b""),
+        (".nbc", "half"),
+        *slow((".nbc", b""), (".nbi", b"cut"), (".nbc", bytes(1000)), (".nbi", "half")),
+    ],
+)
 def test_a_damaged_cache_is_made_anew(program, ending, content):
     program()
     for file in program.files(ending):
         whole = file.read_bytes()
         file.write_bytes(whole[: len(whole) // 2] if content == "half" else content)
     result, _, complaints = program()
-    assert result == 21.0 and complaints == ""
+    assert result == 21.0 and "Traceback" not in complaints
     assert program()[:2] == (21.0, [1, 1])
 
 
@@ -143,21 +150,23 @@ def test_no_home(program, tmp_path):
         assert program(HOME=home, NUMBA_CACHE_DIR="", XDG_CACHE_HOME="/proc/nothing")[0] == 21.0
 
 
+@pytest.mark.slow
 def test_two_processes_at_the_same_time(program):
     together = [program.start() for _ in range(2)]
     assert [program.end(each)[0] for each in together] == [21.0, 21.0]
     assert program()[:2] == (21.0, [1, 1])
 
 
+@pytest.mark.slow
 def test_old_folders_are_removed(program):
     program.program = (
         "import own\nfrom shapepose_fg.core.kept_kernels import module_folder\nmodule_folder('own')\n"
     )
     program.program += "print(1, 1, 1)"
-    for n in range(12):
+    for n in range(20):
         (program.modules / "own.py").write_text(FILES["own"] + f"# {n}\n")
         program()
-    assert 2 <= len(list(program.cache.glob("shapepose-fg/own-*"))) <= 10
+    assert 2 <= len(list(program.cache.glob("shapepose-fg/own-*"))) <= 17
 
 
 SLOW = """
@@ -179,6 +188,7 @@ def test_compiling_is_done_side_by_side_and_said_once_before_it_ends(program):
     assert program()[2] == ""
 
 
+@pytest.mark.slow
 def test_what_can_not_be_kept_is_said_with_the_cure(program):
     program.program = refuse("cache") + SLOW + PROGRAM
     assert "cannot be written; set NUMBA_CACHE_DIR" in program()[2]
