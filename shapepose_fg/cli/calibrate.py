@@ -19,12 +19,13 @@ from shapepose_fg.cli.options import (
     RateOptions,
     grouped,
     json_option,
+    names_of,
     next_reconstruct,
     option,
     picture_size,
 )
 from shapepose_fg.cli.terminal import note, progress, show, table
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.from_people import Calibrated
@@ -48,9 +49,12 @@ class LensOptions:
         metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Size of pictures where no file says it.", metavar="WxH")
+    cameras: str | None = option(INPUT, "Only these cameras.", metavar="A,B")
+    without: str | None = option(INPUT, "All cameras but these.", metavar="A,B")
 
     def rig(self) -> "Rig":
         """The cameras, at no place yet; InputError where nothing says how they see."""
+        from shapepose_fg.core.camera import choose
         from shapepose_fg.io.calibration import read_rig
         from shapepose_fg.io.lenses import lenses_of
 
@@ -61,6 +65,9 @@ class LensOptions:
             rig = read_rig(self.calibration, up="z", unit="m", image_size=size)
         else:
             rig = lenses_of(self.detections, self.field_of_view or [], size)
+        note(*rig.notes)
+        with naming("--cameras, --without"):
+            rig = rig.only(choose(rig.names, names_of(self.cameras), names_of(self.without) or ()))
         if len(rig) < 2:
             raise InputError(f"{self.detections}: at least 2 cameras are needed, got {len(rig)}")
         return rig

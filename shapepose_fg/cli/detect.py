@@ -109,7 +109,7 @@ def detect(
 
     known = cameras.rig() if cameras.calibration is not None else None
     loaded = network.load()
-    opened = pictures.opened(None if known is None else known.names)
+    opened = pictures.opened(cameras.chosen(pictures.names()) if known is None else known.names)
     footage, sizes = list(opened.values()), {name: each.size for name, each in opened.items()}
     rig = known or pictures_only(list(sizes), list(sizes.values()))
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
@@ -171,5 +171,4 @@ def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | N
     skeleton = Path(network.settings["network"].get("skeleton") or "")
     files |= {"--skeleton": skeleton} if skeleton.is_file() else {}
     options = {name: file.resolve() for name, file in files.items() if file is not None}
-    said = {"--up": cameras.up, "--unit": cameras.unit, "--image-size": cameras.image_size}
-    return next_reconstruct(options | said)
+    return next_reconstruct(options | cameras.said())

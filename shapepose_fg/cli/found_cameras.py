@@ -12,6 +12,7 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from shapepose_fg.calibration.synchronisation import Synchronised
     from shapepose_fg.core.camera import Rig
+    from shapepose_fg.io.detections.people import DeclaredJoints
 
 MOST_S = 60.0
 """Cameras that were started by hand began so far apart, at most, where nobody says more."""
@@ -23,7 +24,12 @@ def report_option() -> Any:
 
 
 def found_clocks(
-    detections: Path, rig: "Rig", skeleton: "str | Path | None", fps: float, most: float, frames: str | None = None
+    detections: Path,
+    rig: "Rig",
+    skeleton: "str | Path | DeclaredJoints | None",
+    fps: float,
+    most: float,
+    frames: str | None = None,
 ) -> "tuple[Synchronised, int]":
     """When cameras at known poses began, up to `most` seconds apart, and how many frames the longest has."""
     from shapepose_fg.calibration.synchronisation import synchronise

@@ -3,8 +3,8 @@
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
 import typer
 
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Axis, Rig
     from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.detection_table import DetectionTable
+    from shapepose_fg.io.detections.people import DeclaredJoints
+    from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
 INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
@@ -144,6 +146,8 @@ class CameraOptions:
     up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
     image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
+    cameras: str | None = option(INPUT, "Only these of the calibration's cameras.", metavar="A,B")
+    without: str | None = option(INPUT, "All of its cameras but these.", metavar="A,B")
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used."""
@@ -153,7 +157,22 @@ class CameraOptions:
             raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
         size = picture_size(self.image_size)
         up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
-        return read_rig(self.calibration, up=up, unit=unit, image_size=size)
+        chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
+        found = read_rig(self.calibration, up=up, unit=unit, image_size=size, **chosen)
+        note(*found.notes)
+        return found
+
+    def chosen(self, names: Sequence[str]) -> list[str]:
+        """The names of cameras that are wanted among those of videos, which no calibration names."""
+        from shapepose_fg.core.camera import choose
+
+        with naming("--cameras, --without"):
+            return choose(names, names_of(self.cameras), names_of(self.without) or ())
+
+    def said(self) -> dict[str, object]:
+        """What is said of the calibration, as options of the next command."""
+        names = ("up", "unit", "image_size", "cameras", "without")
+        return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +200,54 @@ class DetectionOptions(CameraOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Located(DetectionOptions):
+    """Cameras and detections whose places are known."""
+
+    source: "Pose2SimProject | None" = None
+    """The project that they are of."""
+
+    @property
+    def joints(self) -> "str | DeclaredJoints | None":
+        """The detector's joints as the user says, else as the project does."""
+        return self.skeleton or (None if self.source is None else self.source.joints)
+
+    def rate(self, given: "RateOptions") -> "RateOptions":
+        """When frames were taken as the user says, else as the project does."""
+        if self.source is None or given.fps is not None or given.timestamps is not None:
+            return given
+        return replace(given, fps=self.source.fps)
+
+    def given(self) -> dict[str, object]:
+        """The same for the next command, but for the calibration and what is said of it."""
+        place = {"--detections": self.detections} if self.source is None else {"--project": self.source.folder}
+        return place | {"--skeleton": self.skeleton}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectOptions(DetectionOptions):
+    """Cameras and what a 2D detector saw with them, each given or that of a Pose2Sim project."""
+
+    detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
+    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
+
+    def located(self) -> Located:
+        """Where they are; InputError where that is not said."""
+        calibration, detections, source = self.calibration, self.detections, None
+        if self.project is not None:
+            from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+
+            source = read_pose2sim_project(self.project)
+            note(*source.notes)
+            calibration, detections = calibration or source.calibration, detections or source.detections
+        if calibration is None or detections is None:
+            places = {"--calibration": calibration, "--detections": detections}
+            missing = " and ".join(name for name, place in places.items() if place is None)
+            raise InputError(f"{missing}: missing; give them, or --project with the folder of a Pose2Sim project")
+        given = {each.name: getattr(self, each.name) for each in fields(DetectionOptions)}
+        return Located(**given | {"calibration": calibration, "detections": detections, "source": source})
+
+
+@dataclass(frozen=True, kw_only=True)
 class TimeOptions:
     """When frames were taken."""
 
@@ -188,7 +255,12 @@ class TimeOptions:
     timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
 
     def read(
-        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path, own_frames: bool = False
+        self,
+        detections: Path,
+        skeleton: "str | DeclaredJoints | None",
+        rig: "Rig",
+        kept: Path,
+        own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes | None]":
         """The recording, and the times of its frames where something says them (`read_recording`); what is odd is
         said.
@@ -210,7 +282,12 @@ class RateOptions(TimeOptions):
     frames: str | None = frames_option()
 
     def part(
-        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path, own_frames: bool = False
+        self,
+        detections: Path,
+        skeleton: "str | DeclaredJoints | None",
+        rig: "Rig",
+        kept: Path,
+        own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes, range]":
         """The recording, its times, 30 frames a second where nothing says them, and the frames that are used."""
         from shapepose_fg.core.frame_times import FrameTimes
@@ -258,6 +335,11 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
     """How to go on, as a line to copy: `reconstruct` with those options that are given."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def names_of(text: str | None) -> list[str] | None:
+    """Names of cameras, apart by commas; None where no text is given."""
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def picture_size(text: str | None) -> tuple[int, int] | None:

@@ -6,10 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shapepose_fg.cli.options import DRAW, INPUT, RESULT, argument, frame_range, frames_option, grouped, option
+from shapepose_fg.cli.options import (
+    DRAW,
+    INPUT,
+    RESULT,
+    argument,
+    frame_range,
+    frames_option,
+    grouped,
+    names_of,
+    option,
+)
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
@@ -24,6 +34,7 @@ class Drawn:
     """What is drawn, and how large."""
 
     cameras: str | None = option(DRAW, "Only these cameras.", metavar="A,B")
+    without: str | None = option(DRAW, "All cameras but these.", metavar="A,B")
     stills: str | None = option(DRAW, "Still pictures of these frames instead of a video.", metavar="A,B")
     each: bool = option(DRAW, "A file for each camera at its own size, or all in one.", False, "--each/--grid")
     bodies: bool = option(DRAW, "Draw the bodies' surfaces.", False, "--bodies/--no-bodies")
@@ -51,6 +62,7 @@ def overlay(
         raise InputError(f"--width {drawn.width}: must be 160 to 7680 pixels")
     if drawn.stills is not None and frames is not None:
         raise InputError("--stills and --frames: both say which frames; give one of them")
+    from shapepose_fg.core.camera import choose
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.solved_setup import cameras_of
     from shapepose_fg.viz.overlay.frames import Overlay, write_overlay
@@ -59,6 +71,8 @@ def overlay(
     with Reconstruction.open(folder) as people:
         rig, run = cameras_of(folder), people.run
         names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
+        with naming("--without"):
+            names = choose(names, without=names_of(drawn.without) or ())
         shown = pictures.of_result(folder, run, rig, names, detections)
         if drawn.points and not people.observed:
             note(f"{folder}: there is no observations.npz, so no detections are drawn")
@@ -85,7 +99,7 @@ def overlay(
 
 def _cameras(text: str, rig: "Rig") -> list[str]:
     """The cameras that are asked for."""
-    names = [name.strip() for name in text.split(",") if name.strip()]
+    names = names_of(text) or []
     for name in names:
         if name not in rig.names:
             raise InputError(f"--cameras {text}: there is no camera {name!r}; there are {' '.join(rig.names)}")

@@ -36,12 +36,17 @@ class PictureOptions:
         names = {each.partition("=")[0].strip() for each in self.videos or [] if "=" in each}
         return [name for name in rig.names if name in names] or list(rig.names)
 
-    def opened(self, names: Sequence[str] | None = None) -> "dict[str, Footage]":
-        """The videos or pictures of every camera, looked through; without `names` of whatever is there."""
-        from shapepose_fg.io.footage.places import find_footage, names_of_footage
+    def names(self) -> list[str]:
+        """The names of the cameras whose videos or pictures are there."""
+        from shapepose_fg.io.footage.places import names_of_footage
+
+        return list(names_of_footage(self.videos or []))
+
+    def opened(self, names: Sequence[str]) -> "dict[str, Footage]":
+        """The videos or pictures of every camera, looked through."""
+        from shapepose_fg.io.footage.places import find_footage
 
         given = self.videos or []
-        names = names_of_footage(given) if names is None else names
         places, notes = find_footage(given, names)
         note(*notes)
         return {name: opened(name, path) for name, path in zip(names, places, strict=True)}

@@ -1,6 +1,6 @@
 """Where cameras stand and what they see: pinhole cameras in the world, a rig of them, their views over time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import PurePath
@@ -10,6 +10,7 @@ import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
 from shapepose_fg.core.arrays import Array, Index, Real
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
 from shapepose_fg.core.trajectory import Carried, Trajectory
 
@@ -101,11 +102,14 @@ class Camera:
         """
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
-        if not np.isfinite(cTw).all() or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE:
-            raise ValueError(f"camera {name}: the rotation must be orthonormal and finite")
-        U, _, Vt = np.linalg.svd(R)
+        if (
+            not np.isfinite(cTw).all()
+            or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE
+            or np.linalg.det(R) < 0
+        ):
+            raise ValueError(f"camera {name}: the rotation must be orthonormal with determinant 1, and finite")
         wTc = np.eye(4)
-        wTc[:3, :3] = (U @ Vt).T
+        wTc[:3, :3] = nearest_rotation(R).T
         wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
         coefficients = padded_distortion(distortion, lens)
         return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
@@ -156,6 +160,8 @@ class Rig:
     """Views that contradict each other then, and nothing says which is wrong."""
     trajectories: tuple[Trajectory, ...] = ()
     """Where the carriers of cameras that move go; two cameras on one robot share its trajectory."""
+    notes: tuple[str, ...] = field(default=(), compare=False)
+    """What a reader left out of the calibration file or took for granted, a sentence each."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
@@ -172,6 +178,25 @@ class Rig:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def only(self, names: Iterable[str]) -> "Rig":
+        """A rig with the cameras of these names, in this rig's order.
+
+        Trajectories that carry none of them are left out. ValueError where there is no such camera.
+        """
+        names = choose(self.names, only=list(names))
+        views = [view for view, name in enumerate(self.names) if name in names]
+        cameras = tuple(self.cameras[view] for view in views)
+        dark, doubted = (
+            tuple(views.index(view) for view in given if view in views) for given in (self.dark, self.doubted)
+        )
+        carriers = {camera.carrier for camera in cameras}
+        trajectories = tuple(each for each in self.trajectories if each.name in carriers)
+        return replace(self, cameras=cameras, dark=dark, doubted=doubted, trajectories=trajectories)
+
+    def without(self, names: Iterable[str]) -> "Rig":
+        """A rig with all cameras but those of these names; ValueError where there is no such camera."""
+        return self.only(choose(self.names, without=list(names)))
 
     @property
     def moves(self) -> bool:
@@ -263,6 +288,21 @@ class Rig:
         """Normalised image coordinates (D, 2) of undistorted pixels `xy` (D, 2) seen in `view` (D,)."""
         K_inverse = np.linalg.inv(self.K)[view]
         return np.einsum("dij,dj->di", K_inverse[:, :2, :2], xy) + K_inverse[:, :2, 2]
+
+
+def choose(known: Sequence[str], only: Sequence[str] | None = None, without: Sequence[str] = ()) -> list[str]:
+    """The names of cameras among those `known` that are in `only` (None: all) and not in `without`.
+
+    ValueError that lists the known ones where a name is not among them, or no camera remains.
+    """
+    for name in [*(only or []), *without]:
+        if name not in known:
+            listed = " ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
+            raise ValueError(f"there is no camera {name[:80]!r}; there are {listed}")
+    chosen = [name for name in known if (only is None or name in only) and name not in without]
+    if len(chosen) == 0 and len(known) > 0:
+        raise ValueError(f"no camera is chosen; give some of {' '.join(known[:12])}")
+    return chosen
 
 
 @dataclass(frozen=True)

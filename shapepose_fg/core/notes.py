@@ -45,6 +45,7 @@ class _Kept(BaseModel):
     thinned_frames: _Frames
     repeated_pictures: _Frames
     problems: list[Problem]
+    factors: dict[str, tuple[_Count, _Count]] = {}
 
 
 @dataclass
@@ -67,6 +68,8 @@ class Notes:
     """The frames in which a camera, by its name, showed the picture before once more."""
     problems: list[Problem] = field(default_factory=list)
     """What could not be solved."""
+    factors: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """How many factors each function of the user's made, and how many of them were inactive."""
 
     def add(self, other: "Notes") -> None:
         """Take in the notes of what comes next."""
@@ -80,6 +83,9 @@ class Notes:
             before = self.evidence.get(track, [0.0, 0])
             self.evidence[track] = [before[0] + evidence, before[1] + rows]
         self.problems += other.problems
+        for name, counts in other.factors.items():
+            before = self.factors.get(name, (0, 0))
+            self.factors[name] = before[0] + counts[0], before[1] + counts[1]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values; `from_dict` reads them back."""

@@ -208,53 +208,129 @@ BODY_25 = Skeleton(
 
 _MIDDLES = {"Neck": ("RShoulder", "LShoulder"), MID_HIP: ("RHip", "LHip")}
 """How BODY_25's own middle joints were labelled: a skeleton without them has them made so."""
+_GROWN_FROM = dict(zip(BODY_25.joints, (BODY_25.joints[parent] for parent in BODY_25.parents), strict=True)) | {
+    "Head": "Neck", "head": "Neck", "neck": "Neck", "left_collar": "Neck", "right_collar": "Neck",
+    "spine1": MID_HIP, "spine2": MID_HIP, "spine3": MID_HIP,
+    "left_hand": "LWrist", "right_hand": "RWrist", "left_foot": "LAnkle", "right_foot": "RAnkle",
+}  # fmt: skip
+"""The joint that each point of the body hangs on, where the skeleton has it; else what that one hangs on."""
 
 
-def _like_body_25(name: str, keypoints: str, passed_over: int = 0) -> Skeleton:
-    """A skeleton of joints of BODY_25 (and HALPE's top of the head), with the limbs whose ends it has."""
-    given = keypoints.split()
+def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> Skeleton:
+    """The skeleton of a detector whose `keypoints` are points of the body: of BODY_25, HALPE's top of the head
+    (`Head`), or SMPL_24's `head`, `neck`, spine, collars, hands and feet.
+
+    "" is a keypoint that is passed over, and so are `passed_over` more at the end. Neck and mid-hip are made as
+    middles where they are not given. ValueError where shoulders or hips are missing.
+    """
+    given = [point for point in keypoints if point]
+    lacking = [each for ends in _MIDDLES.values() for each in ends if each not in given]
+    if lacking:
+        problem = f"there is no {' and no '.join(lacking)}, and a person needs both shoulders and both hips"
+        raise ValueError(f"{name}: {problem}")
     middles = {joint: ends for joint, ends in _MIDDLES.items() if joint not in given}
-    joints = (*given, *middles)
-    names = BODY_25.joints
+    joints, names = (*given, *middles), BODY_25.joints
+    parents = dict[str, str]()
+    for joint in joints:
+        parent = _GROWN_FROM[joint]
+        while parent not in joints:
+            parent = _GROWN_FROM[parent]
+        if joint != MID_HIP:
+            parents[joint] = parent
     limbs = [(names[a], names[b]) for a, b in BODY_25.limbs if names[a] in joints and names[b] in joints]
-    parents = {joint: names[parent] for joint, parent in zip(names, BODY_25.parents, strict=True) if parent >= 0}
-    if "Head" in given:
-        limbs, parents = [*limbs, ("Neck", "Head")], parents | {"Head": "Neck"}
+    limbs += [
+        (parent, joint)
+        for joint, parent in parents.items()
+        if (parent, joint) not in limbs and (joint, parent) not in limbs
+    ]
+    sides = [(joint, joint.replace("R", "L", 1).replace("right_", "left_")) for joint in joints]
     return Skeleton.of(
         name,
-        given,
+        keypoints,
         limbs,
         anchor=MID_HIP,
-        mirror=[(joint, "L" + joint[1:]) for joint in joints if joint[0] == "R"],
-        core=[names[joint] for joint in BODY_25.core],
+        mirror=[(right, left) for right, left in sides if right != left and left in joints],
+        core=[names[joint] for joint in BODY_25.core if names[joint] in joints],
         middles=middles,
-        parents={joint: parent for joint, parent in parents.items() if joint in joints},
+        parents=parents,
         passed_over=passed_over,
     )
+
+
+def _layout(name: str, keypoints: str, passed_over: int = 0) -> Skeleton:
+    """A skeleton from its usual notation; - is a keypoint that is passed over."""
+    return body_skeleton(name, ["" if point == "-" else point for point in keypoints.split()], passed_over)
 
 
 _COCO = (
     "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
 )
 _HALPE = f"{_COCO} Head Neck MidHip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel"
+_FEET = "LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
+_ARMS = "RShoulder RElbow RWrist LShoulder LElbow LWrist"
+_LEGS = "RHip RKnee RAnkle LHip LKnee LAnkle"
 
-COCO_17 = _like_body_25("COCO_17", _COCO)
+COCO_17 = _layout("COCO_17", _COCO)
 """COCO's 17 keypoints; neck and mid-hip are made."""
-COCO_18 = _like_body_25(
-    "COCO_18",
-    "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist RHip RKnee RAnkle LHip LKnee LAnkle "
-    "REye LEye REar LEar",
-)
+COCO_18 = _layout("COCO_18", f"Nose Neck {_ARMS} {_LEGS} REye LEye REar LEar")
 """OpenPose's COCO model; mid-hip is made."""
-HALPE_26 = _like_body_25("HALPE_26", _HALPE)
+HALPE_26 = _layout("HALPE_26", _HALPE)
 """HALPE's body with feet, AlphaPose's and RTMPose's."""
-HALPE_136 = _like_body_25("HALPE_136", _HALPE, passed_over=110)
+HALPE_136 = _layout("HALPE_136", _HALPE, passed_over=110)
 """HALPE's whole body; face and hands are passed over."""
-COCO_133 = _like_body_25("COCO_133", f"{_COCO} LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel", passed_over=110)
+COCO_133 = _layout("COCO_133", f"{_COCO} {_FEET}", passed_over=110)
 """COCO-WholeBody; neck and mid-hip are made, face and hands are passed over."""
+BODY_25B = _layout("BODY_25B", f"{_COCO} head Head {_FEET}")
+"""OpenPose's BODY_25B: COCO's joints, MPII's upper neck and top of the head, feet."""
 
-SKELETONS = {each.name: each for each in (BODY_25, COCO_17, COCO_18, HALPE_26, COCO_133, HALPE_136)}
-"""The skeletons that files of detections are known to have; they differ in the number of keypoints."""
+SKELETONS = {
+    each.name: each
+    for each in (
+        BODY_25,
+        COCO_17,
+        COCO_18,
+        HALPE_26,
+        COCO_133,
+        HALPE_136,
+        BODY_25B,
+        _layout("BODY_135", f"{_COCO} head Head {_FEET}", passed_over=110),
+        _layout("COCO_23", f"{_COCO} {_FEET}"),
+        _layout("HALPE_68", _HALPE, passed_over=42),
+        _layout(
+            "H36M_17",
+            "MidHip RHip RKnee RAnkle LHip LKnee LAnkle spine2 Neck head Head LShoulder LElbow LWrist"
+            " RShoulder RElbow RWrist",
+        ),
+        _layout("POSETRACK_17", f"Nose head Head {_COCO.split(maxsplit=3)[3]}"),
+        _layout("MPI_INF_3DHP_17", f"Head Neck {_ARMS} {_LEGS} MidHip spine2 head"),
+        _layout(
+            "MPII_16",
+            "RAnkle RKnee RHip LHip LKnee LAnkle MidHip Neck head Head RWrist RElbow RShoulder LShoulder LElbow"
+            " LWrist",
+        ),
+        _layout("MPI_15", f"Head Neck {_ARMS} {_LEGS} spine3"),
+        _layout(
+            "JHMDB_15",
+            "Neck spine1 - RShoulder LShoulder RHip LHip RElbow LElbow RKnee LKnee RWrist LWrist RAnkle LAnkle",
+        ),
+        _layout(
+            "CROWDPOSE_14",
+            "LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle Head Neck",
+        ),
+        _layout("AIC_14", f"{_ARMS} {_LEGS} Head Neck"),
+        _layout(
+            "LSP_14",
+            "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck Head",
+        ),
+        _layout(
+            "BLAZEPOSE_33",
+            "Nose - LEye - - REye - LEar REar - - LShoulder RShoulder LElbow RElbow LWrist RWrist"
+            " - - - - - - LHip RHip LKnee RKnee LAnkle RAnkle LHeel RHeel LBigToe RBigToe",
+        ),
+    )
+}
+"""The skeletons that files of detections are known to have; of several with one number of keypoints the most usual
+first."""
 
 SMPL_24 = tuple(
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot "

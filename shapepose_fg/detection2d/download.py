@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import SMALL, read_bytes, read_text, user_cache, write_content
-from shapepose_fg.detection2d.onnx_network import MOST_BYTES
+from shapepose_fg.detection2d.onnx_file import MOST_BYTES
 
 BASES = (
     "https://download.openmmlab.com/mmpose/v1/projects/rtmposev1/onnx_sdk",

@@ -1,5 +1,7 @@
 """The X step: people's joints, solved with what the views and the body say of them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
@@ -40,30 +42,47 @@ def solve_between(
 
 
 def solve_joints(
+    parts: Sequence[tuple[WindowGraph, slice]],
+    evidence: ViewEvidence,
+    of_body: Message,
+    config: EstimatorConfig,
+    near: Array | None = None,
+) -> None:
+    """Solve people, each with the rows that are their part of those of views and body; `positions` has the result.
+
+    People whom factors tie must be among them all. Of frames by themselves the solver may start `near` (R, J, 3)
+    what `solve_between` came to.
+    """
+    for person, part in parts:
+        _prepare(person, evidence, of_body, part, config, None if near is None else near[part])
+    for person, _ in parts:
+        if person is person.ties.people[0]:
+            person.optimise()
+
+
+def _prepare(
     person: WindowGraph,
     evidence: ViewEvidence,
     of_body: Message,
     part: slice,
     config: EstimatorConfig,
-    near: Array | None = None,
-) -> Array:
-    """X (T, J, 3) of one person, metres, whose rows are a `part` of those of views and body; NaN where unknown.
-
-    Of a frame by itself the solver may start `near` (1, J, 3) what `solve_between` came to.
-    """
+    near: Array | None,
+) -> None:
+    """Make the problem of one person."""
     views, body = evidence.message.rows(part), of_body.rows(part)
     inlier, sigma_m, points = evidence.inlier[part], evidence.sigma_m[part], evidence.points[part]
     initial = _start(points, sigma_m, body, config)
     if not person.temporal:
         used = inlier & np.isfinite(initial[..., :1])
-        return person.solve(used, views, body, initial if near is None else near)
+        person.prepare(used, views, body, initial if near is None else near)
+        return
     initial = interpolated(np.where(np.isfinite(points), points, initial), person.times_s)
     # X_0 alone is no evidence: a joint that nobody says anything of has nothing that determines it.
     mentioned = (inlier.any(axis=-1) | body.known).any(axis=0) | person.touched
     initial[:, ~mentioned] = np.nan
     lost = sigma_m > LOST_M
     feet = feet_of(config.joints if config.motion.contact else ())
-    return person.solve(inlier, views, body, initial, lost, feet)
+    person.prepare(inlier, views, body, initial, lost, feet)
 
 
 def _start(points: Array, sigma_m: Array, body: Message, config: EstimatorConfig) -> Array:

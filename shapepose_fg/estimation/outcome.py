@@ -1,5 +1,8 @@
 """What comes of a solved window: errors that last, doubts, how each joint is known, and what went wrong."""
 
+from collections import Counter
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +29,7 @@ from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, li
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
-from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
+from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
 
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
@@ -83,14 +86,25 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         fit=fit,
         status=status,
         problems=wrong,
-        people=tuple(
+        people=tied([
             PersonGraph(
                 person, X[person.rows], covariance[person.rows], fit.rows(person.rows), state.joints[person.rows],
                 solved[person.rows], state.motion.views, state.of_body.rows(person.rows),
             )
             for person in people
-        ),
+        ]),
+        factors=factors_of(people),
     )  # fmt: skip
+
+
+def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
+    """How many factors each function of the user's made, and how many were inactive in the last problem."""
+    ties = {id(person.ties): person.ties for person in people}.values()
+    made, active = (
+        Counter(factor.name for each in ties for factor in of(each))
+        for of in (lambda each: each.factors, lambda each: each.active)
+    )
+    return {name: (count, count - active[name]) for name, count in made.items()}
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:

@@ -13,7 +13,7 @@ from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import Message, ViewEvidence, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
+from shapepose_fg.estimation.window_graph import FactorFunction, WindowGraph, add_factors
 
 
 @dataclass
@@ -59,17 +59,17 @@ class State:
         fitter: BodyFitter,
         config: EstimatorConfig,
         motion: MotionModel,
-        extra_factors: ExtraFactors | None,
+        extra_factors: Sequence[FactorFunction] = (),
     ) -> "State":
         """X_0, the observations' sigmas there, and a graph for everybody, with the user's factors in it."""
         first = first_places(observations, views, fitter, config)
         sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
         people = list[WindowGraph]()
         for rows in window_rows(observations):
-            person = WindowGraph(observations.rows(rows), sigmas[rows], views.rows(rows), config, motion, rows)
-            for factor in extra_factors(person, person.keys) if extra_factors is not None else ():
-                person.add(factor)
-            people.append(person)
+            given = observations.rows(rows), sigmas[rows], views.rows(rows)
+            people.append(WindowGraph(*given, config, motion, rows, first[rows]))
+        if len(extra_factors) > 0:
+            add_factors(people, extra_factors)
         N, J, V = sigmas.shape
         of_views, of_body = (Message(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2))
         return cls(

@@ -21,10 +21,11 @@ def state_covariances(graphs: Sequence[WindowGraph]) -> list[tuple[Array, Array]
     NaN where a variable is not in the problem, and where the problem leaves it undetermined
     (`joint_chains.UNDETERMINED_M`): singular systems raise no error.
     """
-    return [_of_graph(graph) for graph in graphs]
+    asked = dict[int, gtsam.Marginals]()
+    return [_of_graph(graph, asked) for graph in graphs]
 
 
-def _of_graph(graph: WindowGraph) -> tuple[Array, Array]:
+def _of_graph(graph: WindowGraph, known: dict[int, gtsam.Marginals]) -> tuple[Array, Array]:
     of_positions, of_velocities = (np.full((*graph.keys.shape, 3, 3), np.nan) for _ in range(2))
     if graph.failure:
         return of_positions, of_velocities
@@ -34,32 +35,35 @@ def _of_graph(graph: WindowGraph) -> tuple[Array, Array]:
         of_positions[:, chains.joints], of_velocities[:, chains.joints] = chains.covariances(points)
     if asked.any():
         asked_of = [graph.keys[asked]] + ([graph.velocity_keys[asked]] if graph.temporal else [])
-        for into, found in zip((of_positions, of_velocities), _by_gtsam(graph, np.stack(asked_of)), strict=False):
+        for into, found in zip(
+            (of_positions, of_velocities), _by_gtsam(graph, np.stack(asked_of), known), strict=False
+        ):
             into[asked] = found
     return of_positions, of_velocities
 
 
-def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64]) -> Array:
-    """Marginal covariance (K, D, 3, 3) of `keys` (K, D), one variable after the other, of whatever graph."""
-    try:
-        found = _marginals(graph.graph, graph, keys)
-    except RuntimeError:
+def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64], known: dict[int, gtsam.Marginals]) -> Array:
+    """Marginal covariance (K, D, 3, 3) of `keys` (K, D), one variable after the other, of whatever graph.
+
+    People who are tied have one graph, which is factorised once: `known` keeps it.
+    """
+    for make in (lambda: graph.graph, lambda: _damped(graph)):
         try:
-            found = _marginals(_damped(graph), graph, keys)
+            marginals = known.get(id(graph.ties)) or gtsam.Marginals(make(), graph.values)
+            found = np.array([[marginals.marginalCovariance(key) for key in row] for row in keys.tolist()])
         except RuntimeError:
-            found = np.full((*keys.shape, 3, 3), np.nan)
-    return determined(found)
-
-
-def _marginals(factors: gtsam.NonlinearFactorGraph, graph: WindowGraph, keys: NDArray[np.int64]) -> Array:
-    marginals = gtsam.Marginals(factors, graph.values)
-    return np.array([[marginals.marginalCovariance(key) for key in row] for row in keys.tolist()])
+            known.pop(id(graph.ties), None)
+            continue
+        known[id(graph.ties)] = marginals
+        return determined(found)
+    return np.full((*keys.shape, 3, 3), np.nan)
 
 
 def _damped(graph: WindowGraph) -> gtsam.NonlinearFactorGraph:
     """The problem with a prior of 100 m on all variables: what is then wider than 10 m is not determined."""
     damped = gtsam.NonlinearFactorGraph(graph.graph)
     wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
-    for key in graph.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-        damped.push_back(gtsam.PriorFactorPoint3(key, graph.values.atPoint3(key), wide))
+    for key in (key for person in graph.ties.people for key in person.states.ravel().tolist()):
+        if graph.values.exists(key):
+            damped.push_back(gtsam.PriorFactorPoint3(key, graph.values.atPoint3(key), wide))
     return damped

@@ -4,9 +4,10 @@ Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Thet
 more than one frame, joints have velocities too, and motion factors between their states.
 """
 
-import re
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -16,6 +17,7 @@ from factors import (
     KernelName,
     body_prior_factors,
     diagonal,
+    format_key,
     lasting_prior_factors,
     make_camera,
     moving_projection_factors,
@@ -29,12 +31,14 @@ from factors import (
 )
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
-from shapepose_fg.estimation.linearisation import Message, symmetric_roots
+from shapepose_fg.estimation.linearisation import Message
+from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import leads
 
@@ -42,10 +46,62 @@ _OF_VIEWS, _OF_BODY = 0, 1
 """Sources of messages about joints, for the keys of their offsets."""
 
 
+@dataclass(frozen=True)
+class UserFactor:
+    """A factor of the user's own."""
+
+    factor: gtsam.NonlinearFactor
+    keys: tuple[int, ...]
+    """Its variables: joints' states of people of the window, and variables of the user's own."""
+    name: str
+    """The name of the function that made it."""
+
+
+@dataclass
+class Ties:
+    """What factors of the user's own tie together, solved as one graph: people of a window, and further variables.
+
+    A person without such factors is alone.
+    """
+
+    people: list["WindowGraph"]
+    """Whose graphs are one."""
+    factors: list[UserFactor] = field(default_factory=list)
+    """The user's own factors on them."""
+    start: gtsam.Values = field(default_factory=gtsam.Values)
+    """Where variables of the user's own start."""
+    parts: list[frozenset[tuple[int, int]]] = field(default_factory=list)
+    """Variables that are tied to each other, sets without overlap: (track, joint), or (-1, key) of the user's."""
+    active: list[UserFactor] = field(default_factory=list)
+    """Factors whose variables are all in the last problem; the others are inactive in it."""
+
+    def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
+        """Note that a factor joins these variables."""
+        joined = frozenset(nodes)
+        apart = [each for each in self.parts if not each & joined]
+        self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]
+
+    def take_in(self, other: "Ties") -> None:
+        """Merge with the ties of other people, who share these from now on."""
+        if other is self:
+            return
+        for key in other.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+            if self.start.exists(key):
+                raise ValueError(f"the variable {format_key(key)} of your own has two starts")
+        self.start.insert(other.start)
+        self.people += other.people
+        self.factors += other.factors
+        for part in other.parts:
+            self.tie(part)
+        for person in other.people:
+            person.ties = self
+
+
 class WindowGraph:
     """The graph of one person in T frames; T = 1 is a frame by itself, without velocities.
 
-    Joints are not tied to each other but by factors of your own, which keeps marginal covariances cheap.
+    Joints are not tied to each other, and people not to people, but by factors of your own, which keeps marginal
+    covariances cheap. People who are tied (`ties`) are one graph, and `graph` and `values` are that of them all.
 
     **Correlated errors.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess. In
     a window of several frames therefore
@@ -67,11 +123,13 @@ class WindowGraph:
         config: EstimatorConfig,
         motion: MotionModel,
         rows: Index | None = None,
+        first: Array | None = None,
     ) -> None:
         """Make the factors of all observations: T rows of one person, frames rising.
 
         `sigmas_px` (T, J, V), 0 where the view did not see the joint; `views` are their cameras; `rows` (T,) says
-        which rows of a larger problem they are.
+        which rows of a larger problem they are, `first` (T, J, 3) where joints are
+        before anything is solved.
         """
         T, J, _ = sigmas_px.shape
         if np.any(np.diff(observations.frame) <= 0):
@@ -103,8 +161,13 @@ class WindowGraph:
         self._offset_keys = np.stack(
             [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
-        self._added: list[tuple[gtsam.NonlinearFactor, frozenset[int]]] = []
-        self._tied: list[frozenset[int]] = []
+        self.first: Array = np.full((T, J, 3), np.nan) if first is None else first
+        """(T, J, 3) where joints are before anything is solved, to within decimetres, metres; NaN where unknown.
+        Functions may choose by it what their factors join."""
+        self.people: list[WindowGraph] = [self]
+        """Everybody in the window, this person too; frame by frame, in the frame."""
+        self.ties = Ties([self])
+        """The people to whom factors of your own tie this one, and these factors."""
         self.touched: Mask = np.zeros(J, dtype=bool)
         """(J,) joints on which there is a factor of your own."""
         self.present: Mask = np.zeros((T, J), dtype=bool)
@@ -145,28 +208,78 @@ class WindowGraph:
         """Whether there is more than one frame: then joints have velocities and motion factors."""
         return len(self) > 1
 
-    def add(self, factor: gtsam.NonlinearFactor) -> None:
-        """Append a factor of your own on any of `state_keys`; it stays through all alternations.
+    @property
+    def partners(self) -> "list[WindowGraph]":
+        """Those of the window's people who come after this one: so each pair of people comes once."""
+        return self.people[next(n for n, each in enumerate(self.people) if each is self) + 1 :]
 
-        While one of its variables is not in the problem, because neither views nor body nor motion place it, it
-        rests. ValueError if it is on anything but this window's keys.
+    def shared(self, other: "WindowGraph") -> tuple[Index, Index]:
+        """Rows (S,) of this person, and those of another, of the frames in which both are."""
+        _, mine, theirs = np.intersect1d(self.frames, other.frames, assume_unique=True, return_indices=True)
+        return mine, theirs
+
+    def add(self, item: gtsam.NonlinearFactor | gtsam.Values, name: str = "") -> None:
+        """Append a factor of your own; it stays through all alternations. Or where variables of your own start.
+
+        A factor may be on `state_keys` of this person and of all others of the window (`people`), who are solved
+        together then, and on variables of your own that `Values` gave before. While one of its variables is not in
+        the problem, because neither views nor body nor motion place it, it is inactive, and `run` counts it under
+        the `name` of what made it. ValueError if it is on any other key, and for a start that is a joint's.
         """
-        own = set(self.state_keys.ravel().tolist())
-        keys = set(factor.keys())
-        if not keys <= own:
-            raise ValueError(
-                "a factor of your own must be on the window's own keys only (WindowGraph.keys and velocity_keys)"
-            )
-        self._added.append((factor, frozenset(keys)))
-        joined = frozenset(split_key(key).joint for key in keys)
-        self.touched[list(joined)] = True
-        apart = [each for each in self._tied if not each & joined]
-        self._tied = [*apart, joined.union(*(each for each in self._tied if each & joined))]
+        if isinstance(item, gtsam.Values):
+            self._add_start(item)
+            return
+        nodes, touched = list[tuple[int, int]](), list[tuple[WindowGraph, int]]()
+        whose = f"a factor of your own{f' ({name})' if name else ''}"
+        for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+            person = next((each for each in (self, *self.people) if key in each._own), None)
+            if person is not None:
+                joint = split_key(key).joint
+                touched.append((person, joint))
+                nodes.append((person.track, joint))
+                continue
+            holder = self._holder(key)
+            if holder is None:
+                raise ValueError(
+                    f"{whose} is on {format_key(key)}, which is not in this window: use keys of its people (`keys`"
+                    " and `velocity_keys` of `window.people`), who are not in every frame, or yield first"
+                    " gtsam.Values with the start of a variable of your own"
+                )
+            nodes.append((-1, key))
+            self.ties.take_in(holder)
+        for person, joint in touched:
+            self.ties.take_in(person.ties)
+            person.touched[joint] = True
+        if len(touched) == 0 and len(nodes) == 0:
+            raise ValueError(f"{whose} has no variable")
+        self.ties.factors.append(UserFactor(item, tuple(item.keys()), name))
+        self.ties.tie(nodes)
+
+    def _add_start(self, start: gtsam.Values) -> None:
+        """Where variables of the user's own start; one that has a start keeps it."""
+        new = gtsam.Values(start)
+        for key in start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+            if any(key in person._own for person in self.people):
+                raise ValueError(
+                    f"{format_key(key)} is a joint's: variables of your own are symbols (gtsam.symbol)"
+                )
+            if self._holder(key) is not None:
+                new.erase(key)
+        self.ties.start.insert(new)
+
+    def _holder(self, key: int) -> Ties | None:
+        """The ties that a variable of the user's own is in."""
+        return next((each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None)
+
+    @cached_property
+    def _own(self) -> frozenset[int]:
+        return frozenset(self.state_keys.ravel().tolist())
 
     @property
     def coupled(self) -> list[frozenset[int]]:
-        """Joints that factors of your own tie to each other: sets of two or more, without overlap."""
-        return [each for each in self._tied if len(each) > 1]
+        """The person's joints that factors of your own tie to each other: sets of two or more, without overlap."""
+        mine = [frozenset(joint for track, joint in part if track == self.track) for part in self.ties.parts]
+        return [each for each in mine if len(each) > 1]
 
     @property
     def with_offsets(self) -> Mask:
@@ -182,7 +295,21 @@ class WindowGraph:
         lost: Mask | None = None,
         feet: Index | None = None,
     ) -> Array:
-        """Minimise over the joints, from `initial` (T, J, 3) metres; returns (T, J, 3).
+        """`prepare` and `optimise`, of a person who is alone; returns joints (T, J, 3), metres."""
+        self.prepare(inlier, views, body, initial, lost, feet)
+        self.optimise()
+        return self.positions
+
+    def prepare(
+        self,
+        inlier: Mask,
+        views: Message,
+        body: Message,
+        initial: Array,
+        lost: Mask | None = None,
+        feet: Index | None = None,
+    ) -> None:
+        """Make the problem of this person's joints, from `initial` (T, J, 3) metres on.
 
         `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
         `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
@@ -190,7 +317,7 @@ class WindowGraph:
         seen. `feet` (F,): joints that may stand (`contact.walking`).
 
         In a window of several frames each joint is solved by itself first (`joint_chains`), without factors of
-        your own, and GTSAM starts there. It takes the last step, or as many as Levenberg-Marquardt needs.
+        your own, and GTSAM starts there.
         """
         self.failure, self.chains = "", []
         self.present = np.asarray(np.isfinite(initial).all(axis=2))
@@ -216,12 +343,45 @@ class WindowGraph:
             self._add(self._lasting(said, source))
         if self.temporal:
             self._add(self._moving(problem))
-        exists = self.values.exists
-        self._add(factor for factor, keys in self._added if all(map(exists, keys)))
-        if not self.values.empty():
-            self._optimise()
-        self.positions, self.velocity = self._points()
-        return self.positions
+
+    def optimise(self) -> None:
+        """Minimise over the joints of this person and of all who are tied to them, who must be prepared, too.
+
+        GTSAM takes one last step, or as many as Levenberg-Marquardt needs. `graph` and `values` of all of them are
+        those of the whole problem then.
+        """
+        ties, people = self.ties, self.ties.people
+        graph, values = self.graph, self.values
+        if len(people) > 1:
+            graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            for person in people:
+                graph.push_back(person.graph)
+                values.insert(person.values)
+        there = values.exists
+        ties.active = [
+            each for each in ties.factors if all(there(key) or ties.start.exists(key) for key in each.keys)
+        ]
+        for each in ties.active:
+            graph.add(each.factor)
+        if not ties.start.empty():
+            values = gtsam.Values(values)
+            idle = gtsam.Values(ties.start)
+            used = {key for each in ties.active for key in each.keys}
+            for key in ties.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+                if key not in used:
+                    idle.erase(key)
+            values.insert(idle)
+        failure = ""
+        if not values.empty():
+            try:
+                values = self._minimum(graph, values)
+            except NotFinite as error:
+                failure = str(error)
+            except RuntimeError as error:
+                failure = f"the solver failed: its system is singular{_where(error, people)}"
+        for person in people:
+            person.graph, person.values, person.failure = graph, values, failure
+            person.positions, person.velocity = person._points()
 
     def _problem(self, inlier: Mask, views: Message, body: Message, near: Array, lost: Mask | None) -> Problem:
         """What `solve` is asked; how far joints may turn goes by their speed `near` where they are."""
@@ -253,48 +413,22 @@ class WindowGraph:
             standing=np.full(density.shape, np.inf),
         )
 
-    def _optimise(self) -> None:
-        """Solve from `values`; where that fails they stay as they are, and `failure` says why."""
-        # Joint by joint, each from frame to frame: what is eliminated so fills nothing in.
-        by_joint = self.states.swapaxes(0, 1)
-        ordering = gtsam.Ordering(by_joint[self._there.swapaxes(0, 1)].tolist())
-        try:
-            if self.touched.any() or not self._confirmed(ordering):
-                self._descend(None if self.coupled else ordering)
-        except RuntimeError as error:
-            key, where = undetermined_key(error), ""
-            if key is not None and key in set(self.states.ravel().tolist()):
-                joint = split_key(key)
-                where = f" near {self._names[joint.joint]} in frame {joint.frame}: nothing determines it there"
-            self.failure = f"the solver failed: its system is singular{where}"
+    def _minimum(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+        """The solution from `values` on; RuntimeError where there is none."""
+        if len(self.ties.factors) > 0:
+            chains = all(len(part) == 1 for part in self.ties.parts) and len(self.ties.people) == 1
+            over_time = any(person.temporal for person in self.ties.people)
+            own = not self.ties.start.empty()
+            return descend(
+                graph, values, self._ordering() if chains and not own else None, self.config, over_time=over_time
+            )
+        ordering = self._ordering()
+        found = confirmed(graph, values, ordering, self.config)
+        return descend(graph, values, ordering, self.config, over_time=self.temporal) if found is None else found
 
-    def _confirmed(self, ordering: gtsam.Ordering) -> bool:
-        """Whether the error falls by no more than the tolerance in a step by Gauss and Newton; if so, take it."""
-        linear = self.graph.linearize(self.values)
-        try:
-            solved = linear.eliminateSequential(ordering)
-            step = solved.optimize()
-        except RuntimeError:  # a joint is not determined: damped, the others are solved all the same
-            return False
-        nowhere = gtsam.VectorValues.Zero(step)
-        # What is eliminated has no error left at the step: what it has without is what the step takes away.
-        settled = solved.error(nowhere) <= self.config.tolerance * linear.error(nowhere)
-        if settled:
-            self.values = self.values.retract(step)
-        return settled
-
-    def _descend(self, ordering: gtsam.Ordering | None) -> None:
-        """Levenberg-Marquardt."""
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(self.config.max_iterations)
-        # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
-        parameters.setRelativeErrorTol(self.config.tolerance * (10.0 if self.temporal else 1.0))
-        if ordering is not None:
-            parameters.setOrdering(ordering)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, parameters)
-        self.values = optimizer.optimize()
-        if not np.isfinite(optimizer.error()):
-            self.failure = "the solver left the finite numbers"
+    def _ordering(self) -> gtsam.Ordering:
+        """Joint by joint, each from frame to frame: what is eliminated so fills nothing in."""
+        return gtsam.Ordering(self.states.swapaxes(0, 1)[self._there.swapaxes(0, 1)].tolist())
 
     def _add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         deque(map(self.graph.add, factors), maxlen=0)
@@ -336,7 +470,7 @@ class WindowGraph:
         if not said.where.any():
             return []
         known, keys = said.message.known & said.where, self._offset_keys[source]
-        roots = symmetric_roots(said.message.information[known] / said.scale)
+        roots = symmetric_root(said.message.information[known] / said.scale)
         xyz, share = said.message.xyz[known], said.errors.white_share
         factors = lasting_prior_factors(self.keys[known], keys[known], xyz, roots, share)
         # An offset in every frame between two, so that a joint's states are a chain.
@@ -366,28 +500,65 @@ class WindowGraph:
         deque(map(self.values.insert, self.states[self._there].tolist(), states[self._there]), maxlen=0)
 
     def _points(self) -> tuple[Array, Array]:
-        """Positions and velocities (T, J, 3) of the last solution. Values are sorted as keys are: by joint, then
-        frame.
-        """
-        present = self.present.T
-        positions, speeds = (np.full((*present.shape, 3), np.nan) for _ in range(2))
-        count = int(present.sum())
-        if count > 0:
-            points = gtsam.utilities.extractPoint3(self.values)
-            positions[present] = points[:count]
-            if self.temporal:
-                speeds[present] = points[count : 2 * count]
-        return positions.swapaxes(0, 1), speeds.swapaxes(0, 1)
+        """Positions and velocities (T, J, 3) of the last solution."""
+        positions, speeds = (np.full((*self.present.shape, 3), np.nan) for _ in range(2))
+        if not self.present.any():
+            return positions, speeds
+        kinds = [(positions, self.keys), *([(speeds, self.velocity_keys)] if self.temporal else [])]
+        if len(self.ties.people) > 1 or not self.ties.start.empty():
+            for into, keys in kinds:
+                into[self.present] = [self.values.atPoint3(key) for key in keys[self.present].tolist()]
+            return positions, speeds
+        # Values are sorted as keys are: by kind, joint, then frame.
+        points, count = gtsam.utilities.extractPoint3(self.values), int(self.present.sum())
+        for n, (into, _) in enumerate(kinds):
+            into.swapaxes(0, 1)[self.present.T] = points[n * count : (n + 1) * count]
+        return positions, speeds
 
 
-ExtraFactors = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
-"""Your own factors for a person's window, made from its keys (T, J)."""
+FactorFunction = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor | gtsam.Values]]
+"""Your own factors for a person's window, made from its keys (T, J), and from those of `window.people`."""
+ExtraFactors = FactorFunction | Sequence[FactorFunction]
+"""One such function or several."""
 
 
-def undetermined_key(error: RuntimeError) -> int | None:
-    """The variable near which GTSAM found a system without a solution; None where the error is another."""
-    found = re.search(r"[Ii]ndeterminate? linear system.*?variable\s+(\d+)", str(error), re.DOTALL)
-    return None if found is None else int(found[1])
+def add_factors(people: Sequence[WindowGraph], functions: Sequence[FactorFunction]) -> None:
+    """Add the factors of the user's functions to the people of a window, who are those of one frame each where all
+    have a single frame.
+    """
+    alone = all(len(person) == 1 for person in people)
+    together: dict[int, list[WindowGraph]] = {}
+    for person in people:
+        together.setdefault(int(person.frames[0]) if alone else 0, []).append(person)
+    for person in people:
+        person.people = together[int(person.frames[0]) if alone else 0]
+    for function in functions:
+        for person in people:
+            for item in function(person, person.keys):
+                person.add(item, name_of(function))
+
+
+def functions_of(given: ExtraFactors | None) -> tuple[FactorFunction, ...]:
+    """One function of the user's, several, or none, as several."""
+    if given is None:
+        return ()
+    return (given,) if callable(given) else tuple(given)
+
+
+def name_of(function: FactorFunction) -> str:
+    """What a function of the user's is called."""
+    inner = getattr(function, "func", function)  # of functools.partial
+    return str(getattr(inner, "__name__", type(inner).__name__))
+
+
+def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
+    """Of which joint a singular system leaves open."""
+    key = undetermined_key(error)
+    if key is None or all(key not in set(person.states.ravel().tolist()) for person in people):
+        return ""
+    joint = split_key(key)
+    whose = f" of person {joint.person}" if len(people) > 1 else ""
+    return f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: nothing determines it there"
 
 
 def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:

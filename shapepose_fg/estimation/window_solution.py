@@ -12,15 +12,17 @@ from factors import lasting_difference_factors, offset_factors, offset_keys, rep
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.linearisation import Message
+from shapepose_fg.estimation.minimise import undetermined_key
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.out_of_step import carried_to_frames
-from shapepose_fg.estimation.window_graph import WindowGraph, undetermined_key
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 LEAST_M = 1e-4
 """Where the solver's graph leaves a joint no less certain than it is reported, its error is taken to be this much
@@ -61,6 +63,9 @@ class WindowSolution:
     """What went wrong, joint by joint; rows of these have the status `not solved`."""
     people: "tuple[PersonGraph, ...]" = ()
     """Everybody's graph; none where some rows were taken."""
+    factors: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """How many factors each function of the user's made, and how many of them were inactive at the end, because a
+    joint had no place."""
     seconds: dict[str, float] = field(default_factory=dict)
     """What it took, by stage."""
 
@@ -129,6 +134,8 @@ class PersonGraph:
     """How the error goes on that is in the report and not in the solver's graph."""
     body: Message
     """(T, J) what the body says of each joint without the joint's own views; nothing where it does not pull."""
+    together: "list[PersonGraph]" = field(default_factory=list, repr=False)
+    """The people whom factors of your own tie to this one, and this one (`tied`); none where nobody is."""
 
     @property
     def person(self) -> int:
@@ -160,9 +167,17 @@ class PersonGraph:
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """All factors: projections, bodies, motion, your own, and the errors that last. Joint by joint it is a
-        chain over time, unless factors of your own tie joints.
+        chain over time, unless factors of your own tie joints. People whom they tie (`together`) are one graph,
+        with the keys of all of them.
         """
         graph = gtsam.NonlinearFactorGraph(self.window.graph)
+        for person in self.together or [self]:
+            for factor in person._differences():
+                graph.push_back(factor)
+        return graph
+
+    def _differences(self) -> list[gtsam.NonlinearFactor]:
+        """What the reported positions differ by from the solver's, with an error that lasts."""
         reported, offsets, known = self.keys, self._offset_keys, self._known
         factors = lasting_difference_factors(
             reported[known],
@@ -177,18 +192,18 @@ class PersonGraph:
             factors += offset_factors(
                 offsets[there, joint], self.window.times_s[there], self.lasting.correlation_s
             )
-        for factor in factors:
-            graph.push_back(factor)
-        return graph
+        return factors
 
     @cached_property
     def values(self) -> gtsam.Values:
         """The solution: the solver's variables, the reported positions, and their offsets, which are 0."""
-        values, known, zero = gtsam.Values(self.window.values), self._known, np.zeros(3)
-        for key, place in zip(self.keys[known].tolist(), self.joints[known], strict=True):
-            values.insert(key, place)
-        for key in self._offset_keys[known].tolist():
-            values.insert(key, zero)
+        values, zero = gtsam.Values(self.window.values), np.zeros(3)
+        for person in self.together or [self]:
+            known = person._known
+            for key, place in zip(person.keys[known].tolist(), person.joints[known], strict=True):
+                values.insert(key, place)
+            for key in person._offset_keys[known].tolist():
+                values.insert(key, zero)
         return values
 
     def not_determined(self, error: RuntimeError, joint_names: list[str]) -> NotDetermined | None:
@@ -223,5 +238,15 @@ class PersonGraph:
     def _more(self) -> Array:
         """(T, J, 3, 3) what the reported covariances are larger by, m²: positive definite."""
         more = np.where(self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3))
-        values, vectors = np.linalg.eigh((more + more.mT) / 2)
-        return (vectors * np.maximum(values, LEAST_M**2)[..., None, :]) @ vectors.mT
+        return raise_eigenvalues(more, LEAST_M**2)
+
+
+def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
+    """The same people, each with the others to whom factors of the user's own tie them."""
+    together, found = dict[int, list[PersonGraph]](), list[PersonGraph]()
+    for person in people:
+        group = together.setdefault(id(person.window.ties), [])
+        alone = len(person.window.ties.people) == 1
+        found.append(person if alone else replace(person, together=group))
+        group.append(found[-1])
+    return tuple(found)

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.calibration.reading import is_calibration
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.json_people import frame_files, frame_number
+from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.footage.footage import glance
 from shapepose_fg.io.footage.places import VIDEOS
 
@@ -17,6 +19,8 @@ CONFIG = "Config.toml"
 _POSES = ("pose-sync", "pose", "pose-associated")
 """Folders of 2D detections, the best first: brought into step, as detected, and one person as Pose2Sim chose them.
 Who is who in the cameras is found anew, so that what Pose2Sim dropped is not lost."""
+_MOST_KEYPOINTS = 1000
+"""No detector has as many: a larger id is a mistake."""
 _RATE = 30.0
 """Frames a second where neither Config.toml nor a video says it, as in Pose2Sim."""
 
@@ -39,6 +43,8 @@ class Pose2SimProject:
     """The project's own numbers of the first frame to be reconstructed and of the one after the last."""
     multi_person: bool
     """Whether everybody is of interest, or one person."""
+    joints: DeclaredJoints | None
+    """The detector's joints as pose.pose_model says; None where it says nothing."""
     notes: tuple[str, ...]
     """What was taken to be what."""
 
@@ -96,17 +102,18 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         given = rate != "auto"
         fps, origin = (rate, f", as {CONFIG} says") if given else next((e for e in told if e[0] > 0), assumed)
         said = f"{fps:g} frames a second{origin}"
-    # Results have the numbers of the files' names, 0 where they have none.
-    folders = [each for each in detections.iterdir() if each.is_dir()]
-    numbers = (frame_number(file) for each in folders for file in frame_files(each))
+    # Results have the numbers of the files' names, 0 where they have none, from the first that all have.
+    folders = [frame_files(each) for each in detections.iterdir() if each.is_dir()]
+    numbers = (min(map(frame_number, files)) for files in folders if len(files) > 0)
     return Pose2SimProject(
         folder,
         calibration,
         detections,
         None if fps is None else float(fps),
-        min(numbers, default=0),
+        max(numbers, default=0),
         (span[0], span[1]) if isinstance(span, list) and len(span) == 2 else None,
         multi_person,
+        _joints(config, folder / CONFIG),
         (f"{folder}: cameras from {calibration}, detections from {detections}", f"{folder}: {said}"),
     )
 
@@ -128,6 +135,36 @@ def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
     if not isinstance(multi_person, bool):
         raise wrong("multi_person", "true or false")
     return rate, span, multi_person
+
+
+def _joints(config: dict[str, Any], file: Path) -> DeclaredJoints | None:
+    """What pose.pose_model says of the keypoints: a layout's name, or the tree of joints under that name."""
+    pose = config.get("pose", config.get("pose-2d", {}))
+    if not isinstance(pose, dict):
+        raise InputError(f"{file}: pose must be a table; write [pose] as Pose2Sim's demos do")
+    name = pose.get("pose_model")
+    if not isinstance(name, str) or not name.strip():
+        return None
+    tree, source = pose.get(name), f"{file}: pose.pose_model"
+    names = {} if layouts_called(name) else _joints_of_tree(tree[0] if isinstance(tree, list) and tree else tree)
+    if not names:
+        return DeclaredJoints(name, source)
+    return DeclaredJoints(tuple(names.get(place, "") for place in range(max(names) + 1)), source)
+
+
+def _joints_of_tree(tree: Any) -> dict[int, str]:
+    """The names of joints by their places among the keypoints: tables with `id`, `name` and `children`."""
+    names, waiting = dict[int, str](), [tree]
+    while waiting:
+        each = waiting.pop()
+        if not isinstance(each, dict):
+            continue
+        children, place, name = each.get("children"), each.get("id"), each.get("name")
+        waiting += children if isinstance(children, list) else []
+        place = int(place) if isinstance(place, str) and place.isdecimal() else place
+        if type(place) is int and 0 <= place < _MOST_KEYPOINTS and isinstance(name, str):
+            names[place] = name
+    return names
 
 
 def _settings(folder: Path) -> tuple[dict[str, Any], Path]:

@@ -15,6 +15,7 @@ from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.detections.view_streams import in_moments
 from shapepose_fg.io.timestamps import read_timestamps
 
@@ -34,7 +35,7 @@ def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -
 def read_recording(
     detections: Path,
     rig: Rig,
-    skeleton: Skeleton | str | Path | None,
+    skeleton: Skeleton | str | Path | DeclaredJoints | None,
     kept: Path,
     fps: float | None = None,
     timestamps: Path | None = None,

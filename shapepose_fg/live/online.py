@@ -3,6 +3,7 @@
 import threading
 from bisect import bisect_left
 from collections import deque
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -29,7 +30,7 @@ from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_s
 from shapepose_fg.live.views import ViewsInStep, joined, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
-from shapepose_fg.pipeline.workers import Workers
+from shapepose_fg.pipeline.workers import workers as worker_processes
 from shapepose_fg.proposal.thinning import thinned
 
 AHEAD_S = 1.0
@@ -122,9 +123,10 @@ class OnlineReconstructor:
         self._filter = Filter(setup.engine(Notebook()).tracker, config.stitching)
         self._motion = MotionModel.load(skeleton.joints, config.motion, config.law)
         self._lock = threading.RLock()
-        self._workers = Workers(workers, setup).__enter__()
+        self._open = ExitStack()
+        pool = self._open.enter_context(worker_processes(workers, setup))
         self._most_waiting = 1 if workers == 1 else 2 * workers
-        self._refinery = Refinery(self._workers, self._filter)
+        self._refinery = Refinery(pool, self._filter)
         self._state = LiveState(rig, CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
         self._said = deque[Said](maxlen=_MOST_SAID)
         self._now = Newest(0, self._filter.nobody, fitter)
@@ -162,7 +164,7 @@ class OnlineReconstructor:
     def close(self) -> None:
         """End the processes that refine. What was settled can still be taken."""
         with self._lock:
-            self._workers.__exit__(None)
+            self._open.close()
 
     def push(self, detections: Detections, time_s: float | Array) -> None:
         """Take in a frame of all cameras, taken at `time_s`: seconds, or (V,) for cameras out of step.

@@ -17,7 +17,7 @@ from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.windows import Span
-from shapepose_fg.pipeline.workers import Workers
+from shapepose_fg.pipeline.workers import Pool, naming_lost_work
 
 
 @dataclass
@@ -92,8 +92,8 @@ class _Sent:
 class Refinery:
     """Sends windows to be solved, and gives back what came of them in the order in which they were sent."""
 
-    def __init__(self, workers: Workers[Setup], following: Filter) -> None:
-        self._workers, self._filter = workers, following
+    def __init__(self, pool: Pool[Setup], following: Filter) -> None:
+        self._pool, self._filter = pool, following
         self._sent = deque[_Sent]()
 
     @property
@@ -117,7 +117,7 @@ class Refinery:
         if len(rows) == 0:
             return
         frames = np.array([slot.given.frame for slot in window])
-        part = self._workers.submit(
+        part = self._pool.submit(
             Setup.solve, Span(tuple(decided), start, len(decided), rig=rig if rig.moves else None)
         )
         self._sent.append(_Sent(part, frames, names, own, start))
@@ -127,7 +127,8 @@ class Refinery:
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()
-            rows = sent.part.result().rows
+            with naming_lost_work():
+                rows = sent.part.result().rows
             at = rows.frame
             person = np.array([sent.names[track] for track in rows.person.tolist()], dtype=np.int64)
             # Of two tracks of one identity in a frame, who came back while they were still followed, one stays.

@@ -8,17 +8,20 @@ import numpy as np
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
+from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
 from shapepose_fg.estimation.linearisation import inverses, observation_sigmas, weakest_sigma
 from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.window_graph import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, Finding, ViewReason
+from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, FactorReason, Finding, ViewReason
 from shapepose_fg.pipeline.solving import Solver, solved_around
 
 OFF_SIGMA = 3.0
@@ -44,13 +47,15 @@ def explain(
     frame: int | None = None,
     time_s: float | None = None,
     detections: DetectionSequence | None = None,
+    extra_factors: ExtraFactors | None = None,
 ) -> Explanation:
     """Why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`, seconds.
 
     The person's window is solved once more, from the detections that `people.observations` has of them, before the
     cameras `rig`; joints, covariances and gates are those of the result. With the recording's `detections` those
-    are named, too, that a detector joins with the person's and that were not given to them. InputError where the
-    person, the joint or the frame is not in the result, or where it does not say what it was solved from.
+    are named, too, that a detector joins with the person's and that were not given to them. `extra_factors` are
+    those that the result was solved with, if any; `window.track` is the result's person for them. InputError where
+    the person, the joint or the frame is not in the result, or where it does not say what it was solved from.
     """
     table = people.observations
     if table is None:
@@ -61,20 +66,24 @@ def explain(
         raise InputError(f"joint {joint}: the result has none of that name; it has {' '.join(names)}")
     number = names.index(joint)
     solver = Solver.of(people, rig)
-    graph = solved_around(people, solver, person, frame)
+    graph = solved_around(people, solver, person, frame, extra_factors)
     near = np.abs(people.frame - frame) <= (_WINDOW_FRAMES if solver.config.temporal else 0)
     around = _Detections.of(people.rows(near), rig, solver.config, detections)
     at = int(near[:row].sum())
-    views, shares = _view_reasons(around, graph, at, number, solver.config)
+    views, factors, shares = _view_reasons(around, graph, at, number, solver.config)
     here, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
     wrong = wrong_view(around.seen, around.people.joints, around.views, solver.config.estimator.observations)
     refused = _refused(around, at, number, detections)
-    findings = _findings(people, row, number, views, shares, wrong, refused)
+    findings = _findings(people, row, number, views, factors, shares, wrong, refused)
+    given = {name_of(function) for function in functions_of(extra_factors)}
+    used = people.run.get("extra_factors", {})
+    missing = tuple(name for name in used if isinstance(used, dict) and name not in given)
     return Explanation(
         person, joint, frame, when if np.isfinite(when) else None,
         tuple(here.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
         Known(people.known[row, number]).name.lower(), str(people.status[row]), views, *shares, findings,
+        factors, missing,
     )  # fmt: skip
 
 
@@ -149,7 +158,7 @@ def _with_strays(
     for v in np.unique(view).tolist():
         mine = np.flatnonzero(view == v)
         off = np.linalg.norm(away[mine] - _commonest(away[mine]), axis=-1)
-        order = np.argsort(-off)  # the nearest is written last
+        order = np.argsort(-off, kind="stable")  # the nearest is written last
         mine = mine[order[off[order] < _BESIDE_RAD]]
         xy[row[mine], joint[mine], v], confidence[row[mine], joint[mine], v] = at[mine], score[mine]
     return replace(rows, xy=xy, confidence=confidence)
@@ -181,8 +190,9 @@ def _view_reasons(
     row: int,
     joint: int,
     config: PipelineConfig,
-) -> tuple[tuple[ViewReason, ...], tuple[float, float]]:
-    """What each camera says of a joint; and the shares of the body and of motion in what is known of it.
+) -> tuple[tuple[ViewReason, ...], tuple[FactorReason, ...], tuple[float, float]]:
+    """What each camera and each factor of the user's own says of a joint; and the shares of the body and of motion
+    in what is known of it.
 
     The solver's information of the joint is taken apart: that of each detection, of the body, and the rest, which
     is other frames'. The share of a part is trace(part inverse(whole)) / 3. A detection is compared with the joint
@@ -192,11 +202,13 @@ def _view_reasons(
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
     sigma, seen = all_of_it.seen.sigmas_px[row, joint], gates != Gate.NOT_SEEN
     place, whole, of_body = people.joints[row, joint], None, np.zeros((3, 3))
+    evidence = list[FactorEvidence]()
     solved = [] if graph is None else np.flatnonzero(graph.frames == people.frame[row]).tolist()
     if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
         t, estimator = solved[0], config.estimator
         place, whole = graph.solved[t, joint], np.linalg.inv(graph.solved_covariance[t, joint])
         of_body = estimator.graph.weight_shape * graph.body.information[t, joint]
+        evidence = factor_evidence(graph.window, t, joint)
     xy, _, slope = (each[0, 0] for each in rows.project(place[None, None]))
     residual = xy - table.xy[row, joint]
     information, gradient = np.zeros((len(gates), 3, 3)), np.zeros((len(gates), 3))
@@ -205,14 +217,15 @@ def _view_reasons(
     for v in np.flatnonzero(used).tolist():
         weight = kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v]) / sigma[v] ** 2
         information[v], gradient[v] = weight * slope[v].T @ slope[v], weight * slope[v].T @ residual[v]
-    if whole is not None and graph is not None and graph.window.temporal:
+    if whole is not None and graph is not None and graph.window.temporal and not graph.window.touched[joint]:
         # Of what is seen the solver's graph holds the share of the variance that is new in every frame.
         seen_well = weakest_sigma(information.sum(axis=0)) <= LOST_M
         whole *= graph.lasting.white_share if seen_well else 1.0
     if whole is None:
         whole = information.sum(axis=0) + of_body + np.eye(3)
-    rest = np.linalg.eigvalsh(whole - information.sum(axis=0) - of_body).sum()
-    parts = [*information, of_body]
+    of_factors = [each.information for each in evidence]
+    rest = np.trace(whole - information.sum(axis=0) - of_body - sum(of_factors))
+    parts = [*information, *of_factors, of_body]
     known = [float(np.trace(np.linalg.solve(whole, part))) / 3 for part in parts]
     known.append(max(1.0 - sum(known), 0.0) if rest > 0 else 0.0)
     known = [each / max(sum(known), 1e-9) for each in known]
@@ -222,7 +235,7 @@ def _view_reasons(
         like = ""
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
             least = np.eye(3)  # a metre
-            without = inverses(_positive(whole - information[v]) + least)
+            without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
             away = residual[v] + slope[v] @ without @ gradient[v]
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
             off_px = float(np.linalg.norm(away))
@@ -243,7 +256,14 @@ def _view_reasons(
             looks_like=like,
         )
         reasons.append(reason)
-    return tuple(reasons), (known[-2], known[-1])
+    told = dict[tuple[str, tuple[str, ...]], float]()
+    for each, share in zip(evidence, known[len(gates) :], strict=False):
+        tied = ((who, people.joint_names[number]) for who, number, _ in each.others)
+        mine = int(people.person[row])
+        others = tuple(dict.fromkeys(str(name) if who == mine else f"person {who}'s {name}" for who, name in tied))
+        told[each.name, others] = told.get((each.name, others), 0.0) + share
+    factors = tuple(FactorReason(*which, share) for which, share in told.items())
+    return tuple(reasons), factors, (known[-2], known[-1])
 
 
 def _looks_like(
@@ -306,6 +326,7 @@ def _findings(
     row: int,
     joint: int,
     views: Sequence[ViewReason],
+    factors: Sequence[FactorReason],
     shares: tuple[float, float],
     wrong: WrongView | None,
     refused: Sequence[Finding],
@@ -319,9 +340,11 @@ def _findings(
     found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
     if wrong is not None and all(views[wrong.view].camera not in each.cameras for each in found):
         name = views[wrong.view].camera
+        (turn, turn_sigma), (shift, shift_sigma) = wrong.turn_deg, wrong.shift_m
         words = (
-            f"Camera {name} is off with whatever it sees around this time: turned by {wrong.turn_deg:.1f} degrees"
-            f" and moved by {100 * wrong.shift_m:.0f} cm it would fit the others. Check its pose, lens and clock."
+            f"Camera {name} is off with whatever it sees around this time: turned by {turn:.1f} ± {turn_sigma:.1f}"
+            f" degrees and moved by {100 * shift:.0f} ± {100 * shift_sigma:.0f} cm it would fit the others."
+            " Check its pose, lens and clock."
         )
         found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
@@ -357,7 +380,8 @@ def _findings(
     found += [each for each in refused if each.cameras[0] not in named]
     if len(used) == 0:
         words = (
-            f"No camera's detection was used: the body says {shares[0]:.0%}, motion from other frames the rest."
+            f"No camera's detection was used: the body says {shares[0]:.0%},"
+            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} motion from other frames the rest."
         )
         found.append(Finding(Cause.PRIOR_ONLY, (), words))
     if len(used) == 1:
@@ -416,12 +440,6 @@ def _mirrored(name: str) -> str:
             if name.startswith(one):
                 return other + name.removeprefix(one)
     return name
-
-
-def _positive(matrix: Array) -> Array:
-    """The nearest positive semi-definite matrix."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def _pair(values: Array) -> tuple[float, float] | None:

@@ -70,6 +70,18 @@ class ViewReason:
 
 
 @dataclass(frozen=True)
+class FactorReason:
+    """What factors of the user's own have to do with a joint."""
+
+    name: str
+    """The function that made them."""
+    others: tuple[str, ...]
+    """The joints that they tie it to, as `person 3's RWrist`; none where they are on this joint alone."""
+    share: float
+    """Of what the solver knows of the joint, 0 to 1."""
+
+
+@dataclass(frozen=True)
 class Explanation:
     """Why a joint is where it is."""
 
@@ -93,6 +105,12 @@ class Explanation:
     """And what comes from other frames."""
     findings: tuple[Finding, ...]
     """What is the matter, the gravest first; none where nothing is."""
+    factors: tuple[FactorReason, ...] = ()
+    """What factors of your own say of the joint in this frame, one entry for those of one function that tie it to
+    the same joints. What they say in other frames is in `motion_share`."""
+    missing_factors: tuple[str, ...] = ()
+    """Functions of the user's own with which the result was solved and which were not given: shares are without
+    them."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as `shapepose-fg explain --json` prints them."""
@@ -110,8 +128,18 @@ class Explanation:
             where = f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm (one sigma)."
         used = [view for view in self.views if view.gate == GATES[Gate.USED]]
         told = [f"{view.camera} {view.share:.0%}" for view in used]
+        told += [f"{each.name}{_with(each.others)} {each.share:.0%}" for each in self.factors]
         parts = [*told, f"the body {self.body_share:.0%}", f"motion, from other frames, {self.motion_share:.0%}"]
         shares = f"What is known of it comes from: {', '.join(parts)}."
+        if self.missing_factors:
+            shares += (
+                f" The result was solved with factors of {', '.join(self.missing_factors)} too, which are unknown"
+                " here: in Python, `explain(..., extra_factors=...)` counts them."
+            )
         matter = [finding.words for finding in self.findings]
         good = f"{len(used)} cameras agree on it, and nothing speaks against them."
         return (where, *(matter or [good]), *([shares] if self.position_m is not None else []))
+
+
+def _with(others: tuple[str, ...]) -> str:
+    return f" (with {', '.join(others)})" if others else ""

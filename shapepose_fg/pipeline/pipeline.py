@@ -1,5 +1,6 @@
 """The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -23,7 +24,7 @@ from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.core.trust import with_poses
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.trajectory_graph import CameraFactors
-from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.window_graph import ExtraFactors, functions_of, name_of
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
@@ -59,7 +60,8 @@ def reconstruct(
     `frames` picks frames of the recording (all of them by default). `times` says when the frames were taken;
     without it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut:
     nothing carries over to them, identities least of all. `shapes` are people known from other recordings.
-    `fitter` replaces the body fitter, and `extra_factors` adds factors of your own to every person's window.
+    `fitter` replaces the body fitter. `extra_factors`, one function or several, adds factors of your own to every
+    person's window; they may join people (docs/extending.md), and `run` says how many there were.
     Where cameras move, their trajectories are refined first, unless `refine_trajectories` has done so.
     `Trusted(detections, check_setup(detections, rig).trust)` leaves out cameras that contradict the others.
     `execution` says what runs it: processes, a cluster, chunks, who is told how far it is.
@@ -74,6 +76,10 @@ def reconstruct(
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     kept = InMemory()
     people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
+    for name, told in people.run.get("extra_factors", {}).items():
+        if told["made"] == told["inactive"]:
+            what = "is active, because joints that they need have no place" if told["made"] > 0 else "was made"
+            warnings.warn(f"extra_factors: {name}: none of its factors {what}", stacklevel=2)
     return replace(people, rig=kept_rig(kept, rig) or rig)
 
 
@@ -202,6 +208,10 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}
     if rig.moves:
         more |= {"trajectories": about(rig, setup.rig)}
+    if functions := functions_of(task.extra_factors):
+        made = {name_of(function): notes.factors.get(name_of(function), (0, 0)) for function in functions}
+        counts = {name: {"made": count, "inactive": idle} for name, (count, idle) in made.items()}
+        more |= {"extra_factors": counts}
     more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
     return result.with_run(**_summary(notes, config, frames, result), **more)
 

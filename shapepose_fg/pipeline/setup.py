@@ -88,7 +88,9 @@ class Setup:
             number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
             problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
             solution = replace(solution, observations=replace(rows, track=number), problems=problems)
-        notes = Notes(len(own), Counter(solution.seconds), problems=list(solution.problems))
+        notes = Notes(
+            len(own), Counter(solution.seconds), problems=list(solution.problems), factors=solution.factors
+        )
         if dropped := sorted(frame for frame in left.elements() if frame in own):
             notes.dropped[_FALSE_POSITIVE] = dropped
         said = np.isfinite(rows.evidence)

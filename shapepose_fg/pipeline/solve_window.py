@@ -22,7 +22,7 @@ from shapepose_fg.estimation.out_of_step import carried_to_frames, velocities_of
 from shapepose_fg.estimation.outcome import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
-from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph
+from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph, functions_of
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
@@ -59,8 +59,8 @@ def solve_window(
 
     Rows of one track at several frames are a window, one factor graph; a row whose track has no other is the
     frame-by-frame method, and with `EstimatorConfig` of the paper its Algorithm 1. `views` are the cameras, row by
-    row if they move. `extra_factors` adds factors of your own to every window. Without `assigning` detections stay
-    with whom they are.
+    row if they move. `extra_factors`, one function or several, add factors of your own to every window. Without
+    `assigning` detections stay with whom they are.
 
     In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
     says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice.
@@ -92,7 +92,7 @@ def solve_window(
     assigned = time.perf_counter()
 
     # Draft: X_0, the observations' sigmas there, and everybody's graph.
-    state = State.start(observations, views, fitter, config, motion, extra_factors)
+    state = State.start(observations, views, fitter, config, motion, functions_of(extra_factors))
     moving, velocity = state.people, velocities_of(observations, state.joints)
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
         rows = np.concatenate([person.rows for person in moving])
@@ -129,23 +129,29 @@ def solve_window(
         near = X
         if any(map(_waits, moving)):
             near = solve_between(observed, sigma, cameras, evidence, of_body, config)
-        X_new = np.concatenate([
-            near[part] if _waits(person) else solve_joints(person, evidence, of_body, part, config)
-            for person, part in parts
-        ])  # fmt: skip
+        now = [(person, part) for person, part in parts if not _waits(person)]
+        solve_joints(now, evidence, of_body, config)
+        X_new = near.copy()
+        for person, part in now:
+            X_new[part] = person.positions
 
         # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
         before = np.where((of_body.known | wrong)[..., None], X, fitted)
         still = np.linalg.norm(X_new - before, axis=-1) < config.refine.settled_m
         settled = (still | np.isnan(X_new).any(axis=-1)).all(axis=1)
         last, more = n + 1 == config.refine.alternations, n + 1 < config.refine.window_alternations
-        moving = list[WindowGraph]()
+        unsettled = {id(person.ties) for person, part in parts if not settled[part].all()}
+        moving, done = list[WindowGraph](), list[tuple[WindowGraph, slice]]()
         for person, part in parts:
-            goes_on = more or not person.temporal or person.touched.any()
-            if not last and goes_on and not settled[part].all():
+            goes_on = more or not person.temporal or len(person.ties.factors) > 0
+            if not last and goes_on and id(person.ties) in unsettled:
                 moving.append(person)
             elif _waits(person):
-                X_new[part] = solve_joints(person, evidence, of_body, part, config, near[part])
+                done.append((person, part))
+        solve_joints(done, evidence, of_body, config, near)
+        for person, part in done:
+            X_new[part] = person.positions
+        for person, _ in parts:
             velocity[person.rows] = np.nan_to_num(person.velocity)
         state.put(rows, X_new, evidence, wrong, of_body, body)
         if len(moving) == 0:
@@ -157,4 +163,4 @@ def solve_window(
 
 def _waits(person: WindowGraph) -> bool:
     """Whether a person's graph is solved in the last round only."""
-    return not person.temporal and not person.touched.any()
+    return not person.temporal and len(person.ties.factors) == 0

@@ -63,15 +63,15 @@ class Solver:
         return cls.of(people, rig, folder / "run.json")
 
 
-def solve_rows(rows: Reconstruction, solver: Solver) -> Reconstruction:
+def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None = None) -> Reconstruction:
     """Some people of a result solved anew, each over all of their rows, in the windows of the whole recording.
 
-    Detections stay with whom they were given; gates are decided anew. ValueError where `rows` do not say what
-    they were solved from.
+    Detections stay with whom they were given; gates are decided anew. `extra_factors` are factors of your own, for
+    which `window.track` is the result's person. ValueError where `rows` do not say what they were solved from.
     """
     parts, keyframe_s = [], solver.config.windows.keyframe_s
     motion = MotionModel.load(tuple(rows.joint_names.tolist()), solver.config.motion)
-    for own, part, solution in _solved(rows, solver, None):
+    for own, part, solution in _solved(rows, solver, extra_factors):
         assert part.observations is not None
         solved = solution.result(part.observations.candidate, solver.rig, part.joint_names.tolist())
         if keyframe_s > 0:
@@ -90,9 +90,9 @@ def window_solutions(
     """Every person of every window of a result as one graph, whose values and marginals are the result's.
 
     Joints and covariances are those of `people`; the graph below is solved anew from their observations, before
-    the cameras `rig`, in the order of the views. With `extra_factors` it says something else, and what it says
-    are joints and covariances. Windows overlap: frames near a border are in two. InputError where `people.run`
-    does not say the settings, ValueError where there are no observations.
+    the cameras `rig`, in the order of the views. With `extra_factors`, which know people as the result does
+    (`window.track`), joints and covariances are of the graph. Windows overlap: frames near a border are in two.
+    InputError where `people.run` does not say the settings, ValueError where there are no observations.
     """
     solver = Solver.of(people, rig)
     for _, part, solution in _solved(people, solver, extra_factors):
@@ -101,17 +101,23 @@ def window_solutions(
             yield person if extra_factors is not None else replace(person, **as_reported)
 
 
-def solved_around(people: Reconstruction, solver: Solver, person: int, frame: int) -> PersonGraph | None:
+def solved_around(
+    people: Reconstruction, solver: Solver, person: int, frame: int, extra_factors: ExtraFactors | None = None
+) -> PersonGraph | None:
     """Somebody's graph of the window that has this frame, solved anew from the person's own observations; None
-    where nothing is in it. The observations must be there.
+    where nothing is in it. With `extra_factors` everybody in the window is solved. The observations must be there.
     """
-    mine = people.rows(people.person == person if solver.config.temporal else people.frame == frame)
-    found = [solution for _, _, solution in _solved(mine, solver, None, frame)]
+    if extra_factors is None:
+        people = people.rows(people.person == person if solver.config.temporal else people.frame == frame)
+    found = [solution for _, _, solution in _solved(people, solver, extra_factors, frame)]
     return next((each for solution in found for each in solution.people if each.person == person), None)
 
 
 def _solved(
-    rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None, frame: int | None = None
+    rows: Reconstruction,
+    solver: Solver,
+    extra_factors: ExtraFactors | None,
+    frame: int | None = None,
 ) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
     """Each window of the recording, or that of one `frame`: its own frames, and its rows with those around it,
     solved.

@@ -581,3 +581,39 @@ def test_an_export_follows_no_link_either(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["export", str(tmp_path / "results"), "csv"])
     assert ended.value.code == 2 and "export: this is a link" in capsys.readouterr().err
+
+
+@pytest.fixture
+def three(recording, tmp_path) -> list[str]:
+    """The same of three cameras, of which the last has no detections."""
+    file = tmp_path / "calibration.json"
+    cameras = json.loads(file.read_text())
+    cameras["behind"] = {"K": K, "RT": [1, 0, 0, -2, 0, 1, 0, 0, 0, 0, 1, 0], "imgSize": [1001, 801]}
+    file.write_text(json.dumps(cameras))
+    return recording
+
+
+@pytest.mark.parametrize("choice", [["--without", "behind"], ["--cameras", "right, left"]])
+def test_some_of_the_cameras(three, pipeline, tmp_path, choice):
+    """Whoever films with fewer cameras than were calibrated says which; a run that goes on has the same ones."""
+    assert run(*three, *choice, "--no-check") == 0
+    assert pipeline["rig"].names == ("left", "right")
+    assert [each["name"] for each in json.loads((tmp_path / "out/cameras.json").read_text())["cameras"]] == [
+        "left",
+        "right",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ([], 'the detections of camera "behind" are missing'),
+        (["--without", "behnid"], "there is no camera 'behnid'; there are left right behind"),
+        (["--cameras", "left"], "at least 2 cameras are needed"),
+        (["--cameras", ""], "no camera is chosen"),
+    ],
+)
+def test_cameras_that_cannot_be_chosen(three, capsys, choice, sentence):
+    with pytest.raises(SystemExit) as ended:
+        main([*three, *choice])
+    assert ended.value.code == 2 and sentence in capsys.readouterr().err.replace("\n", " ")

@@ -39,7 +39,8 @@ def test_every_skeleton_is_one_tree_on_its_limbs_and_mirrors_itself(skeleton):
         assert parent < 0 or skeleton.adjacency[joint, parent] == 1
     mirror = np.array(skeleton.mirror)
     np.testing.assert_array_equal(mirror[mirror], np.arange(len(skeleton)))
-    assert [skeleton.joints[joint] for joint in skeleton.core] == [BODY_25.joints[joint] for joint in BODY_25.core]
+    wanted = [BODY_25.joints[joint] for joint in BODY_25.core if BODY_25.joints[joint] in skeleton.joints]
+    assert [skeleton.joints[joint] for joint in skeleton.core] == wanted and len(wanted) >= 14
     assert {skeleton.joints[hip] for hip in skeleton.hips} == {"RHip", "LHip"}
     assert skeleton.joints[skeleton.root] == "MidHip"
     # A body has a point for every joint.
@@ -50,14 +51,21 @@ def test_a_skeleton_without_middles_has_them_made():
     assert [COCO_17.joints[joint] for joint, _, _ in COCO_17.middles] == ["Neck", "MidHip"]
     assert {COCO_17.joints[joint] for joint in COCO_17.anchor} == {"RHip", "LHip"}
     assert BODY_25.anchor == (8,) and BODY_25.middles == ()
-    assert {name: (each.keypoint_count, len(each)) for name, each in SKELETONS.items()} == {
-        "BODY_25": (25, 25),
-        "COCO_17": (17, 19),
-        "COCO_18": (18, 19),
-        "HALPE_26": (26, 26),
-        "COCO_133": (133, 25),
-        "HALPE_136": (136, 26),
-    }
+    counts = {name: (each.keypoint_count, len(each)) for name, each in SKELETONS.items()}
+    assert (
+        counts.items()
+        >= {
+            "BODY_25": (25, 25),
+            "COCO_17": (17, 19),
+            "COCO_18": (18, 19),
+            "HALPE_26": (26, 26),
+            "COCO_133": (133, 25),
+            "HALPE_136": (136, 26),
+            "BODY_25B": (25, 27),
+            "H36M_17": (17, 17),
+            "BLAZEPOSE_33": (33, 23),
+        }.items()
+    )
 
 
 def test_target_skeletons_have_the_detectors_order():

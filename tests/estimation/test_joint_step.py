@@ -41,10 +41,12 @@ def test_the_kernel_and_the_graph_agree(five_cameras, two_people, kernel, moving
     for row in range(2):
         rows = np.array([row])
         person = WindowGraph(seen.rows(rows), sigmas[rows], views.rows(rows), config, motion, rows)
-        alone = solve_joints(person, evidence, body, slice(row, row + 1), config)
+        solve_joints([(person, slice(row, row + 1))], evidence, body, config)
+        alone = person.positions
         # Detections and bodies are centimetres off; under the robust kernel the last steps are short.
         np.testing.assert_allclose(between[rows], alone, atol=5e-5)
-        again = solve_joints(person, evidence, body, slice(row, row + 1), config, between[rows])
+        solve_joints([(person, slice(row, row + 1))], evidence, body, config, between)
+        again = person.positions
         np.testing.assert_allclose(again, alone, atol=5e-5)
     assert np.isnan(between[:, NOWHERE]).all() and np.isfinite(np.delete(between, NOWHERE, axis=1)).all()
     np.testing.assert_allclose(between[:, BODY_ONLY], body.xyz[:, BODY_ONLY], atol=1e-6)

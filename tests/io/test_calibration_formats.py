@@ -572,10 +572,50 @@ def test_qualisys_pictures_of_a_lower_resolution_are_resized(tmp_path, resolutio
         assert one.image_size == (round(1280 * scale), round(720 * scale))
 
 
-def test_qualisys_resolutions_that_are_not_known(tmp_path):
+@pytest.mark.parametrize("resolution", ["4K", "N/A", "none"])
+def test_qualisys_resolutions_that_are_not_known_are_said(tmp_path, resolution):
     file = qualisys(tmp_path)
-    file.write_text(file.read_text().replace('model="Miqus Video"', 'model="Miqus Video" video_resolution="4K"'))
-    refuses(file, "camera 0 \"alpha\": video_resolution must be one of 1080p 720p 540p 480p, got '4K'")
+    file.write_text(
+        file.read_text().replace('model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"')
+    )
+    rig = read_rig(file)
+    assert_same(rig, TRUTH)
+    assert f"video_resolution is '{resolution}' of camera alpha" in rig.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("resolution", "window", "scale"),
+    [
+        ("1440p", (1919, 1439), 1.0),  # all of the sensor
+        ("1440p", (1439, 1439), 1.0),  # a square in it
+        ("1080p", (1919, 1079), 1.0),  # a window of so many lines
+        ("1080p", (1919, 1439), 0.75),  # resized
+        ("720p", (1919, 1439), 0.5),
+    ],
+)
+def test_qualisys_sensors_of_more_lines(tmp_path, resolution, window, scale):
+    """Miqus Video Plus has 1440 lines; pictures are resized only where there are more lines in the window."""
+    file = qualisys(tmp_path)
+    text = file.read_text().replace(
+        'left="8" top="4" right="1287" bottom="723"', f'left="0" top="0" right="{window[0]}" bottom="{window[1]}"'
+    )
+    text = text.replace("<transform", '<fov_video_max left="0" top="0" right="1919" bottom="1439"/><transform')
+    plus = f'model="Miqus Video Plus" video_resolution="{resolution}"'
+    file.write_text(text.replace('model="Miqus Video"', plus))
+    width, height = window[0] + 1, window[1] + 1
+    first = read_rig(file, cameras=[NAMES[0]]).cameras[0]
+    assert first.image_size == (round(width * scale), round(height * scale))
+    np.testing.assert_allclose(first.K[0, 0], scale * TRUTH.K[0, 0, 0])
+
+
+def test_qualisys_hybrid_cameras_are_video_cameras_and_others_are_named(tmp_path):
+    file = qualisys(tmp_path)
+    file.write_text(file.read_text().replace("Miqus Video", "Miqus Hybrid", 1))
+    rig = read_rig(file)
+    assert_same(rig, TRUTH)
+    assert [note.split(": ", 1)[1] for note in rig.notes] == [
+        "camera marker (Miqus M3) is left out: it takes no videos"
+    ]
 
 
 def test_pose2sim_s_recording_in_three_formats(shared_data):

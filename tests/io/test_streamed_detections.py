@@ -15,8 +15,9 @@ from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.detections.association_text import NumberStream
 from shapepose_fg.io.detections.json_people import read_one_file
-from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.io.write_detections import write_association, write_openpose
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
+from tests.marks import slow
 
 COLUMNS = ("view", "joint", "xy", "confidence", "pairs", "affinity")
 FRAMES = 2 * BLOCK_FRAMES + 40
@@ -195,3 +196,21 @@ def test_numbers_are_read_as_python_reads_them(other, tmp_path):
     assert stream.reaches(len(words)) and not stream.reaches(len(words) + 1)
     expected = np.array([float(word) for word in words])
     assert stream.values.tobytes() == expected.tobytes()  # to the last bit, and the sign of zero
+
+
+@pytest.mark.parametrize("lead", [*slow(0, 1, 100, BLOCK_FRAMES), BLOCK_FRAMES + 7])
+@pytest.mark.parametrize("end", [*slow(0), 3])
+def test_files_of_which_some_frames_are_common(scene, once, tmp_path, lead, end):
+    """Camera 1 has `lead` frames less at the beginning and `end` less at the end: by number, block by block."""
+    whole = repeated(once, FRAMES)
+    write_openpose(whole, scene.rig, tmp_path / "whole")
+    everything = read_detections(tmp_path / "whole", scene.rig)
+    folder = tmp_path / "whole" / scene.rig.names[1]
+    files = sorted(folder.iterdir() if folder.is_dir() else folder.with_name(f"{folder.name}_json").iterdir())
+    for file in [*files[:lead], *files[FRAMES - end :]]:
+        file.unlink()
+    table = read_detections(tmp_path / "whole", scene.rig)
+    assert len(table) == FRAMES - lead - end
+    for frame in range(len(table)):
+        for name in COLUMNS:
+            np.testing.assert_array_equal(getattr(table[frame], name), getattr(everything[lead + frame], name))

@@ -82,6 +82,7 @@ def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], 
         return frames, work()
 
 
+@pytest.mark.slow
 def test_rows_are_solved_anew_in_the_windows_of_the_recording():
     """22 frames cut before the tenth, windows of six that overlap by three; the last of each part is longer."""
     scene = built_in_scene(people=2, cameras=4, frames=22)
@@ -158,7 +159,7 @@ def test_without_time_rows_do_not_depend_on_who_they_are(scene, people, tmp_path
 
 
 def test_a_result_without_its_cameras_changes_identities_only(people, tmp_path, capsys):
-    people.save(tmp_path / "results")
+    replace(people, rig=None).save(tmp_path / "results")
     assert run("tracks", tmp_path / "results", "split", int(people.person[0]), 5) == 0
     assert "joints and bodies stay as they were solved" in capsys.readouterr().out
 

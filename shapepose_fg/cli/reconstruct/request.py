@@ -27,6 +27,7 @@ from shapepose_fg.core.result_files import RUN as RUN_FILE
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
+    from shapepose_fg.io.detections.people import DeclaredJoints
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
@@ -89,6 +90,12 @@ class Prepared:
     """The folder of detections."""
     output: Path
     """The folder of results."""
+
+    @property
+    def skeleton(self) -> "str | DeclaredJoints | None":
+        """The detector's joints as the user says, else as the project does."""
+        declared = None if self.project is None else self.project.joints
+        return self.request.skeleton or declared
 
     def settings(self) -> "PipelineConfig":
         """The settings; InputError where they do not go with the rest."""

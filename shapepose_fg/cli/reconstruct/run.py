@@ -44,7 +44,6 @@ from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
-from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
@@ -83,14 +82,14 @@ def carry_out(
         poses = [Path(each.partition("=")[2]) for each in asked.trajectory or ()]
         files = (known.calibration, asked.config, asked.body, asked.timestamps, *poses)
         reading = ReadInputs((*files, known.detections))
-        rig = asked.rig()
-        recording, times = read_recording(known.detections, rig, asked.skeleton, kept, asked.fps, asked.timestamps)
+        rig, own = asked.rig(), output / CAMERAS
+        if (asked.cameras or asked.without) and own.exists() and own.samefile(known.calibration):
+            raise InputError(f"{own}: results replace this file, all of whose cameras are needed; copy it first")
+        recording, times = read_recording(known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps)
         note(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
-        if execution.workers != 1 and execution.cluster is None:
-            get_ready("shapepose_fg.pipeline.pipeline")
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
@@ -122,7 +121,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")
-        found, count = found_clocks(known.detections, rig, asked.skeleton, asked.fps, MOST_S)
+        found, count = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
         show_clocks(found, rig)
         if problems := found.undetermined(rig):
             raise InputError(f"--synchronise: {'; '.join(problems)}")
@@ -252,7 +251,7 @@ class _Run:
         seconds = time.perf_counter() - start
         if file is not None and known is not None and len(known) > 0:
             inputs[str(file)] = manifest.checksum_at_start(kept)
-        about = {"inputs": inputs, "notes": list(self.recording.notes)}
+        about = {"inputs": inputs, "notes": [*rig.notes, *self.recording.notes]}
         about |= {"body": None if asked.body is None else asked.body.resolve()}
         about |= {} if self.recording.first == 0 else {"numbered_from": self.recording.first}
         about |= {} if self.known.project is None else {"project": self.known.project.name}
@@ -269,6 +268,7 @@ class _Run:
         note(*set_aside(output))
         result.save(output)
         # What the observations were seen with: to solve or draw them anew.
+        # `carry_out` refuses a part of the cameras of that very file.
         if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
             write_rig(rig, output / CAMERAS)
         if not self.known.request.synchronise:

@@ -1,5 +1,6 @@
 """Calibrations in JSON (our own rig file, 4D Association, CMU Panoptic, VoxelPose) and AniPose's kind of TOML."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -145,7 +146,9 @@ def _read_panoptic(content: Content) -> WrittenRig | None:
             raise node.refuse("name", f"must be text, got {describe(value.get('name'))}")
         wTc = node.pose("R", "t")
         cameras.append(node.camera(value["name"], "K", wTc, ["resolution"], "distCoef", most=5))
-    return WrittenRig(cameras, "cm", "-y")
+    if "calibDataSource" in content.value or any({"type", "panel", "node"} & each.keys() for each in listed):
+        return WrittenRig(cameras, "cm", "-y")
+    return WrittenRig(cameras, None, None, {"unit": "pass --unit (that of CMU's studio is cm)", "up": _UP})
 
 
 def _read_voxelpose(content: Content) -> WrittenRig | None:
@@ -169,13 +172,40 @@ def _read_voxelpose(content: Content) -> WrittenRig | None:
     return WrittenRig(cameras, "mm", "z")
 
 
-def _program(tables: Mapping[str, dict[str, Any]], metadata: Any) -> str:
-    """Whose TOML it is. Pose2Sim says of every camera that it is no fisheye; AniPose says it of fisheyes only."""
-    if any("cam_id" in table or "port" in table for table in tables.values()):
+def _program(tables: Mapping[str, dict[str, Any]], metadata: Mapping[str, Any]) -> str:
+    """Whose TOML it is, by what only that program writes; AniPose's, which says least, where nothing tells.
+
+    Pose2Sim writes a camera's size as floats and `fisheye = false` at the end. Caliscope writes `cam_id` or `port`
+    into its own file; in the one for AniPose cameras are called as their tables, [cam_0], and the error is 0.
+    """
+    every = list(tables.values())
+    if any("cam_id" in table or "port" in table for table in every):
         return "Caliscope"
-    if isinstance(metadata, dict) and any(key.startswith(("charuco_", "freemocap")) for key in metadata):
+    if any(key.startswith(_FREEMOCAP) for key in metadata) or any("world_position" in table for table in every):
         return "FreeMoCap"
-    return "Pose2Sim" if all(table.get("fisheye") is False for table in tables.values()) else "AniPose"
+    if all(table.get("fisheye") is False for table in every) and all(
+        list(table)[-1] == "fisheye" or _floats(table.get("size")) for table in every
+    ):
+        return "Pose2Sim"
+    called = all(_CALISCOPE_KEY.fullmatch(key) and table.get("name") == key for key, table in tables.items())
+    return "Caliscope" if called and metadata == {"adjusted": False, "error": 0.0} else "AniPose"
+
+
+def _floats(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(each, float) for each in value)
+
+
+_CALISCOPE_KEY = re.compile(r"cam_\d+")
+_FREEMOCAP = ("charuco_", "freemocap", "groundplane_", "solver_method", "board")
+"""How names in [metadata] begin that FreeMoCap alone writes; the last three since its version 2."""
+
+
+def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis | None]:
+    """Unit and up axis, of those versions that write them: its board in mm, and z off a board on the floor."""
+    board = metadata.get("board")
+    sizes = [*metadata, *(board if isinstance(board, dict) else ())]
+    grounded = any(metadata.get(key) is True for key in ("groundplane_applied", "groundplane_calibration"))
+    return ("mm" if any(key.endswith("_length_mm") for key in sizes) else None), ("z" if grounded else None)
 
 
 def _read_tables(content: Content, program: str) -> WrittenRig | None:
@@ -183,11 +213,16 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
     inner = content.value.get("cameras") if content.syntax == "TOML" else None
     every = inner if isinstance(inner, dict) else content.value if content.syntax == "TOML" else {}
     tables = {key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table}
-    if len(tables) == 0 or _program(tables, content.value.get("metadata")) != program:
+    metadata = content.value.get("metadata") if len(tables) > 0 else None
+    metadata = metadata if isinstance(metadata, dict) else {}
+    if len(tables) == 0 or _program(tables, metadata) != program:
         return None
-    cameras = []
+    cameras, notes = [], list[str]()
+    posed = any(_POSE & table.keys() for table in tables.values())
     for key, table in tables.items():
-        if table.get("ignore") is True:
+        if table.get("ignore") is True or (posed and not _POSE & table.keys()):
+            why = "it is to be ignored" if table.get("ignore") is True else "it has no pose"
+            notes.append(f"camera {table.get('name') or key} is left out: {why}")
             continue
         node = Node(table, f'{content.path}: camera "{key}"', _CURES)
         # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
@@ -199,9 +234,12 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
         name, lens = str(table.get("name") or numbered), "fisheye" if fisheye else "perspective"
         cameras.append(node.camera(name, "matrix", wTc, ["size"], "distortions", lens))
     unit, up, cures = _DIALECTS[program]
-    return WrittenRig(cameras, unit, up, cures)
+    if program == "FreeMoCap":
+        unit, up = _said_by_freemocap(metadata)
+    return WrittenRig(cameras, unit, up, cures, notes=notes)
 
 
+_POSE = {"rotation", "translation"}
 _UP = "pass the axis of the world that points up with --up; it is often -y of a first camera that stood level"
 _DIALECTS: dict[str, tuple[Unit | None, Axis | None, dict[str, str]]] = {
     "Caliscope": ("m", None, {"up": _UP}),

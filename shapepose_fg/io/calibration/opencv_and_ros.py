@@ -1,7 +1,7 @@
 """OpenCV's FileStorage (its multi-view calibration, a node per camera, EasyMocap's), and ROS' camera_info."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,16 @@ _ONE_CAMERA = "give the calibration of the whole rig, intrinsics and poses"
 _AGAIN = {"": "save it with OpenCV's calibration again"}
 _STORAGE = {"": "write it with OpenCV's FileStorage"}
 _EASYMOCAP = {"": "write it with EasyMocap again"}
+
+_STEREO = {"": "save it as OpenCV's stereo_calib sample does"}
+_HALF = "this is half of OpenCV's stereo calibration"
+_STEREO_UP = "pass the axis of the first camera that points up with --up; it is -y where that stood level"
+_SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
+_MATRICES = ("m", "k", "cameramatrix", "camera_matrix", "mtx", "intrinsic", "intrinsic_matrix")
+_BENDS = ("d", "distcoeffs", "dist_coeffs", "distortion_coefficients", "distortion", "dist", "distcoeff")
+"""How cameras of a stereo pair, their intrinsic matrices and their distortion are called, in small letters."""
+_GAP = ("none", "null", "")
+"""What EasyMocap calls a place between two cameras in its list of names."""
 
 INTRINSIC, TURN, SHIFT = (
     "camera_matrix K intrinsic_matrix",
@@ -74,6 +84,47 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     return WrittenRig(cameras, None, None, _ASK)
 
 
+def _read_stereo(content: Content) -> WrittenRig | None:
+    """Two cameras as OpenCV's stereo sample saves them: M1 D1 M2 D2, and R T from the first to the second.
+
+    In one file, or in intrinsics.yml and extrinsics.yml; M may be K or cameraMatrix, 1 and 2 left and right.
+    The world is the first camera, in the unit of the board.
+    """
+    values, places = dict[str, Any](), [content.path]
+    if content.syntax in ("OpenCV", "YAML", "JSON") and isinstance(content.value, dict):
+        values = {str(key).lower(): each for key, each in content.value.items()}
+        halves = [path for path in content.path.parent.glob("*.y*ml") if re.match("(in|ex)trinsics?$", path.stem)]
+        places += [path for path in halves if path.name != content.path.name and len(halves) == 2]
+        places = places if content.path in halves else places[:1]
+    elif content.syntax == "folder":
+        places = [path for path in content.value if re.match(r"(in|ex)trinsics?\.(ya?ml|xml)$", path.name)]
+    for path in places if content.syntax == "folder" else places[1:]:
+        half = load(path).value
+        values |= {str(key).lower(): each for key, each in half.items()} if isinstance(half, dict) else {}
+    sides = next((each for each in _SIDES if _of_side(values, _MATRICES, each[0])), None)
+    where = str(content.path)
+    if sides is None or not _of_side(values, _MATRICES, sides[1]):
+        if {"r", "t"} <= values.keys() and {"q", "p1"} & values.keys():
+            raise InputError(f"{where}: {_HALF}; put intrinsics.yml with M1 D1 M2 D2 beside it")
+        return None
+    node = Node(values, where, _STEREO)
+    if node.named("r") is None or node.named("t") is None:
+        raise InputError(f"{where}: {_HALF}; put extrinsics.yml with R and T beside it")
+    size = [["image_size", "imagesize", "img_size"]] if node.named("image_size imagesize img_size") else _SIZE
+    cameras = []
+    for side, wTc in zip(sides, (np.eye(4), node.pose("r", "t")), strict=True):
+        K, bend = (_of_side(values, names, side) or names[0] + side for names in (_MATRICES, _BENDS))
+        cameras.append(node.camera(side, [K], wTc, size, [bend]))
+    note = f"OpenCV's stereo calibration: cameras are called {sides[0]} and {sides[1]}"
+    return WrittenRig(cameras, None, None, _ASK | {"up": _STEREO_UP}, notes=[note])
+
+
+def _of_side(values: Mapping[str, Any], names: Sequence[str], side: str) -> str | None:
+    """The key of one of `names` for a side of a stereo pair: m1, m_1, or 1_m."""
+    keys = (key for name in names for key in (f"{name}{side}", f"{name}_{side}", f"{side}_{name}"))
+    return next((key for key in keys if values.get(key) is not None), None)
+
+
 def _read_nodes(content: Content) -> WrittenRig | None:
     """Cameras with a node, or a file, each, of MC-Calib or written by hand: K, distortion, size and pose."""
     nodes = content.value if content.syntax == "OpenCV" else {}
@@ -99,16 +150,26 @@ def _read_nodes(content: Content) -> WrittenRig | None:
         cameras.append(node.camera(name, INTRINSIC, wTc, _SIZE, BEND, lens))
     if len(cameras) == 0:
         named = " ".join(list(content.value)[:5]) or "nothing"
+        if Node(content.value, "").named(INTRINSIC) is not None:
+            what = "these are the intrinsics of one camera, as OpenCV's calibration saves them"
+            raise InputError(f"{content.path}: {what}; {_ONE_CAMERA}, such as a file per camera with R and T, too")
         raise InputError(f"{content.path}: no camera with a pose here, only {named}; {_ONE_CAMERA}")
     return WrittenRig(cameras, None, None, _ASK)
+
+
+def _named(inner: Node, name: str) -> bool:
+    """Whether a camera of EasyMocap has intrinsics under its name."""
+    return inner.named([f"K_{name}"]) is not None
 
 
 def _read_easymocap(content: Content) -> WrittenRig | None:
     """EasyMocap's intri.yml and extri.yml, metres, z up: the cameras in the order of the names in the first."""
     paths = content.value if content.syntax == "folder" else [content.path]
     halves_of = [path for path in paths if re.search(r"(intri|extri).*\.ya?ml$", path.name)]
-    there = content.syntax == "OpenCV" and isinstance(content.value.get("names"), list)
-    if len(halves_of) == 0 or not (content.syntax == "folder" or there):
+    values = [content.value] if content.syntax == "OpenCV" else []
+    values += [load(path).value for path in halves_of] if content.syntax == "folder" else []
+    named = any(isinstance(value, dict) and "names" in value for value in values)
+    if len(halves_of) == 0 or not (named or any(path.stem in ("intri", "extri") for path in halves_of)):
         return None
     one = halves_of[0]
     halves = []
@@ -122,10 +183,12 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
         halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
     inner, outer = halves
     names = inner.values.get("names")
-    if not isinstance(names, list) or not all(isinstance(name, str | int) for name in names):
+    if not isinstance(names, list) or not all(isinstance(name, str | int | None) for name in names):
         raise inner.refuse("names", "must be a list of the cameras' names")
+    # EasyMocap leaves a gap between cameras by that name, and passes over it.
+    wanted = [str(name) for name in names if str(name).lower() not in _GAP or _named(inner, str(name))]
     cameras = []
-    for number, name in enumerate(map(str, names), 1):
+    for number, name in enumerate(wanted, 1):
         # EasyMocap writes K_<name>; Pose2Sim's writer numbers them from 1.
         def tagged(kind: str, name: str = name, number: int = number) -> list[str]:
             return [f"{kind}_{name}", f"{kind}_{number}"]
@@ -226,6 +289,7 @@ def message_of(value: Any) -> tuple[Any, Any] | None:
 OPENCV = (
     Format("EasyMocap's intri.yml and extri.yml", _read_easymocap),
     Format("OpenCV's multi-view calibration", _read_multiview),
+    Format("OpenCV's stereo calibration", _read_stereo),
     Format("OpenCV's FileStorage with a node or file per camera", _read_nodes),
 )
 ROS = Format("ROS' camera_info and pose YAML", _read_ros)

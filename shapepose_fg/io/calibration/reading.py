@@ -7,7 +7,7 @@ from typing import get_args
 
 import numpy as np
 
-from shapepose_fg.core.camera import Axis, Rig
+from shapepose_fg.core.camera import Axis, Rig, choose
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
@@ -37,12 +37,16 @@ def read_rig(
     up: Axis | None = None,
     unit: Unit | None = None,
     image_size: tuple[int, int] | None = None,
+    cameras: Sequence[str] | None = None,
+    without: Sequence[str] = (),
 ) -> Rig:
     """Read the cameras of a calibration file, or folder; the format is told by the content.
 
     The formats are `FORMATS`; docs/conventions.md says what unit and up axis each has. `up` and `unit` overrule
-    the file. `image_size` (width, height) is for formats that do not say how large the pictures are. What neither
+    the file. `image_size` (width, height) is for formats that do not say how large the pictures are. `cameras` are
+    the names of those that are wanted, all by default, and `without` of those that are not. What neither
     the file nor the caller says is an InputError: one sentence that names the file, the key and the cure.
+    `notes` of the rig say what was left out.
     """
     path = Path(path)
     for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
@@ -58,6 +62,9 @@ def read_rig(
     form, written = next((both for both in tried if both[1] is not None), (FORMATS[0], None))
     if written is None:
         raise InputError(_unknown(content))
+    with naming(path):
+        wanted = choose([camera.name for camera in written.cameras], cameras, without)
+    written = replace(written, cameras=[camera for camera in written.cameras if camera.name in wanted])
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:
@@ -69,8 +76,11 @@ def read_rig(
         names = f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'}"
         raise InputError(f"{path}: recognised as {form.name}, where {names} missing; {cures}")
     with naming(path):
-        cameras = [camera.finished(METRES[unit], image_size, path) for camera in written.cameras]
-        return carried(Rig(tuple(cameras), up, trajectories=tuple(written.trajectories)))
+        finished = tuple(camera.finished(METRES[unit], image_size, path) for camera in written.cameras)
+        carriers = {camera.carrier for camera in finished}
+        trajectories = tuple(each for each in written.trajectories if each.name in carriers)
+        notes = tuple(f"{path}: {each}" for each in written.notes)
+        return carried(Rig(finished, up, trajectories=trajectories, notes=notes))
 
 
 def carried(rig: Rig) -> Rig:

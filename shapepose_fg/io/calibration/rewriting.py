@@ -32,8 +32,6 @@ from shapepose_fg.io.calibration.opencv_and_ros import (
 )
 from shapepose_fg.io.calibration.xml_files import (
     DISTORTION,
-    FULL,
-    LINES,
     NEXUS_CAMERAS,
     QTM_CAMERAS,
     QUALISYS,
@@ -41,6 +39,7 @@ from shapepose_fg.io.calibration.xml_files import (
     TO_OPENCV,
     VICON,
     chosen,
+    scale_of,
 )
 
 Files = dict[Path, str]
@@ -61,7 +60,7 @@ def _set(element: ET.Element | None, names: str, values: ArrayLike) -> None:
 
 def _qualisys(content: Content, rig: Rig, metres: float) -> Files:
     for element, camera in zip(chosen(content.value, *QTM_CAMERAS), rig.cameras, strict=True):
-        scale = LINES[element.get("video_resolution", FULL)] / LINES[FULL]
+        scale = scale_of(element)
         window = element.find("fov_video")
         first = [float("nan") if window is None else float(window.get(side, "nan")) for side in ("left", "top")]
         _set(element.find("transform"), "r11 r12 r13 r21 r22 r23 r31 r32 r33", TO_OPENCV @ camera.cTw[:, :3])
@@ -254,7 +253,7 @@ REWRITTEN: dict[str, Callable[[Content, Rig, float], Files]] = {
     VICON.name: _vicon,
     OPENCV[0].name: _easymocap,
     OPENCV[1].name: _multiview,
-    OPENCV[2].name: _nodes,
+    OPENCV[3].name: _nodes,
     COLMAP.name: _colmap,
     ROS.name: _ros,
 }

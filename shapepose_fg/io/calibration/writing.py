@@ -14,11 +14,16 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.rig_file import write_rig
 from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
+from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
 from shapepose_fg.io.calibration.reading import FORMATS
 from shapepose_fg.io.calibration.rewriting import REWRITTEN
-from shapepose_fg.io.calibration.written import METRES, Unit, WrittenRig
+from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 
+_SEVERAL = (OPENCV[0].name, COLMAP.name)
+"""Formats of several files, whichever of them is given."""
+_YAML = (".yml", ".yaml")
 _DIGITS, _DIGITS_PX = 1e-6, 1e-4
 """How far what reads back may be off: metres and no unit, pixels."""
 _TABLE = re.compile(r"\s*\[\s*(?P<key>[^\]]+?)\s*\]\s*(#.*)?$")
@@ -31,11 +36,13 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
 
     Poses, intrinsics and distortions are replaced, the rest stays. Formats of several files become a folder:
     `target` has no ending then. `unit` is what `read_rig` was told. What does not read back as `rig`, because a
-    format has no place for it or is written in an unusual way, is written as our own rig file.
+    format has no place for it, is written in an unusual way, or `rig` has only some of the cameras, is written as
+    our own rig file, with the ending .json. InputError where `check_target` raises it.
     """
-    content = load(source)
-    read = ((each, each.read(content)) for each in FORMATS)
-    form, written = next((form, written) for form, written in read if written is not None)
+    check_target(source, target)
+    content, form, written = _found(source)
+    if [each.name for each in written.cameras] != list(rig.names):
+        return _own(rig, target)
     metres = METRES[unit or written.unit or "m"]
     place = _PLACES.get(form.name)
     if place is not None:
@@ -59,7 +66,39 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
         if reads:
             _write(files, target, several=several)
             return form.name, target
-    file = target if target.suffix else target.with_suffix(".json")
+    return _own(rig, target)
+
+
+def check_target(source: Path, target: Path) -> None:
+    """InputError where `target` has the ending of another format than that of `source` and than .json, our own."""
+    _, form, _ = _found(source)
+    several = source.is_dir() or form.name in _SEVERAL
+    ending, own = target.suffix.lower(), source.suffix.lower()
+    same = ending == own or (ending in _YAML and own in _YAML)
+    if ending not in ("", ".json") and (several or not same):
+        name = "a folder, without ending," if several else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
+        raise InputError(
+            f"{target}: cameras that came as {form.name} are written so, or as our own rig file; call it {name} or"
+            " FILE.json"
+        )
+
+
+def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
+    """What lies at `source`, in which format, and its cameras."""
+    content = load(source)
+    read = ((each, each.read(content)) for each in FORMATS)
+    found = next(((form, written) for form, written in read if written is not None), None)
+    if found is None:
+        raise InputError(f"{source}: no calibration is here any more; read it again")
+    return content, *found
+
+
+def _own(rig: Rig, target: Path) -> tuple[str, Path]:
+    """Write a rig file of our own, under the name of `target` where that has its ending or none."""
+    file, number = target, 0
+    while file.suffix.lower() != ".json" or (file != target and file.exists()):
+        stem = target.name.removesuffix("".join(target.suffixes[-2:]))
+        file, number = target.with_name(f"{stem}{f'-{number}' if number else ''}.json"), number + 1
     write_rig(rig, file)
     return FORMATS[0].name, file
 

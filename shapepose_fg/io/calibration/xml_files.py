@@ -1,5 +1,6 @@
 """Calibrations in XML, millimetres and z up: Qualisys' .qca.txt, which QTM exports, and Vicon's .xcp."""
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any
@@ -18,16 +19,22 @@ from shapepose_fg.io.calibration.written import (
     pose,
     rotation_of,
 )
+from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.validation import is_number
 
+_RESOLUTION = "video_resolution"
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
 QTM_CAMERAS, NEXUS_CAMERAS = ("cameras/camera", "model"), ("Camera", "TYPE")
 """Where cameras are, and the attribute that tells those for video."""
 SUBPIXEL = 64.0
 """QTM counts focal lengths and centres in 64ths of a pixel."""
-FULL = "1080p"
-LINES = {"1080p": 1080, "720p": 720, "540p": 540, "480p": 480}
-"""Lines of a picture of the whole sensor by `video_resolution`."""
+_FULL = (1080, 1440, 2160)
+"""Lines of a picture of the whole sensor that QTM names, by the sensor; no smaller sensor makes videos."""
+_CROPPED = 8
+"""Lines by which a picture of part of the sensor may differ from the resolution's name: 1080p has 1088."""
+_LINES = re.compile(r"(\d{3,4})[pi]", re.ASCII)
+_VIDEO = ("video", "hybrid", "none")
+"""Words in the models of cameras that take videos: Miqus Video (Plus), Miqus Hybrid; none is not known."""
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
 DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
@@ -39,19 +46,35 @@ def _cameras(
     """The video cameras where the file tells them by `model` from marker cameras, else all of them."""
     if content.syntax != "XML" or content.value.tag != root or content.value.find(path.split("/")[0]) is None:
         return None
-    cameras = []
-    for number, camera in enumerate(chosen(content.value, path, model)):
+    cameras, used = [], chosen(content.value, path, model)
+    notes, unnamed = list[str](), dict[str, list[str]]()
+    for number, camera in enumerate(used):
         place = f"{content.path}: camera {number}"
         if not camera.get(name):
             raise InputError(f"{place}: {name} is missing; export the calibration again")
         cameras.append(read(camera, f'{place} "{camera.get(name)}"'))
-    return WrittenRig(cameras, "mm", "z")
+        if (said := camera.get(_RESOLUTION, "")) and _LINES.fullmatch(said) is None:
+            unnamed.setdefault(said[:20], []).append(camera.attrib[name])
+    for said, names in unnamed.items():
+        size = "pictures are taken to be as large as fov_video says"
+        notes.append(f"{_RESOLUTION} is {said!r} of camera {listing(names)}; {size}")
+    for camera in content.value.findall(path):
+        if camera not in used:
+            why = "it is not calibrated" if _takes_video(camera, model) else "it takes no videos"
+            kind = f" ({camera.get(model, '')[:40]})" if camera.get(model) else ""
+            notes.append(f"camera {camera.get(name, '?')[:40]}{kind} is left out: {why}")
+    return WrittenRig(cameras, "mm", "z", notes=notes)
+
+
+def _takes_video(camera: ET.Element, model: str) -> bool:
+    return any(word in camera.get(model, "").lower() for word in _VIDEO)
 
 
 def chosen(root: ET.Element, path: str, model: str) -> list[ET.Element]:
     """The elements of the cameras that are read."""
     every = root.findall(path)
-    return [camera for camera in every if "video" in camera.get(model, "").lower()] or every
+    known = [each for each in every if each.get("calibrated", "true") != "false" and len(each) > 0] or every
+    return [each for each in known if _takes_video(each, model)] or known
 
 
 def _node(element: ET.Element | None, place: str, cure: str) -> Node:
@@ -81,18 +104,37 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
     R = TO_OPENCV @ turn
     wTc = pose(R, values("transform", "x y z"), "transform", place, centre=True)
     fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / SUBPIXEL
-    # The numbers are of the whole sensor; smaller pictures are resized, as Pose2Sim's read_qca has it.
-    resolution = camera.get("video_resolution", FULL)
-    if resolution not in LINES:
-        raise InputError(
-            f"{place}: video_resolution must be one of {' '.join(LINES)}, got {resolution[:20]!r}; film and"
-            " calibrate at one of these, or delete it where pictures are as large as fov_video says"
-        )
-    scale = LINES[resolution] / LINES[FULL]
+    scale = scale_of(camera)
     K = intrinsics(fx * scale, fy * scale, (cx - window[0]) * scale, (cy - window[1]) * scale)
     distortion = values("intrinsic", DISTORTION, dict.fromkeys(DISTORTION.split(), 0.0)).tolist()
     width, height = (window[2:] - window[:2] + 1) * scale
     return WrittenCamera(camera.attrib["serial"], K, wTc, (round(width), round(height)), distortion)
+
+
+def scale_of(camera: ET.Element) -> float:
+    """Pixels of a camera's pictures per pixel of its sensor, in which all numbers of the file are.
+
+    Pictures of fewer lines than the sensor's are resized, as Pose2Sim's read_qca has it, except those of a window
+    of so many lines. 1 where the file names no resolution.
+    """
+    named = _LINES.fullmatch(camera.get(_RESOLUTION, ""))
+    if named is None:
+        return 1.0
+    window, *whole = [_lines(camera, tag) for tag in ("fov_video", "fov_video_max", "fov_marker_max")]
+    sensor = max([lines for lines in (window, *whole) if lines is not None], default=0.0)
+    full, lines = max(each for each in _FULL if each <= max(sensor, _FULL[0])), int(named[1])
+    cropped = full > _FULL[0] and window is not None and 0 <= window - lines <= _CROPPED
+    return 1.0 if cropped else min(1.0, lines / full)
+
+
+def _lines(camera: ET.Element, tag: str) -> float | None:
+    """The shorter side of a window of the sensor, pixels; None where the file does not say it."""
+    found = camera.find(tag)
+    sides = [] if found is None else [found.get(side, "") for side in ("left", "right", "top", "bottom")]
+    if len(sides) == 0 or not all(map(is_number, sides)):
+        return None
+    left, right, top, bottom = map(float, sides)
+    return min(right - left, bottom - top) + 1
 
 
 def _vicon(camera: ET.Element, place: str) -> WrittenCamera:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import MIDDLE, read_json, read_text
+from shapepose_fg.core.storage.files import MIDDLE, read_json
 from shapepose_fg.io.camera_names import MOST_FRAME, in_order
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
@@ -90,6 +90,7 @@ class _Result(BaseModel):
     model_config = ConfigDict(strict=True)
     image_id: int | str
     keypoints: Annotated[list[float], Field(min_length=1)]
+    category_id: int | str | None = None
 
 
 _INSTANCES = TypeAdapter(list[_Instance])
@@ -122,9 +123,36 @@ def read_json_people(place: Path) -> CameraPeople:
     lists = _lists(place)
     if len(lists) == 1:
         items = JsonItems(lists[0], _LISTS)
-        if items.key is not None or (items.found and _known(next(iter(items), {"image_id": None}))):
+        first = next(iter(items), None)
+        of_a_picture = isinstance(first, dict) and "keypoints" in first and items.key == "instance_info"
+        if not of_a_picture and (items.key is not None or (items.found and (first is None or _known(first)))):
             return read_one_file(lists[0])
     return read_frame_files(place)
+
+
+def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
+    """The joints that MMPose's `meta_info` names: one by one, or as a data set; None where it names none."""
+    if not isinstance(meta, dict):
+        return None
+    names, count = meta.get("keypoint_id2name"), meta.get("num_keypoints")
+    if isinstance(names, dict):
+        count = count if type(count) is int and 0 <= count <= len(names) else len(names)
+        names = [names.get(str(place)) for place in range(count)]
+    if isinstance(names, list) and len(names) > 0 and all(isinstance(name, str) for name in names):
+        return tuple(names)
+    data_set = meta.get("dataset_name")
+    return data_set if isinstance(data_set, str) else None
+
+
+def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple[str, ...] | None:
+    """The joints that COCO's `categories` name for those in use; None where they name none, or different ones."""
+    found = set[tuple[str, ...]]()
+    for each in categories if isinstance(categories, list) else []:
+        names = each.get("keypoints") if isinstance(each, dict) else None
+        named = isinstance(names, list) and len(names) > 0 and all(isinstance(name, str) for name in names)
+        if named and (None in used or each.get("id") in used):
+            found.add(tuple(names))
+    return found.pop() if len(found) == 1 else None
 
 
 # A file per frame.
@@ -158,36 +186,47 @@ def read_frame_files(folder: Path) -> CameraPeople:
             names = " ".join(lists[:4])
             what = f"several JSON files without frame numbers ({names}); leave the one to be read"
         raise InputError(f"{folder}: {what}")
-    program = _OPENPOSE
+    program, joints = _OPENPOSE, None
     if not files[0].name.endswith("_keypoints.json"):
-        program = _PICTURES if read_text(files[0], most=MIDDLE).lstrip()[:1] == "[" else _POSE2SIM
+        content = read_json(files[0], most=MIDDLE)
+        picture = isinstance(content, list) or (isinstance(content, dict) and "instance_info" in content)
+        program = _PICTURES if picture else _POSE2SIM
+        joints = _joints_of_meta(content.get("meta_info")) if isinstance(content, dict) else None
     numbered = in_order([(frame_number(file), file) for file in files])
     first, last = numbered[0][0], numbered[-1][0]
     if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
         problem = f"{len(numbered)} files are numbered from {first} to {last}"
         raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
     gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
-    blocks = _frame_blocks(folder, program, numbered)
-    return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program])
+    blocks = _frame_blocks(folder, program, numbered, joints)
+    return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints)
 
 
-def _frame_blocks(folder: Path, program: str, numbered: list[tuple[int, Path]]) -> Iterator[PeopleBlock]:
+def _frame_blocks(
+    folder: Path, program: str, numbered: list[tuple[int, Path]], joints: str | tuple[str, ...] | None
+) -> Iterator[PeopleBlock]:
     """The people of the files, block by block."""
     counts = set[int]()
     for start in range(0, len(numbered), BLOCK_FRAMES):
         frames, people = list[int](), list[list[float]]()
         for number, file in numbered[start : start + BLOCK_FRAMES]:
-            found = _people_of_frame(file, program)
+            found = _people_of_frame(file, program, joints)
             people += found
             frames += [number] * len(found)
         _of_one_model(counts, people, folder, program)
         yield PeopleBlock.of(frames, people)
 
 
-def _people_of_frame(file: Path, program: str) -> list[list[float]]:
+def _people_of_frame(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
     """Flat keypoints of the people of a frame; people without keypoints are left out."""
     content, rerun, found = read_json(file, most=MIDDLE), _RERUN[program], list[list[float]]()
     if program == _PICTURES:
+        if isinstance(content, dict):
+            if _joints_of_meta(content.get("meta_info")) != joints:
+                raise InputError(
+                    f"{file}: meta_info names other joints than the first file; give one model's files"
+                )
+            content = content.get("instance_info")
         instances = validated_list(_INSTANCES, content, file, rerun)
         return [person.flat(f"{file}: [{number}]", program) for number, person in enumerate(instances)]
     for number, person in enumerate(validated(_Frame, content, file, rerun).people):
@@ -226,7 +265,7 @@ def read_one_file(path: Path) -> CameraPeople:
         )
     again = every if first is None else chain([first], every)
     if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
-        return _video(_Collected(path, _VIDEO), again)
+        return _video(_Collected(path, _VIDEO), again, items.others)
     program = _ALPHAPOSE if isinstance(first, dict) and isinstance(first.get("image_id"), str) else _COCO
     return _results(_Collected(path, program), again, items.others)
 
@@ -251,10 +290,12 @@ class _Collected:
         if len(rows) > 0:
             self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
 
-    def camera(self, frames: list[int], listed: tuple[int, int]) -> CameraPeople:
+    def camera(
+        self, frames: list[int], listed: tuple[int, int], joints: str | tuple[str, ...] | None
+    ) -> CameraPeople:
         """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
-        how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun}
+        how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun, "joints": joints}
         return CameraPeople(self.path, self.program, blocks, *listed, **how)
 
     def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
@@ -278,8 +319,10 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     `others` has the pictures' names when all items have been read.
     """
     path, program, images = people.path, people.program, list[int | str]()
+    categories = set[int | str | None]()
     for start, results in people.valid(_RESULTS, items):
         images += [person.image_id for person in results]
+        categories |= {person.category_id for person in results}
         places = (f"{path}: [{index}].keypoints" for index in range(start, start + len(results)))
         pairs = zip(results, places, strict=True)
         people.add([_checked(person.keypoints, place, program) for person, place in pairs])
@@ -295,7 +338,9 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
         if first.setdefault(frame, image) != image:
             problem = f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame}"
             raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
-    return people.camera([frames[image] for image in images], (min(first), max(first)) if first else (0, -1))
+    listed = (min(first), max(first)) if first else (0, -1)
+    joints = _joints_of_categories(others.get("categories"), categories)
+    return people.camera([frames[image] for image in images], listed, joints)
 
 
 def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
@@ -322,8 +367,8 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
     return int(match[1])
 
 
-def _video(people: _Collected, items: Iterable[Any]) -> CameraPeople:
-    """A list of frames, each with its people."""
+def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
+    """A list of frames, each with its people; `others` has `meta_info` when all have been read."""
     frames, first, last = list[int](), MOST_FRAME, -1
     for start, found in people.valid(_FRAMES, items):
         rows = list[list[float]]()
@@ -332,4 +377,5 @@ def _video(people: _Collected, items: Iterable[Any]) -> CameraPeople:
             frames += [frame.frame_id] * len(frame.instances)
             rows += [each.flat(f"{people.path}: [{index}].instances", _VIDEO) for each in frame.instances]
         people.add(rows)
-    return people.camera(frames, (first, last) if last >= 0 else (0, -1))
+    joints = _joints_of_meta(others.get("meta_info"))
+    return people.camera(frames, (first, last) if last >= 0 else (0, -1), joints)

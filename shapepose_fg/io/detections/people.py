@@ -68,6 +68,19 @@ class CameraPeople:
     """First and last number of frames in between that are missing from the files: no people are seen in them."""
     rerun: str = "write the detections again"
     """How the program makes pixels of the calibrated pictures."""
+    joints: str | tuple[str, ...] | None = None
+    """What the files say of their keypoints: each one's name, in their order, as the program calls it; or what the
+    program calls the whole layout ("coco", "BODY_25B"); None where they say nothing."""
+
+
+@dataclass(frozen=True)
+class DeclaredJoints:
+    """What the settings of a project say of the keypoints; names in the detections' own files go first."""
+
+    joints: str | tuple[str, ...]
+    """As in `CameraPeople.joints`."""
+    source: str
+    """Where it is said, for messages: "Config.toml: pose.pose_model"."""
 
 
 class KeptPeople:

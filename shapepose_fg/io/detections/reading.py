@@ -9,13 +9,14 @@ from pathlib import Path
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.skeleton import BODY_25, SKELETONS, Skeleton
+from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.json_people import read_json_people
-from shapepose_fg.io.detections.people import CameraPeople, KeptPeople, candidates_of, score_rule
+from shapepose_fg.io.detections.keypoint_layout import skeleton_of_people
+from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople, candidates_of, score_rule
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.skeleton_file import find_skeleton
 
@@ -49,7 +50,7 @@ FORMATS = [Format("4D Association's text", ("{}.txt",), read_association_text), 
 def read_detections(
     path: str | Path,
     rig: Rig,
-    skeleton: Skeleton | str | Path | None = None,
+    skeleton: Skeleton | str | Path | DeclaredJoints | None = None,
     kept: KeptArrays | None = None,
     own_frames: bool = False,
 ) -> DetectionTable:
@@ -57,13 +58,15 @@ def read_detections(
 
     The formats are `FORMATS`, told by the files (docs/conventions.md). Cameras that the rig does not have are
     passed over. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a TOML file that describes it;
-    without it the number of keypoints tells. `notes` of the table say what was made of the files. `kept` holds the
-    recording, in memory by default: with an empty `InFolder` it may be larger than that. With `own_frames` cameras
-    may have different numbers of frames. Raises InputError, one sentence that names file, place and cure.
+    without it the names of joints in the files tell it, or what a project declares, else the number of keypoints.
+    `notes` of the table say what was made of the files. `kept` holds the recording, in memory by default: with an
+    empty `InFolder` it may be larger than that. With `own_frames` cameras may have different numbers of frames.
+    Raises InputError, one sentence that names file, place and cure.
     """
     kept = InMemory() if kept is None else kept
     form, places, notes = find_places(Path(path), rig)
-    wanted = find_skeleton(skeleton)
+    declared = skeleton if isinstance(skeleton, DeclaredJoints) else None
+    wanted = None if isinstance(skeleton, DeclaredJoints) else find_skeleton(skeleton)
     streams, people, first = list[ViewStream](), list[KeptPeople](), 0
     for n, (place, camera) in enumerate(zip(places, rig.cameras, strict=True)):
         read = form.read(place, camera)
@@ -72,9 +75,10 @@ def read_detections(
         else:
             streams.append(read)
     if len(people) > 0:
-        skeleton, how = _skeleton_of_people(people, wanted), "made as middles, where a person's two ends were seen"
+        skeleton, told = skeleton_of_people(people, wanted, declared)
+        how = "made as middles, where a person's two ends were seen"
         streams, said, first = _streams_of(people, skeleton)
-        notes += said
+        notes += [*said, *told]
     else:
         skeleton, how = _skeleton_of_streams(streams, wanted), "made between the two that one neighbour links"
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
@@ -105,7 +109,7 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
             missing = rig.names[found.index(None)]
             raise InputError(
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}" are missing,'
-                f" {folder} holds {holds}; add them, or take the camera out of the calibration"
+                f" {folder} holds {holds}; add them, or choose cameras by --without {missing}"
             )
     # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
     offered = [each for each in entries if each.is_dir() or each.suffix == ".json"]
@@ -143,32 +147,6 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
     if wanted is not None and wanted.joints != skeleton.joints:
         raise InputError(f"{first.source}: these are joints of {skeleton.name}, not of {wanted.name}")
     return skeleton
-
-
-def _skeleton_of_people(people: Sequence[KeptPeople], wanted: Skeleton | None) -> Skeleton:
-    """The skeleton that all people have, by the number of keypoints."""
-    counts: dict[int, CameraPeople] = {}
-    for each in people:
-        if each.keypoint_count is not None:
-            counts.setdefault(each.keypoint_count, each.camera)
-    if len(counts) > 1:
-        (one, first), (other, second) = list(counts.items())[:2]
-        raise InputError(
-            f"{first.source} has people of {one} keypoints, {second.source} of {other}; give the detections of one"
-            " model for all cameras"
-        )
-    if len(counts) == 0:
-        return wanted or BODY_25
-    count, camera = next(iter(counts.items()))
-    place = f"{camera.source}: recognised as {camera.program} with {count} keypoints a person"
-    if wanted is not None and wanted.keypoint_count != count:
-        raise InputError(f"{place}, but {wanted.name} has {wanted.keypoint_count}; name its own")
-    found = wanted or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
-    if found is None:
-        known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
-        what = "MPI's: run OpenPose with --model_pose BODY_25" if count == 15 else "not known here"
-        raise InputError(f"{place}, which is {what}, or describe them in a --skeleton file; known are {known}")
-    return found
 
 
 def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:

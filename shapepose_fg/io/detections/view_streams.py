@@ -17,9 +17,12 @@ from shapepose_fg.io.detection_table import BLOCK_FRAMES, DetectionTable, keep_b
 
 MARGIN = 0.25
 """How far outside the picture a detector may place a joint, as a part of the picture's size."""
-_STRAY = 0.01
-"""Up to this share of a camera's joints may have no place in its picture: they are left out, and it is said. More
-are detections of other pictures, or another camera's calibration."""
+_STRAY = 0.05
+"""Largest share of a camera's joints far outside its picture: they are left out, and a note says so. More are
+detections of other pictures."""
+_BENT = 0.5
+"""Largest share of a camera's joints where its distortion cannot be undone, as in the corners of wide lenses. More
+mean that the coefficients are wrong."""
 _LEAST_SCORE = 1e-6
 """Below this a detector says that it saw nothing; products of such scores are 0."""
 
@@ -70,28 +73,89 @@ def assemble(
 ) -> DetectionTable:
     """Put the views of a recording together, one `ViewStream` per camera of `rig`, undistorted; held by `kept`.
 
-    With `own_frames` cameras may have different numbers of frames: nobody is seen in those that one lacks. Raises
-    InputError where the views hold different frames otherwise, or do not fit their pictures.
+    Where they hold different frames, those that all have are taken, and a note says it; with `own_frames` all are,
+    and nobody is seen in those that a camera lacks. Raises InputError where there are none, or where the views do
+    not fit their pictures.
     """
-    first = max(views, key=lambda view: view.frame_count)
-    for view in views:
-        same_count = view.frame_count == first.frame_count or own_frames
-        if same_count and view.first_number == first.first_number:
-            continue
-        for each in views:  # what is wrong with their files goes first
-            for _ in each.blocks:
-                pass
-        what = f"holds {view.frame_count} frames", f"holds {first.frame_count}"
-        if view.frame_count == first.frame_count:
-            what = f"starts at frame {view.first_number}", f"starts at frame {first.first_number}"
-        raise InputError(f"{view.source} {what[0]}, but {first.source} {what[1]}; give the same frames of each")
+    views, count, said = _longest(views) if own_frames else _common(views)
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
     for n, blocks in enumerate(zip_longest(*(view.blocks for view in views), fillvalue=_NOTHING)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
-        stop = min((n + 1) * BLOCK_FRAMES, first.frame_count)
+        stop = min((n + 1) * BLOCK_FRAMES, count)
         keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
     notes = tuple(note for each in ideal for reason in each.reasons for note in reason.note())
-    return DetectionTable(skeleton, kept, first.frame_count, tuple(view.source for view in views), notes)
+    return DetectionTable(skeleton, kept, count, tuple(view.source for view in views), (*said, *notes))
+
+
+def _longest(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
+    """The views, and how many frames the longest has; InputError where they begin at different numbers."""
+    first = max(views, key=lambda view: view.frame_count)
+    for view in views:
+        if view.first_number != first.first_number:
+            what = f"starts at frame {view.first_number}, but {first.source} starts at frame {first.first_number}"
+            raise InputError(f"{view.source} {what}; number the files of every camera from its first frame")
+    return views, first.frame_count, []
+
+
+def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
+    """The frames that all views have, how many these are, and what is said where some have others."""
+    start = max(view.first_number for view in views)
+    stop = min(view.first_number + view.frame_count for view in views)
+    if all(view.first_number == start and view.frame_count == stop - start for view in views):
+        return views, stop - start, []
+    spans = ", ".join(f"{view.source.name} {_span_words(view)}" for view in views[:12])
+    spans += f" and {len(views) - 12} more" if len(views) > 12 else ""
+    if start >= stop:
+        for view in views:  # what is wrong with their files goes first
+            for _ in view.blocks:
+                pass
+        cure = "give the same frames of each, numbered alike"
+        raise InputError(f"{views[0].source.parent}: no frame is there of every camera ({spans}); {cure}")
+    count, folder = stop - start, views[0].source.parent
+    note = (
+        f"{folder}: cameras have different frames ({spans}); the {count} that all have, {start} to {stop - 1}, are"
+        " used; where cameras were started apart, `shapepose-fg synchronise` finds when"
+    )
+    return [_part(view, start - view.first_number, count) for view in views], count, [note]
+
+
+def _span_words(view: ViewStream) -> str:
+    """How many frames a view has, and their numbers."""
+    if view.frame_count == 0:
+        return "has none"
+    return f"has {view.frame_count}, {view.first_number} to {view.first_number + view.frame_count - 1}"
+
+
+def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
+    """The `count` frames of a view that follow its first `lead`; all of its blocks are read."""
+
+    def blocks() -> Iterator[ViewCandidates]:
+        waiting, number = _NOTHING, 0
+        for n, block in enumerate(view.blocks, 1):
+            shifted = replace(block, frame=block.frame - lead)
+            waiting = _joined([waiting, shifted.only((shifted.frame >= 0) & (shifted.frame < count))])
+            end = (number + 1) * BLOCK_FRAMES
+            if end <= min(n * BLOCK_FRAMES - lead, count):
+                yield waiting.only(waiting.frame < end)
+                waiting, number = waiting.only(waiting.frame >= end), number + 1
+        while number * BLOCK_FRAMES < count:
+            end = (number + 1) * BLOCK_FRAMES
+            yield waiting.only(waiting.frame < end)
+            waiting, number = waiting.only(waiting.frame >= end), number + 1
+
+    return replace(view, frame_count=count, first_number=view.first_number + lead, blocks=blocks())
+
+
+def _joined(parts: Sequence[ViewCandidates]) -> ViewCandidates:
+    """Candidates of one view after each other."""
+    start = np.cumsum([0, *(len(part.frame) for part in parts)])
+    columns = ("joint", "xy", "confidence", "affinity")
+    joint, xy, confidence, affinity = (
+        np.concatenate([getattr(part.seen, name) for part in parts]) for name in columns
+    )
+    pairs = np.concatenate([part.seen.pairs + at for part, at in zip(parts, start[:-1], strict=True)])
+    frame = np.concatenate([part.frame for part in parts])
+    return ViewCandidates.of(frame, joint, xy, confidence, pairs, affinity)
 
 
 def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detections, Index, Index]:
@@ -138,20 +202,16 @@ def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int)
     there = np.flatnonzero(picture >= 0)
     every = [recording[frame] for frame in picture[there].tolist()]
     parts = [each.only(each.view == view) for each in every]
-    if len(parts) == 0:
-        return _NOTHING
-    start = np.cumsum([0, *(len(part) for part in parts)])
-    columns = ("joint", "xy", "confidence", "affinity")
-    joint, xy, confidence, affinity = (np.concatenate([getattr(part, name) for part in parts]) for name in columns)
-    pairs = np.concatenate([part.pairs + at for part, at in zip(parts, start[:-1], strict=True)])
-    return ViewCandidates.of(begin + np.repeat(there, np.diff(start)), joint, xy, confidence, pairs, affinity)
+    frames = [np.full(len(part), begin + frame) for part, frame in zip(parts, there.tolist(), strict=True)]
+    return _joined([_NOTHING, *map(ViewCandidates, frames, parts)])
 
 
 class _LeftOut:
     """Candidates of a camera that were left out for one reason."""
 
-    def __init__(self, what: str, cure: str) -> None:
-        self._what, self._cure, self._count, self._of, self._first = what, cure, 0, 0, ""
+    def __init__(self, cure: str, most: float) -> None:
+        self._cure, self._most = cure, most
+        self._count, self._of, self._first = 0, 0, ""
 
     def add(self, out: Mask, words: Callable[[int], str]) -> None:
         """Take in which candidates (D,) of a block are left out; `words` say where one of them is."""
@@ -162,9 +222,11 @@ class _LeftOut:
 
     def note(self) -> list[str]:
         """A sentence, if there were some; InputError where there are so many that it cannot be by chance."""
-        if self._count > _STRAY * self._of:
-            raise InputError(f"{self._first}; {self._cure}")
-        return [f"{self._first}; {self._count} {self._what} of {self._of} were left out"] if self._count else []
+        joints = "joint" if self._count == 1 else "joints"
+        share = f"{self._count} {joints} of {self._of} ({self._count / max(self._of, 1):.1%})"
+        if self._count > self._most * self._of:
+            raise InputError(f"{self._first}; so are {share} of this camera; {self._cure}")
+        return [f"{self._first}; {share} left out"] if self._count else []
 
 
 class _Undistorted:
@@ -173,8 +235,8 @@ class _Undistorted:
     def __init__(self, source: Path, camera: Camera) -> None:
         self.source, self.camera = source, camera
         self.reasons = (
-            _LeftOut("such joints", "give detections made on pictures of the calibrated size"),
-            _LeftOut("joints", "check the distortion coefficients in the calibration"),
+            _LeftOut("give detections made on pictures of the calibrated size", _STRAY),
+            _LeftOut("check the distortion coefficients in the calibration", _BENT),
         )
 
     def undistorted(self, view: ViewCandidates) -> ViewCandidates:
@@ -193,8 +255,15 @@ class _Undistorted:
         certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
         straight = camera.undistort(certain.seen.xy)
         undone = np.asarray(~np.isfinite(straight).all(axis=1))
-        what = f"{self.source}: the distortion of camera {camera.name} cannot be undone at frame"
-        self.reasons[1].add(undone, lambda row: f"{what} {certain.frame[row]}")
+        xy = certain.seen.xy
+
+        def bent(row: int) -> str:
+            return (
+                f"{self.source}: frame {certain.frame[row]} has a joint at pixel ({xy[row, 0]:.0f},"
+                f" {xy[row, 1]:.0f}), where the distortion of camera {camera.name} cannot be undone"
+            )
+
+        self.reasons[1].add(undone, bent)
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
 
 

@@ -1,0 +1,74 @@
+"""What factors of the user's own say of a joint, each in information form."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import split_key
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.estimation.window_graph import UserFactor, WindowGraph
+
+
+@dataclass(frozen=True)
+class FactorEvidence:
+    """What one factor of the user's own says of a joint."""
+
+    name: str
+    """The name of the function that made it."""
+    others: tuple[tuple[int, int, int], ...]
+    """The joints that it ties this one to: person, joint and frame of each."""
+    information: Array
+    """(3, 3) information on the joint's position, 1/m², from what is known of the factor's other variables without
+    this factor."""
+
+
+def factor_evidence(window: WindowGraph, t: int, joint: int) -> list[FactorEvidence]:
+    """What the user's factors on a joint in row `t` of a solved window say of its position.
+
+    The other variables of a factor are marginalised out with the covariance that they have in the graph without
+    the user's factors on this joint and frame. What factors in other frames say comes by motion.
+    """
+    key, ties = int(window.keys[t, joint]), window.ties
+    mine = [factor for factor in ties.active if key in factor.keys]
+    if len(mine) == 0 or window.failure:
+        return []
+    first = window.graph.size() - len(ties.active)  # the user's are the last
+    without = {first + n for n, factor in enumerate(ties.active) if key in factor.keys}
+    rest = gtsam.NonlinearFactorGraph()
+    for n in range(window.graph.size()):
+        if n not in without:
+            rest.push_back(window.graph.at(n))
+    wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)  # a joint that only these factors place
+    for other in {other for factor in mine for other in factor.keys}:
+        if window.ties.start.exists(other):
+            continue
+        rest.push_back(gtsam.PriorFactorPoint3(other, window.values.atPoint3(other), wide))
+    try:
+        marginals = gtsam.Marginals(rest, window.values)
+        return [_evidence(factor, key, window, marginals) for factor in mine]
+    except RuntimeError:  # a variable of the user's own that nothing else places: these factors say nothing
+        return []
+
+
+def _evidence(factor: UserFactor, key: int, window: WindowGraph, marginals: gtsam.Marginals) -> FactorEvidence:
+    linear = factor.factor.linearize(window.values)
+    keys = list(linear.keys())
+    sizes = [len(marginals.marginalCovariance(each)) for each in keys]
+    ends = np.cumsum([0, *sizes])
+    at = {each: np.arange(ends[n], ends[n + 1]) for n, each in enumerate(keys)}
+    H = np.asarray(linear.information())
+    mine, others = at[key], [each for each in keys if each != key]
+    information = H[np.ix_(mine, mine)]
+    if len(others) > 0:
+        rest = np.concatenate([at[each] for each in others])
+        joint = marginals.jointMarginalCovariance(gtsam.KeyVector(others))
+        covariance = np.block([[joint.at(a, b) for b in others] for a in others])
+        across = H[np.ix_(mine, rest)]
+        # H_jj - H_jo (H_oo + C^-1)^-1 H_oj, for a covariance C of any rank.
+        known = covariance @ np.linalg.inv(np.eye(len(rest)) + H[np.ix_(rest, rest)] @ covariance)
+        information = information - across @ known @ across.T
+    people = {each.track for each in window.ties.people}
+    named = [split_key(each) for each in others if not window.ties.start.exists(each)]
+    tied = tuple((each.person, each.joint, each.frame) for each in named if each.person in people)
+    return FactorEvidence(factor.name, tied, (information + information.T) / 2)

@@ -1,0 +1,182 @@
+"""Factors that join people of a window: one graph, against the closed form of linear Gaussian estimation."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import isotropic, joint_key
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
+from shapepose_fg.estimation.linearisation import Message, ObservationConfig
+from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.state_covariances import state_covariances
+from shapepose_fg.estimation.window_graph import WindowGraph, add_factors
+
+R, L = BODY_25.index("RWrist"), BODY_25.index("LWrist")
+EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
+MOTION = MotionModel.load(BODY_25.joints)
+APART_M, SIGMA_M = np.array([0.3, 0.0, 0.05]), 0.01
+
+
+@pytest.fixture
+def seen(five_cameras, two_people):
+    """Detections of three people (the third a metre beside the first), 6 px of noise: (3, 25, 5, 2)."""
+    truth = np.concatenate([two_people, two_people[:1] + np.array([1.0, 0.0, 0.0])])
+    xy = np.moveaxis(five_cameras.project(truth)[0], 0, 2)
+    return truth, xy + np.random.default_rng(0).normal(0, 6.0, xy.shape)
+
+
+def graphs(rig, truth, xy, frames=1) -> list[WindowGraph]:
+    """A graph for each person, in so many frames of the same detections."""
+    people, V = [], len(rig)
+    for number in range(len(truth)):
+        seen = Observations(
+            np.repeat(xy[number][None], frames, axis=0),
+            np.full((frames, 25, V), 0.8),
+            np.full((frames, 25, 3), np.nan),
+            np.full(frames, number),
+            np.arange(frames),
+            np.repeat(0.1 * np.arange(frames)[:, None], V, axis=1),
+        )
+        settings = EstimatorConfig(ObservationConfig(kernel="none"), EXACT)
+        sigmas, first = np.full((frames, 25, V), 6.0), np.repeat(truth[number][None], frames, axis=0)
+        people.append(WindowGraph(seen, sigmas, Views.of(rig), settings, MOTION, first=first))
+    return people
+
+
+def solve(people: list[WindowGraph], truth) -> None:
+    T = len(people[0])
+    nothing = Message(np.full((T, 25, 3), np.nan), np.zeros((T, 25, 3, 3)))
+    said = Message(np.repeat(truth[:, None], T, axis=1), np.tile(np.eye(3) / 0.03**2, (len(people), T, 25, 1, 1)))
+    for number, person in enumerate(people):
+        of_views = Message(said.xyz[number], said.information[number]) if T > 1 else nothing
+        person.prepare(np.ones((T, 25, 5), bool), of_views, nothing, np.repeat(truth[number][None], T, axis=0))
+    for person in people:
+        if person is person.ties.people[0]:
+            person.optimise()
+
+
+def box(window, keys):
+    """r = (left wrist - right wrist) - d: whoever comes before holds its left end."""
+    for other in window.partners:
+        if {window.track, other.track} == {0, 1}:
+            mine, theirs = window.shared(other)
+            for right, left in zip(keys[mine, R].tolist(), other.keys[theirs, L].tolist(), strict=True):
+                yield gtsam.BetweenFactorPoint3(right, left, APART_M, isotropic(3, SIGMA_M))
+
+
+def test_the_joint_posterior_is_that_of_the_closed_form(five_cameras, seen):
+    """Two independent Gaussians and a linear factor between them: Kalman's update of both."""
+    truth, xy = seen
+    alone = graphs(five_cameras, truth, xy)
+    solve(alone, truth)
+    before = [each[0][0] for each in state_covariances(alone)]
+    tied = graphs(five_cameras, truth, xy)
+    add_factors(tied, [box])
+    assert [person.track for person in tied[0].ties.people] == [0, 1] and tied[2].ties.people == [tied[2]]
+    solve(tied, truth)
+    after = [each[0][0] for each in state_covariances(tied)]
+
+    a, b, A, B = alone[0].positions[0, R], alone[1].positions[0, L], before[0][R], before[1][L]
+    gain = np.linalg.inv(A + B + SIGMA_M**2 * np.eye(3))
+    missing = (b - a) - APART_M
+    # The projections are not linear: 20 cm away their information is a little another.
+    np.testing.assert_allclose(tied[0].positions[0, R] - a, A @ gain @ missing, atol=0.1 * np.linalg.norm(missing))
+    np.testing.assert_allclose(after[0][R], A - A @ gain @ A, rtol=0.35, atol=3e-6)
+    across = gtsam.Marginals(tied[0].graph, tied[0].values).jointMarginalCovariance(
+        gtsam.KeyVector([int(tied[0].keys[0, R]), int(tied[1].keys[0, L])])
+    )
+    found = across.at(int(tied[0].keys[0, R]), int(tied[1].keys[0, L]))
+    expected = A @ gain @ B
+    assert np.linalg.norm(found - expected) < 0.3 * np.linalg.norm(expected)
+    # Joints that no factor is on, and people whom none ties, are as they were.
+    others = np.delete(np.arange(25), [R])
+    np.testing.assert_allclose(tied[0].positions[0, others], alone[0].positions[0, others], atol=1e-6)
+    np.testing.assert_array_equal(tied[2].positions, alone[2].positions)
+
+
+def test_a_shared_point_of_the_user_s_own(five_cameras, seen):
+    """Both hold the same point: a variable that is nobody's joint."""
+    truth, xy = seen
+    point = gtsam.symbol("b", 0)
+
+    def same_point(window, keys):
+        if window.track > 1:
+            return
+        start = gtsam.Values()
+        start.insert(point, window.first[0, R])
+        yield start
+        yield gtsam.BetweenFactorPoint3(int(keys[0, R]), point, np.zeros(3), isotropic(3, 0.001))
+
+    tied = graphs(five_cameras, truth, xy)
+    add_factors(tied, [same_point])
+    solve(tied, truth)
+    held = tied[0].values.atPoint3(point)
+    for person in tied[:2]:
+        assert person.failure == "" and np.linalg.norm(person.positions[0, R] - held) < 0.01
+    assert len(tied[0].ties.people) == 2 and not tied[2].values.exists(point)
+    of_both = state_covariances(tied)
+    assert all(np.isfinite(of_both[n][0][0, R]).all() for n in range(2))
+
+
+def test_over_time_both_move_and_both_are_surer(five_cameras, seen):
+    truth, xy = seen
+    alone, tied = graphs(five_cameras, truth, xy, frames=4), graphs(five_cameras, truth, xy, frames=4)
+    add_factors(tied, [box])
+    solve(alone, truth)
+    solve(tied, truth)
+    apart = tied[1].positions[:, L] - tied[0].positions[:, R]
+    assert np.linalg.norm(apart - APART_M, axis=1).max() < 0.05
+    for one, other in ((tied[0], alone[0]), (tied[1], alone[1])):
+        assert one.failure == "" and np.isfinite(one.positions).all() and np.isfinite(one.velocity).all()
+        assert np.abs(one.positions - other.positions).max() > 0.01
+    reported = [each[0][:, joint] for each, joint in zip(state_covariances(tied), (R, L), strict=False)]
+    assert all(np.isfinite(each).all() for each in reported)
+    # With the error that lasts in it the box is known to its sigma, whoever holds it.
+    marginals = gtsam.Marginals(tied[0].graph, tied[0].values)
+    keys = gtsam.KeyVector([int(tied[0].keys[2, R]), int(tied[1].keys[2, L])])
+    joint = marginals.jointMarginalCovariance(keys)
+    blocks = [[joint.at(a, b) for b in keys] for a in keys]
+    between = blocks[0][0] + blocks[1][1] - blocks[0][1] - blocks[1][0]
+    assert np.sqrt(np.trace(between) / 3) < 1.05 * SIGMA_M
+
+
+def test_joints_that_another_person_s_factors_tie_are_coupled(five_cameras, seen):
+    """A body's prior for one wrist must not have the other's views, where both are tied to a third."""
+    truth, xy = seen
+    people = graphs(five_cameras, truth, xy)
+
+    def both_wrists(window, keys):
+        for other in window.partners:
+            for wrist in (R, L):
+                yield gtsam.RangeFactor3(int(keys[0, wrist]), int(other.keys[0, R]), 0.5, isotropic(1, 0.05))
+
+    add_factors(people[:2], [both_wrists])
+    assert people[0].coupled == [{R, L}] and people[1].coupled == []
+    assert np.flatnonzero(people[1].touched).tolist() == [R]
+
+
+def test_factors_that_cannot_count_are_refused_or_counted(five_cameras, seen):
+    truth, xy = seen
+    people = graphs(five_cameras, truth, xy)
+    for key, words in (
+        (joint_key(7, R, 0), "joint 4, frame 0"),
+        (joint_key(1, R, 99), "frame 99"),
+        (gtsam.symbol("b", 3), "b3"),
+    ):
+        lost = gtsam.RangeFactor3(int(people[0].keys[0, R]), key, 0.5, isotropic(1, 0.05))
+        with pytest.raises(ValueError, match=words) as refused:
+            add_factors(people, [lambda window, keys, lost=lost: [lost]])
+        assert "gtsam.Values" in str(refused.value)
+    taken = gtsam.Values()
+    taken.insert(int(people[0].keys[0, R]), np.zeros(3))
+    with pytest.raises(ValueError, match="is a joint's"):
+        people[0].add(taken)
+    people = graphs(five_cameras, truth, xy)
+    add_factors(people, [box])
+    start = truth.copy()
+    start[1, L] = np.nan
+    solve(people, start)
+    assert len(people[0].ties.factors) == 1 and len(people[0].ties.active) == 0

@@ -1,0 +1,234 @@
+"""Which joints keypoints are: names in the files, a project's settings, the user's word, their number."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.joint_names import keypoint_names
+from shapepose_fg.core.skeleton import COCO_17, SKELETONS
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+
+K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
+
+
+@pytest.fixture
+def rig() -> Rig:
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][0, 3] = 1
+    return Rig(tuple(Camera(name, K, pose, (1001, 801)) for name, pose in zip("ab", poses, strict=True)), "-y")
+
+
+def spelt(point: str) -> str:
+    """A joint as COCO and MMPose spell it."""
+    if point in ("head", "Head", "spine2"):
+        return {"head": "upper_neck", "Head": "head_top", "spine2": "spine"}[point]
+    return {"R": "right_", "L": "left_"}.get(point[0], "") + point[1:].lower() if point[1:2].isupper() else point
+
+
+def person(names: list[str]) -> list[list[float]]:
+    """x and y of a standing person's joints, each told by its place."""
+    return [[300.0 + 7 * place, 200.0 + 3 * place] for place in range(len(names))]
+
+
+def data_set(names: list[str] | None, count: int) -> dict:
+    found = {"id": 1, "name": "person"} | ({} if names is None else {"keypoints": names})
+    keypoints = [value for xy in person([""] * count) for value in (*xy, 0.9)]
+    return {
+        "images": [{"id": 5, "file_name": "img_000000.jpg"}],
+        "annotations": [{"image_id": 5, "category_id": 1, "keypoints": keypoints}],
+        "categories": [{"id": 2, "name": "dog", "keypoints": ["nose", "tail"]}, found],
+    }
+
+
+def video(meta: dict, count: int) -> dict:
+    instance = {"keypoints": person([""] * count), "keypoint_scores": [0.9] * count}
+    return {"meta_info": meta, "instance_info": [{"frame_id": 1, "instances": [instance]}]}
+
+
+def written(folder: Path, *contents: dict) -> Path:
+    for name, content in zip("ab", contents * (2 // len(contents)), strict=True):
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    return folder
+
+
+def places(table) -> dict[str, float]:
+    """The column of each joint of the first camera's first person, which tells its place among the keypoints."""
+    first = table[0].only(table[0].view == 0)
+    made = [joint for joint, _, _ in table.skeleton.middles]
+    return {
+        table.skeleton.joints[joint]: round((x - 300) / 7)
+        for joint, x in zip(first.joint.tolist(), first.xy[:, 0].tolist(), strict=True)
+        if joint not in made
+    }
+
+
+NAMED = [each for each in SKELETONS.values() if all(keypoint_names(each))]
+
+
+@pytest.mark.parametrize("skeleton", NAMED, ids=lambda each: each.name)
+@pytest.mark.parametrize("write", ["data set", "video"])
+def test_names_in_the_file_are_obeyed_in_any_order(tmp_path, rig, skeleton, write):
+    order = np.random.default_rng(3).permutation(skeleton.keypoint_count)
+    names = [keypoint_names(skeleton)[place] for place in order]
+    spelled = [spelt(name) for name in names]
+    meta = {"dataset_name": "coco", "keypoint_id2name": {str(n): name for n, name in enumerate(spelled)}}
+    content = data_set(spelled, len(names)) if write == "data set" else video(meta, len(names))
+    table = read_detections(written(tmp_path, content), rig)
+    assert places(table) == {name: place for place, name in enumerate(names)}
+    assert any("names its joints" in note for note in table.notes)
+
+
+def test_a_data_set_s_name_is_obeyed(tmp_path, rig):
+    assert read_detections(written(tmp_path, video({"dataset_name": "h36m"}, 17)), rig).skeleton.name == "H36M_17"
+    assert read_detections(written(tmp_path, video({"dataset_name": "coco"}, 17)), rig).skeleton is COCO_17
+    table = read_detections(written(tmp_path, video({"dataset_name": "horse10"}, 17)), rig)
+    assert any("says horse10, which are not known here" in note for note in table.notes)
+
+
+def test_joints_that_a_body_lacks_are_passed_over_and_said(tmp_path, rig):
+    names = [*keypoint_names(COCO_17), "mouth_left", "left_thumb"]
+    table = read_detections(written(tmp_path, data_set(names, 19)), rig)
+    assert table.skeleton.joints == COCO_17.joints
+    assert any("passed over: mouth_left left_thumb" in note for note in table.notes)
+
+
+def test_names_that_cannot_be_are_refused(tmp_path, rig):
+    def refused(*contents: dict, **options) -> str:
+        with pytest.raises(InputError) as caught:
+            read_detections(written(tmp_path, *contents), rig, **options)
+        return str(caught.value)
+
+    names = keypoint_names(COCO_17)
+    assert "names 17 joints, and its people have 18 keypoints" in refused(data_set(names, 18))
+    assert "there is no RHip and no LHip" in refused(
+        data_set([n if "Hip" not in n else "tail" for n in names], 17)
+    )
+    other = [names[0], *names[:0:-1]]
+    assert "b.json names other joints than" in refused(data_set(names, 17), data_set(other, 17))
+    assert "but BODY_25 has 25" in refused(data_set(names, 17), skeleton="BODY_25")
+
+
+def test_the_user_s_word_goes_before_the_file_s_and_it_is_said(tmp_path, rig):
+    table = read_detections(written(tmp_path, data_set(keypoint_names(COCO_17)[::-1], 17)), rig, "COCO_17")
+    assert table.skeleton is COCO_17
+    assert any("names its joints, but they are read as COCO_17, as you said" in note for note in table.notes)
+
+
+@pytest.mark.parametrize("names", [None, [], [f"kp{n}" for n in range(17)]], ids=["none", "empty", "numbers"])
+def test_files_without_names_are_read_by_their_number(tmp_path, rig, names):
+    table = read_detections(written(tmp_path, data_set(names, 17)), rig)
+    assert table.skeleton is COCO_17
+    assert any("17 keypoints a person and no names of joints: taken as those of COCO_17" in n for n in table.notes)
+
+
+def test_mmpose_s_pictures_of_its_demo_are_read(tmp_path, rig):
+    names = keypoint_names(SKELETONS["H36M_17"])
+    meta = {"keypoint_id2name": {str(place): name for place, name in enumerate(names)}}
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        for frame in range(3):
+            content = {"meta_info": meta, "instance_info": video({}, 17)["instance_info"][0]["instances"]}
+            (tmp_path / name / f"results_{frame:06d}.json").write_text(json.dumps(content))
+    table = read_detections(tmp_path, rig)
+    assert len(table) == 3 and places(table) == {name: place for place, name in enumerate(names)}
+    file = tmp_path / "a" / "results_000002.json"
+    file.write_text(json.dumps({"meta_info": {"dataset_name": "coco"}, "instance_info": []}))
+    with pytest.raises(InputError, match="names other joints than the first file"):
+        read_detections(tmp_path, rig)
+
+
+def project(folder: Path, pose: str, count: int = 25) -> Path:
+    """A Pose2Sim project whose people have `count` keypoints, and [pose] says `pose`."""
+    (folder / "calibration").mkdir(parents=True)
+    table = (
+        '[{0}]\nname = "{0}"\nsize = [1001.0, 801.0]\nmatrix = [[1000.0, 0, 500], [0, 1000.0, 400], [0, 0, 1]]\n'
+        "distortions = [0.0, 0.0, 0.0, 0.0]\nrotation = [0.0, 0.0, 0.0]\ntranslation = [{1}, 0.0, 0.0]\n"
+        "fisheye = false\n"
+    )
+    calibration = table.format("a", "0.0") + table.format("b", "1.0")
+    (folder / "calibration" / "Calib.toml").write_text(calibration)
+    (folder / "Config.toml").write_text(f"{pose}\n[project]\nframe_rate = 30\n")
+    values = [value for xy in person([""] * count) for value in (*xy, 0.9)]
+    for name in "ab":
+        (folder / "pose" / f"{name}_json").mkdir(parents=True)
+        file = folder / "pose" / f"{name}_json" / f"{name}_000000.json"
+        file.write_text(json.dumps({"people": [{"pose_keypoints_2d": values}]}))
+    return folder
+
+
+CUSTOM = """
+[pose]
+pose_model = "MINE"
+[pose.MINE]
+name = "CHip"
+id = "None"
+  [[pose.MINE.children]]
+  name = "RHip"
+  id = 3
+    [[pose.MINE.children.children]]
+    name = "RKnee"
+    id = "4"
+  [[pose.MINE.children]]
+  name = "LHip"
+  id = 2
+  [[pose.MINE.children]]
+  name = "RShoulder"
+  id = 0
+  [[pose.MINE.children]]
+  name = "LShoulder"
+  id = 1
+"""
+
+
+@pytest.mark.parametrize(
+    ("pose", "count", "name", "said"),
+    [
+        ("[pose]\npose_model = 'BODY_25B'", 25, "BODY_25B", "pose.pose_model says BODY_25B"),
+        ("[pose]\npose_model = 'Body_with_feet'", 26, "HALPE_26", "says Body_with_feet"),
+        ("[pose]\npose_model = 'COCO'", 18, "COCO_18", "says COCO"),
+        ("[pose]\npose_model = 'MPII'", 15, "MPI_15", "says MPII"),
+        ("[pose]\npose_model = 'BLAZEPOSE'", 33, "BLAZEPOSE_33", "says BLAZEPOSE"),
+        ("[pose]\npose_model = 'Body_with_feet'", 17, "COCO_17", "which have 26 keypoints, not 17"),
+        ("[pose]\npose_model = 'unheard_of'", 17, "COCO_17", "which are not known here"),
+        ("[pose]\n", 17, "COCO_17", "no names of joints"),
+        (CUSTOM, 8, "NAMED_8", "names its joints"),
+    ],
+)
+def test_a_project_s_pose_model_is_obeyed(tmp_path, pose, count, name, said):
+    found = read_pose2sim_project(project(tmp_path / "trial", pose, count))
+    table = read_detections(found.detections, read_rig(found.calibration), found.joints)
+    assert table.skeleton.name == name and any(said in note for note in table.notes)
+    if name == "NAMED_8":
+        assert places(table) == {"RShoulder": 0, "LShoulder": 1, "LHip": 2, "RHip": 3, "RKnee": 4}
+
+
+def test_a_project_that_makes_no_sense_is_refused(tmp_path):
+    with pytest.raises(InputError, match="pose must be a table"):
+        read_pose2sim_project(project(tmp_path / "trial", "pose = 3"))
+
+
+def test_human36m_s_names_in_a_real_coco_file(shared_cases):
+    rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
+    table = read_detections(shared_cases / "h36m_coco" / "detections_end_to_end", rig)
+    assert {"MidHip", "LHip", "RHip", "Neck", "Head", "LAnkle", "RWrist"} <= set(table.skeleton.joints)
+    # The feet are where people stand: the lowest in every picture.
+    frame = table[0]
+    ankles = np.isin(frame.joint, [table.skeleton.index("LAnkle"), table.skeleton.index("RAnkle")])
+    assert frame.xy[ankles, 1].min() > frame.xy[~ankles, 1].mean()
+
+
+def test_mmpose_s_cases(shared_cases, rig):
+    table = read_detections(shared_cases / "mmpose" / "mm_video_h36m", rig_of(rig, (1920, 1080)))
+    assert "spine2" in table.skeleton.joints and "Nose" not in table.skeleton.joints
+    table = read_detections(shared_cases / "mmpose" / "mm_image_demo", rig_of(rig, (1920, 1080)))
+    assert table.skeleton is COCO_17 and len(table) == 20
+
+
+def rig_of(rig: Rig, size: tuple[int, int]) -> Rig:
+    return Rig(tuple(Camera(each.name, each.K, each.wTc, size) for each in rig.cameras), rig.up)
