@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from pathlib import Path
 from threading import Timer
 from typing import Any
 
@@ -60,8 +61,9 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
     groups = [p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])]
     for group in sorted(groups, key=_work, reverse=True):
         min(shares, key=_work).extend(group)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", f"from {__name__} import main; main()"]
+    # The same packages as here, whatever lies in the working folder.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)}
+    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()"]
     started = list[subprocess.Popen[bytes]]()
     try:
         for share in shares:

@@ -48,14 +48,14 @@ def kept_folder() -> Path | None:
     if _can_keep(wanted):
         return wanted
     try:
-        temporary, owner = Path(tempfile.mkdtemp(prefix="shapepose-fg-")), os.getpid()
+        temporary, owner = Path(tempfile.mkdtemp(prefix="shapepose-fg-kernels-")), os.getpid()
         atexit.register(lambda: os.getpid() != owner or shutil.rmtree(temporary, ignore_errors=True))
         if _can_keep(temporary):
             os.environ[_GIVEN] = str(temporary)
             return temporary
     except OSError:
         pass
-    return wanted if wanted.is_dir() else None
+    return wanted if os.path.isdir(wanted) else None  # noqa: PTH112
 
 
 def _can_keep(place: Path) -> bool:
