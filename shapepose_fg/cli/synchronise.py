@@ -4,7 +4,6 @@ import json
 import shlex
 from pathlib import Path
 
-import numpy as np
 import typer
 
 from shapepose_fg.cli.found_cameras import MOST_S, check_most, found_clocks, show_clocks
@@ -20,13 +19,12 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import InputError
 
 
 @grouped
 def synchronise(
     seen: DetectionOptions,
-    fps: float | None = option(TIME, "Frames a second of all cameras; needed."),
+    fps: float | None = option(TIME, "Frames a second of all cameras; needed where no times.csv says it."),
     most: float = option(TIME, "Largest offset that is looked for, seconds.", MOST_S),
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "File for the times of all frames, as --timestamps takes it."),
@@ -38,15 +36,13 @@ def synchronise(
     """
     from shapepose_fg.io.timestamps import write_timestamps
 
-    if fps is None:
-        raise InputError("--fps: missing; say how many frames a second the cameras took")
     check_fps(fps)
     check_most(most)
     rig = seen.still_rig("synchronise")
-    found, count = found_clocks(seen.detections, rig, seen.skeleton, fps, most, frames)
+    found, taken_s = found_clocks(seen.detections, rig, seen.skeleton, fps, most, frames)
     problems = found.undetermined(rig)
     if output is not None and not problems:
-        write_timestamps(output, rig.names, found.at(np.arange(count) / fps))
+        write_timestamps(output, rig.names, taken_s)
     if as_json:
         print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
     else:
@@ -65,5 +61,5 @@ def synchronise(
             options = {"--calibration": seen.calibration, "--detections": seen.detections}
             options |= {"--skeleton": seen.skeleton} | seen.said()
             options |= {"--timestamps": output, "--output": "results"}
-            print(f"{output}: times of {count} frames")
+            print(f"{output}: times of {len(taken_s)} frames")
             print(next_reconstruct(options))
