@@ -25,6 +25,26 @@ from shapepose_fg.simulation import Scene, built_in_scene, simulate
 # first, for processes that are begun by a test, too.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+SEED = int(os.environ.get("SHAPEPOSE_TEST_SEED", "0"))
+"""Another number here makes every seeded generator of a test process another one: bounds must hold for all."""
+
+
+def pytest_configure() -> None:
+    """Let `SHAPEPOSE_TEST_SEED` change all that tests draw."""
+    if SEED != 0:
+        np.random.default_rng = _other_generator
+
+
+_seeded = np.random.default_rng
+
+
+def _other_generator(seed: object = None) -> np.random.Generator:
+    """The generator of a seed, of several numbers or of none, together with `SEED`."""
+    if seed is None or isinstance(seed, np.random.Generator | np.random.BitGenerator | np.random.SeedSequence):
+        return _seeded(seed)
+    return _seeded([SEED, *np.atleast_1d(np.asarray(seed, dtype=np.uint64)).tolist()])
+
+
 # A person who stands with the arms a little out: BODY_25, metres, x to their left, z up, facing -y.
 STANDING = np.array(
     [

@@ -31,12 +31,13 @@ from factors import (
 )
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
-from shapepose_fg.estimation.linearisation import Message, symmetric_roots
+from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import leads
@@ -469,7 +470,7 @@ class WindowGraph:
         if not said.where.any():
             return []
         known, keys = said.message.known & said.where, self._offset_keys[source]
-        roots = symmetric_roots(said.message.information[known] / said.scale)
+        roots = symmetric_root(said.message.information[known] / said.scale)
         xyz, share = said.message.xyz[known], said.errors.white_share
         factors = lasting_prior_factors(self.keys[known], keys[known], xyz, roots, share)
         # An offset in every frame between two, so that a joint's states are a chain.

@@ -106,7 +106,7 @@ def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array
         times, poses, surely = known[0].time_s, known[0].wTb, known[0].covariance_at(known[0].time_s)
     stays = (times != time_s) & (times >= times[times <= since_s].max(initial=-np.inf))
     times, poses = np.append(times[stays], time_s), np.append(poses[stays], pose[None], axis=0)
-    order, surely = np.argsort(times), np.append(surely[stays], covariance[None], axis=0)
+    order, surely = np.argsort(times, kind="stable"), np.append(surely[stays], covariance[None], axis=0)
     goes = Trajectory(name, times[order], poses[order], surely[order])
     cameras = [replace(each, carrier=name) if each is camera else each for each in rig.cameras]
     return replace(rig, cameras=tuple(cameras), trajectories=(*others, goes))

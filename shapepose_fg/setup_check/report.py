@@ -16,9 +16,9 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.trust import BELIEVED, Spell, Trust
-from shapepose_fg.setup_check.diagnosis import Diagnosis, diagnose
+from shapepose_fg.setup_check.diagnosis import Build, Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, triangulate
-from shapepose_fg.setup_check.findings import Finding, Kind, sentence
+from shapepose_fg.setup_check.findings import ADULT_M, Finding, Kind, sentence
 from shapepose_fg.setup_check.fit import match
 from shapepose_fg.setup_check.matching import GATE, miss_px, size_of
 
@@ -83,7 +83,7 @@ class SetupReport:
     trust: Trust = BELIEVED
     """Which cameras a reconstruction is better without: for `reconstruct`."""
     notes: tuple[str, ...] = ()
-    """What is odd and not of the set-up: people whose detections are biased in one view."""
+    """What is odd and need not be a mistake: people whose detections are biased in one view, or who are small."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
         """The warnings, and what a reconstruction makes of them."""
@@ -136,8 +136,19 @@ def check_setup(
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
-        tuple(sentence(finding, rig) for finding in diagnosis.biased),
+        (*(sentence(finding, rig) for finding in diagnosis.biased), *_children(build)),
     )
+
+
+def _children(build: Build | None) -> list[str]:
+    """What a rig in which people are as tall as children may be instead."""
+    if build is None or not build.are_children:
+        return []
+    lengths = f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they should be"
+    return [
+        f"people come out {build.stature:.2f} m tall, as children are; if they are adults, {lengths}: check the"
+        " size of the board's squares"
+    ]
 
 
 def _spells(spells: Sequence[Spell], names: Sequence[str]) -> list[dict[str, Any]]:
@@ -348,7 +359,9 @@ def _shapes(people: Reconstruction) -> list[str]:
 
 
 def _speeds(people: Reconstruction) -> list[str]:
-    """People who move as nobody does."""
+    """People who move as nobody does, where rows have identities."""
+    if not people.run.get("configuration", {}).get("temporal", True):
+        return []
     hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
     order = np.lexsort((people.frame, people.person))
     x, t = people.joints[order][:, hips].mean(axis=1), people.time_s[order]

@@ -42,6 +42,7 @@ def installed():
     pytest.importorskip("distributed", reason="Dask is an extra")
 
 
+@pytest.mark.slow
 def test_results_come_in_order_whoever_does_them():
     with cluster(None, 2, "") as pool:
         assert list(pool.map(late, range(6))) == list(range(6))
