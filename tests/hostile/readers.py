@@ -95,7 +95,7 @@ def _people(program: str) -> Prepare:
 
 def _others(program: str) -> Prepare:
     def prepare(folder: Path, seed: int) -> Read:
-        rig, found = people.two_cameras("left", "right"), others.random_people(seed, (640, 480))
+        rig, found = people.two_cameras("cam_0", "cam_1"), others.random_people(seed, (640, 480))
         others.WRITERS[program](folder, rig, found)
         return lambda: read_detections(folder, rig)
 
