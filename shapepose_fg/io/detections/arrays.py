@@ -91,7 +91,7 @@ def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bo
     try:
         version = npy.read_magic(stream)
         shape, fortran, dtype = _HEADERS[version](stream)
-    except (ValueError, KeyError, SyntaxError, TypeError, EOFError, RecursionError, MemoryError):
+    except Exception:  # NumPy parses the header as Python's own text, with all errors of that
         raise InputError(f"{path}: this is no NumPy array; {what_it_is(path)}") from None
     if dtype.hasobject:
         raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
