@@ -1,8 +1,9 @@
 """Behind the newest moment: windows of frames solved by stage II, in order, here or in processes of their own."""
 
-from collections import deque
+from collections import Counter, deque
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.live.cameras import CameraWatch
+from shapepose_fg.live.clock import CommonClock
 from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
 from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
@@ -51,6 +53,12 @@ class LiveState:
     """Which cameras are believed."""
     views: ViewsInStep
     """Views that wait for the others of their frame."""
+    clock: CommonClock[tuple[Any, ...]]
+    """Views that wait until other cameras confirm their time. Not saved."""
+    begin: Moment
+    """The people before the first frame: nobody, and the next identity. Not saved."""
+    without_pose: Counter[int] = field(default_factory=Counter)
+    """By view: how many more were given without a pose than with one. Not saved."""
     slots: list[Slot] = field(default_factory=list)
     """The last frames, in order of time: those that are not settled, and what a window needs before them."""
     before: Detections | None = None
@@ -63,6 +71,7 @@ class LiveState:
     dropped: int = 0
     unrefined: int = 0
     not_taken: int = 0
+    jumps: int = 0
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ LEVELS = (
     "viz.overlay setup_check",
     "calibration",
     "io.export",
-    "live.ends viz.report",
+    "live.outputs viz.report",
     "evaluation",
     "cli.options",
     "cli.pictures cli.found_cameras",
