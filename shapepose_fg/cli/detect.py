@@ -20,6 +20,7 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
+from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
@@ -130,9 +131,8 @@ def detect(
     with progress("detecting", "pictures") as done:
         try:
             joints, unreadable = run_detection(run, done)
-        except KeyboardInterrupt:
-            note("stopped; the same command goes on from here")
-            raise
+        except Stopped as stop:
+            raise Stopped(stop.number, "the same command goes on from here") from None
     for name, failed in zip(rig.names, unreadable, strict=True):
         if failed > 0:
             note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; nothing is detected there")
