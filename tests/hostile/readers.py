@@ -351,6 +351,7 @@ READERS: dict[str, Prepare] = {
     "recordings": _recordings,
     "batch": _batch,
     "ONNX": streams.network,
+    "ONNX's file": streams.network_file,
     "photo, JPEG": streams.photo("JPEG"),
     "photo, PNG": streams.photo("PNG"),
     "photo, TIFF": streams.photo("TIFF"),

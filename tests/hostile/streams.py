@@ -12,6 +12,7 @@ import numpy as np
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.io.lenses import lenses_of
 from shapepose_fg.io.ros.mcap_files import read_views
@@ -24,6 +25,12 @@ from tests.hostile.trying import Prepare
 
 Read = Callable[[], object]
 FRAMES = 4
+
+
+def network_file(folder: Path, seed: int) -> Read:
+    """A network of which only its file is read."""
+    network(folder, seed)
+    return lambda: read_onnx(folder / "n.onnx")
 
 
 def network(folder: Path, seed: int) -> Read:
