@@ -35,7 +35,7 @@ from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
+from shapepose_fg.estimation.in_time import motion_of, near_in_time, spanned
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
@@ -388,8 +388,10 @@ class WindowGraph:
         of_views = of_body = self.present & self.with_offsets
         density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
         if self.temporal:
-            share, speed = self._motion.views.white_share, speeds(near, self.times_s)
-            density = self._motion.density(speed)
+            share = self._motion.views.white_share
+            variance = 1.0 / np.maximum(np.linalg.eigvalsh(views.information)[..., 0], 1.0)
+            speed, turning = motion_of(near, variance, self.times_s)
+            density = self._motion.density_of(speed, turning)
             if lost is not None:
                 around = near_in_time(lost, self.times_s, self._motion.around_s)
                 of_body = self.present & (self.with_offsets | around)

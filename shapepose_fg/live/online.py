@@ -401,7 +401,7 @@ class OnlineReconstructor:
     def _take(self, detections: Detections, times: Array) -> None:
         """A frame, in its place among those that came."""
         time_s, slots = float(times.mean()), self._state.slots
-        detections, _ = thinned(detections, len(self.rig), self._config.candidates)
+        detections, _ = thinned(detections, self.rig, self._config.candidates)
         if len(slots) > 0 and time_s <= slots[-1].time_s:
             self._insert(detections, times, time_s)
             return

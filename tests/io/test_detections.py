@@ -11,6 +11,7 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.camera_names import match_names
 from shapepose_fg.io.detections import read_detections
 
 LIMBS = BODY_25.limbs
@@ -387,3 +388,20 @@ def test_folders_of_unequal_length(shared_cases):
     rig = read_rig(shared_cases / "unequal" / "calibration.json")
     table = read_detections(shared_cases / "unequal" / "det", rig)
     assert len(table) == 11 and "the 11 that all have, 0 to 10, are used" in table.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "names", "expected"),
+    [
+        (["23087", "23088"], ["walk_Miqus_2_23088", "walk_Miqus_1_23087"], [1, 0]),
+        (["int_cam1", "int_cam2"], ["cam02", "cam01"], [1, 0]),
+        (["2022-09-19_synced_Cam1", "2022-09-19_synced_Cam2"], ["view_02", "view_01"], [1, 0]),
+        (["2025-04-23_camera_0", "2025-04-23_camera_1"], ["camera_0", "camera_1", "camera_2"], [0, 1]),
+        (["Left", "Right"], ["right_cam", "left_cam"], [1, 0]),
+        (["a1", "a2"], ["walk_3_x", "walk_4_x"], None),
+        (["left", "right"], ["front", "back"], None),
+        (["cam1", "cam2"], ["trial1", "trial2", "trial_1"], None),
+    ],
+)
+def test_cameras_are_told_by_parts_of_names(cameras, names, expected):
+    assert match_names(cameras, names) == expected

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
@@ -121,11 +119,11 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")
-        found, count = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
+        found, taken_s = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
         show_clocks(found, rig)
         if problems := found.undetermined(rig):
             raise InputError(f"--synchronise: {'; '.join(problems)}")
-        write_timestamps(file, rig.names, found.at(np.arange(count) / asked.fps))
+        write_timestamps(file, rig.names, taken_s)
     return replace(known, request=replace(asked, fps=None, timestamps=file))
 
 
@@ -203,7 +201,7 @@ class _Run:
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
-            "cameras": _digest(asdict(task.rig)),
+            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "versions": versions(),
             "program": program_digest(),
         }
@@ -262,7 +260,8 @@ class _Run:
         rig = kept_rig(kept, rig) or rig
         people = result.reconstruction(every=every)
         report = self.report
-        checked = None if report is None else result_check(report, people, task.detections, rig, frames)
+        looked_at = [frame for frame in frames if frame % every == 0]
+        checked = None if report is None else result_check(report, people, task.detections, rig, looked_at)
         result = result if checked is None else result.with_run(**checked.as_run())
         people = people.with_run(**result.run)
         note(*set_aside(output))
@@ -282,7 +281,7 @@ class _Run:
             write_moments(output / MOMENTS, rig, self.recording.picture)
         else:
             (output / MOMENTS).unlink(missing_ok=True)
-        summary = summary_table(result, people, self.task, seconds)
+        summary = summary_table(result, people, self.task, seconds, unchecked=checked is None)
         for n, written in enumerate(self._written(result, people, rig, every)):
             summary.add_row("" if n > 0 else "written", written)
         if file is not None and known is not None and result.shapes is not None:
