@@ -38,7 +38,7 @@ def network(folder: Path, seed: int) -> Read:
     from tests.detection2d.conftest import onnx_file
 
     onnx_file(folder / "n.onnx", np.random.default_rng(seed).normal(size=(3, 3, 2, 2)).astype(np.float32))
-    if not Path("canary").exists():
+    if Path("files").is_dir() and not Path("canary").exists():  # the folder of fuzz.py
         os.mkfifo("canary")  # who opens it waits for ever
 
     def read() -> None:
