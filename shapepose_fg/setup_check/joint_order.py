@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shapepose_fg.body.joint_order import exchanges, fit_of_order
+from shapepose_fg.body.joint_order import LIKE_A_BODY, exchanges, fit_of_order
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.detections import DetectionSequence
@@ -93,6 +93,10 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
         more = more[np.isfinite(more)]
         return (float(more.mean()), float((more > 0).mean())) if len(more) >= _FEWEST else (0.0, 0.0)
 
+    fits = fit_of_order(flat[:, order], names)
+    fits = fits[np.isfinite(fits)]
+    if len(fits) < _FEWEST or fits.mean() < LIKE_A_BODY:
+        return False
     in_picture, share = gain(flat)
     in_pictures = in_picture > _GAIN_2D and share > _SHARE_2D
     if space is None:
@@ -110,7 +114,8 @@ def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
         if each.keypoint_count == len(own) and keypoint_names(each) != own:
             more = fit_of_order(people, keypoint_names(each)) - found
             more = more[np.isfinite(more)]
-            if len(more) >= _FEWEST and (more > 0).mean() > _SHARE and more.mean() > gain:
+            sure = len(more) >= _FEWEST and (more > 0).mean() > _SHARE
+            if sure and more.mean() > gain and np.nanmean(found) + more.mean() > LIKE_A_BODY:
                 best, gain = each.name, float(more.mean())
     return best
 

@@ -99,7 +99,9 @@ def _sure(fits: Array) -> int | None:
     """The layout that people fit best (L, N), if surely better than the most usual, the first, or that one if it
     surely fits better than all others; else None.
     """
-    if fits.shape[1] == 0:
+    from shapepose_fg.body.joint_order import LIKE_A_BODY
+
+    if fits.shape[1] == 0 or fits.mean(axis=1).max() < LIKE_A_BODY:
         return None
     best = int(np.argmax(fits.mean(axis=1)))
     rivals = range(1, len(fits)) if best == 0 else range(1)
