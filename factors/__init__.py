@@ -28,6 +28,7 @@ from factors.keys import (
     velocity_keys,
 )
 from factors.lasting import lasting_blocks, lasting_difference_factors, lasting_prior_factors, offset_factors
+from factors.linear import linear_factor
 from factors.motion import (
     CONSTANT_ACCELERATION,
     CONSTANT_VELOCITY,
@@ -105,6 +106,7 @@ __all__ = [
     "lasting_blocks",
     "lasting_difference_factors",
     "lasting_prior_factors",
+    "linear_factor",
     "load_graph",
     "make_calibration",
     "make_camera",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from factors.camera_of import camera_of
 from factors.keys import format_key
-from factors.motion import contained
+from factors.linear import linear_factor
 from factors.noise import ESTIMATORS, robust
 from factors.projection import make_calibration, make_camera
 
@@ -281,7 +281,7 @@ def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
         raise ValueError("a linear factor must be a Jacobian on points: rotations turn what it was linearised at")
     off = factor.error(origin) - (b @ b) / 2
     if abs(off) > 1e-9 * max(b @ b, 1.0):
-        raise ValueError("has no point of linearisation, and so no error: make it with factors.motion.contained")
+        raise ValueError("has no point of linearisation, and so no error: make it with factors.linear_factor")
     return {"data": [A.tolist(), b.tolist()]}
 
 
@@ -314,9 +314,7 @@ def _linear(keys: list[int], A: Any, b: Any) -> gtsam.NonlinearFactor:
     if not (rows and keys) or len(set(keys)) < len(keys):
         raise ValueError("needs rows, and keys that differ")
     blocks = np.split(_array(A, (rows, 3 * len(keys))), len(keys), axis=1)
-    unit = noiseModel.Unit.Create(rows)
-    conditional = gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, _array(b, (rows,)), unit)
-    return contained([gtsam.JacobianFactor(conditional)], np.array(keys))[0]
+    return linear_factor(keys, blocks, _array(b, (rows,)))
 
 
 def _key(number: Any) -> int:

@@ -8,9 +8,12 @@ import numpy as np
 from gtsam import noiseModel
 from numpy.typing import NDArray
 
+Factor = gtsam.NoiseModelFactor | gtsam.LinearContainerFactor
+"""What can be checked."""
+
 
 def assert_jacobian(
-    factor: gtsam.NoiseModelFactor,
+    factor: Factor,
     values: gtsam.Values,
     *,
     step: float = 1e-5,
@@ -33,16 +36,21 @@ def assert_jacobian(
         )
 
 
-def assert_zero_at_truth(factor: gtsam.NoiseModelFactor, values: gtsam.Values, *, atol: float = 1e-9) -> None:
-    """AssertionError unless the factor's raw residual at `values` is zero to `atol`, in its own unit."""
-    residual = np.asarray(factor.unwhitenedError(values))
+def assert_zero_at_truth(factor: Factor, values: gtsam.Values, *, atol: float = 1e-9) -> None:
+    """AssertionError unless the factor's raw residual at `values` is zero to `atol`, in its own unit; of a
+    `LinearContainerFactor`, which has no noise of its own, in standard deviations.
+    """
+    linear = isinstance(factor, gtsam.LinearContainerFactor)
+    residual = _of_linear(factor, values) if linear else np.asarray(factor.unwhitenedError(values))
     if not np.all(np.abs(residual) <= atol):
         raise AssertionError(f"residual at the truth is {residual}, not zero to {atol}")
 
 
-def analytic_jacobian(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> NDArray[np.float64]:
+def analytic_jacobian(factor: Factor, values: gtsam.Values) -> NDArray[np.float64]:
     """The factor's own Jacobian (residual, tangent), over its Gaussian noise, in the order of its keys."""
     jacobian, right_hand_side = factor.linearize(values).jacobian()
+    if isinstance(factor, gtsam.LinearContainerFactor):
+        return np.asarray(jacobian)
     model = factor.noiseModel()
     if not isinstance(model, noiseModel.Robust):
         return np.asarray(jacobian)
@@ -54,9 +62,7 @@ def analytic_jacobian(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> N
     return np.asarray(jacobian) / scale
 
 
-def numeric_jacobian(
-    factor: gtsam.NoiseModelFactor, values: gtsam.Values, step: float = 1e-5
-) -> NDArray[np.float64]:
+def numeric_jacobian(factor: Factor, values: gtsam.Values, step: float = 1e-5) -> NDArray[np.float64]:
     """Central differences of the residual over its Gaussian noise, in the order of the factor's keys."""
     columns = []
     keys = list(factor.keys())
@@ -71,13 +77,25 @@ def numeric_jacobian(
     return np.stack(columns, axis=1)
 
 
-def _whitened(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> NDArray[np.float64]:
+def _whitened(factor: Factor, values: gtsam.Values) -> NDArray[np.float64]:
     """Residual over its Gaussian noise, without any robust kernel."""
+    if isinstance(factor, gtsam.LinearContainerFactor):
+        return _of_linear(factor, values)
     residual = np.asarray(factor.unwhitenedError(values))
     model = factor.noiseModel()
     if isinstance(model, noiseModel.Robust):
         model = model.noise()
     return residual if model is None else np.asarray(model.whiten(residual))
+
+
+def _of_linear(factor: gtsam.LinearContainerFactor, values: gtsam.Values) -> NDArray[np.float64]:
+    """Residual of a linear factor over its noise; AssertionError where its error is not that of it."""
+    residual = -np.asarray(factor.linearize(values).jacobian()[1])
+    if not np.isclose(factor.error(values), residual @ residual / 2, rtol=1e-9, atol=1e-12):
+        raise AssertionError(
+            "the factor has no point of linearisation, and so no error: make it with linear_factor"
+        )
+    return residual
 
 
 def _moved(values: gtsam.Values, key: int, delta: NDArray[np.float64]) -> gtsam.Values:

@@ -19,12 +19,31 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.pipeline.pipeline import reconstruct
-from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
 # first, for processes that are begun by a test, too.
 sys.path.insert(0, str(Path(__file__).parents[1]))
+
+SEED = int(os.environ.get("SHAPEPOSE_TEST_SEED", "0"))
+"""Another number here makes every seeded generator of a test process another one: bounds must hold for all."""
+
+
+def pytest_configure() -> None:
+    """Let `SHAPEPOSE_TEST_SEED` change all that tests draw."""
+    if SEED != 0:
+        np.random.default_rng = _other_generator
+
+
+_seeded = np.random.default_rng
+
+
+def _other_generator(seed: object = None) -> np.random.Generator:
+    """The generator of a seed, of several numbers or of none, together with `SEED`."""
+    if seed is None or isinstance(seed, np.random.Generator | np.random.BitGenerator | np.random.SeedSequence):
+        return _seeded(seed)
+    return _seeded([SEED, *np.atleast_1d(np.asarray(seed, dtype=np.uint64)).tolist()])
+
 
 # A person who stands with the arms a little out: BODY_25, metres, x to their left, z up, facing -y.
 STANDING = np.array(
@@ -36,12 +55,6 @@ STANDING = np.array(
         [0.19, -0.12, 0.02], [0.12, 0.08, 0.03], [-0.14, -0.15, 0.02], [-0.19, -0.12, 0.02], [-0.12, 0.08, 0.03],
     ]
 )  # fmt: skip
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _modules_are_loaded_once_for_all_processes() -> None:
-    """Fork the worker processes of all tests off one that has imported the pipeline."""
-    get_ready("shapepose_fg.pipeline.pipeline")
 
 
 @pytest.fixture(scope="session")

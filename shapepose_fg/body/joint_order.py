@@ -25,7 +25,7 @@ not find anywhere on the person."""
 _NEAREST = 0.02
 """Least distance that counts, as a part of the mean distance: joints in one pixel are no nearer."""
 LIKE_A_BODY = -1.0
-"""Least fit in pictures of what looks like a body at all, nats a pair: people around an operating table have -1."""
+"""Least fit in pictures of what looks like a body at all, nats a pair; gowned people at a table have -1."""
 _LEAST_PAIRS = 20
 """With fewer distances a person does not tell an order: seven joints."""
 

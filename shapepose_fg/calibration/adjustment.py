@@ -18,6 +18,7 @@ from factors.noise import diagonal, gaussian, isotropic_models, robust_kernel
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.decompositions import nearest_rotation
 
 TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
 """Where a camera's parameters stand: rad and m along its own axes, log of the focal length, px, k1 k2 p1 p2."""
@@ -184,8 +185,7 @@ def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Came
     K, distortion = lens.K(), camera.distortion.copy()
     if free:
         distortion[:4] = lens.vector()[5:]
-    U, _, Vt = np.linalg.svd(wTc[:3, :3])
-    wTc[:3, :3] = U @ Vt
+    wTc[:3, :3] = nearest_rotation(wTc[:3, :3])
     return replace(camera, K=K, wTc=wTc, distortion=distortion)
 
 

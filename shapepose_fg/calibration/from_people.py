@@ -29,6 +29,7 @@ from shapepose_fg.calibration.relative import Relative, relative
 from shapepose_fg.calibration.tracks import OneClock, Tracks, seen_at
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import Skeleton
@@ -318,8 +319,7 @@ def _apart_by(one: Rig, other: Rig) -> tuple[Array, Array]:
     near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
     a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
     size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)
-    U, _, Vt = np.linalg.svd(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
     grown = float(np.linalg.norm(b) / max(np.linalg.norm(a), 1e-9))
     turned = np.einsum("ij,vjk,vik->v", R, near, far)  # the traces of far' R near
     turns = np.degrees(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))

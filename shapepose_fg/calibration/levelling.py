@@ -11,9 +11,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 from shapepose_fg.setup_check.diagnosis import build_of
+from shapepose_fg.setup_check.findings import ADULT_M as ADULT_M
 
-ADULT_M = 1.70
-"""Mean stature of adults, of the body model as of the world's women and men."""
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
 """One sigma of the scale by `build_of`, as parts of it: what bones vary by among adults, and among people of a
 known stature; what a detector's joints, and where in the world people are from, are off by for all of them."""

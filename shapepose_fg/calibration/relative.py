@@ -15,6 +15,7 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.decompositions import basis_across
 from shapepose_fg.setup_check.matching import MIN_JOINTS
 
 _LOOK_S = 0.2
@@ -197,7 +198,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         # b . [t] (w x R a) = (b x t) . (w x R a) = w . (R a x (b x t)); b . (dt x R a) = dt . (R a x b)
         J = np.concatenate([_crossed(turned, b @ cross(t)), _crossed(turned, b)], axis=1) / scale[:, None]
         to = np.zeros((5, 6))
-        to[:3, :3], to[3:, 3:] = np.eye(3), np.linalg.svd(t[None])[2][1:]
+        to[:3, :3], to[3:, 3:] = np.eye(3), basis_across(t)
         J, usual = J @ to.T, max(_RANSAC / 2, float(np.median(np.abs(r))))
         weight = 1 / (1 + (r / usual) ** 2)
         H = J.T @ (weight[:, None] * J)

@@ -1,13 +1,14 @@
 """The command `live`: people as they are, from detections as they come in."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from shapepose_fg.cli.options import INPUT, RESULT, RUN, TIME, CameraOptions, check_workers, grouped, option
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import naming
+from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
-    from shapepose_fg.live.online import OnlineReconstructor
+    from shapepose_fg.live.online import OnlineReconstructor, Said
 
 
 @grouped
@@ -24,39 +25,59 @@ def live(
     """Follow people while a detector runs: a line per camera and picture in, lines of people out.
 
     In: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people". Out: "now" after each
-    frame, "settled" when its people are refined. Ends with the input. A socket listens on this machine only,
-    unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2 messages. `rerun` starts that viewer,
-    rerun+http://HOST:9876/proxy is one that runs.
+    frame, "settled" when its people are refined. Ends with the input; a line that cannot be used is left out with
+    a note. A socket listens on this machine only, unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2
+    messages. `rerun` starts that viewer, rerun+http://HOST:9876/proxy is one that runs.
     """
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.io.skeleton_file import find_skeleton
-    from shapepose_fg.live.ends import published, views
+    from shapepose_fg.live.inputs import feed
+    from shapepose_fg.live.notes import SparingNotes
     from shapepose_fg.live.online import OnlineReconstructor
+    from shapepose_fg.live.outputs import published
 
     check_workers(workers)
     rig, joints = cameras.rig(), find_skeleton(skeleton) or BODY_25
-    frames, said = 0, 0
     with (
+        SparingNotes(note) as of_lines,
+        SparingNotes(note) as of_readers,
+        SparingNotes(note) as of_cameras,
         naming("--lag, --calibration", "change them"),
-        published(output or (), rig, note) as publish,
+        published(output or (), rig, of_readers) as publish,
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
-        for view in views(detections, rig, joints, note):
-            with naming(detections or "standard input"):
-                people.push_view(*view)
-            if people.report().frames > frames:
-                frames = people.report().frames
+        frames, jumps, said = 0, 0, None
+
+        def push(*view: Any) -> None:
+            nonlocal frames, jumps, said
+            people.push_view(*view)
+            report = people.report()
+            if report.frames > frames:
+                frames = report.frames
                 publish("now", people.people())
                 publish("settled", people.settled())
-            said = _say(people, said)
+            if report.jumps > jumps:
+                jumps = report.jumps
+                of_cameras(f"all cameras jumped to {view[2]:.2f} s")
+            said = _say(people, said, of_cameras)
+
+        try:
+            feed(detections, rig, joints, of_lines, push)
+        except InputError:
+            publish("settled", people.finish())
+            raise
         publish("settled", people.finish())
         report = people.report()
-    note(f"{report.frames} frames, {report.late} of them late; {report.dropped} came too late or twice")
+    out = f"{report.dropped} came too late, twice or at another time"
+    note(f"{report.frames} frames, {report.late} of them late; {out}")
 
 
-def _say(people: "OnlineReconstructor", said: int) -> int:
-    """Tell what was noticed of cameras since; returns how much has been told."""
+def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]) -> "Said | None":
+    """Tell what was noticed of cameras since the `last` that was told; returns the last one now."""
     events = people.said()
-    for each in events[said:]:
-        note(f"{each.time_s:.2f} s: camera {each.camera} {each.state.name.lower()}")
-    return len(events)
+    if len(events) == 0 or events[-1] is last:
+        return last
+    new = next((n for n, each in enumerate(reversed(events)) if each is last), len(events))
+    for each in events[len(events) - new :]:
+        note(f"{each.time_s:.2f} s: camera {each.camera} {each.state.name.lower().replace('_', ' ')}")
+    return events[-1]

@@ -4,7 +4,7 @@ import inspect
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.detection_table import DetectionTable
+    from shapepose_fg.io.detections.people import DeclaredJoints
+    from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
 INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
@@ -198,6 +200,54 @@ class DetectionOptions(CameraOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Located(DetectionOptions):
+    """Cameras and detections whose places are known."""
+
+    source: "Pose2SimProject | None" = None
+    """The project that they are of."""
+
+    @property
+    def joints(self) -> "str | DeclaredJoints | None":
+        """The detector's joints as the user says, else as the project does."""
+        return self.skeleton or (None if self.source is None else self.source.joints)
+
+    def rate(self, given: "RateOptions") -> "RateOptions":
+        """When frames were taken as the user says, else as the project does."""
+        if self.source is None or given.fps is not None or given.timestamps is not None:
+            return given
+        return replace(given, fps=self.source.fps)
+
+    def given(self) -> dict[str, object]:
+        """The same for the next command, but for the calibration and what is said of it."""
+        place = {"--detections": self.detections} if self.source is None else {"--project": self.source.folder}
+        return place | {"--skeleton": self.skeleton}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectOptions(DetectionOptions):
+    """Cameras and what a 2D detector saw with them, each given or that of a Pose2Sim project."""
+
+    detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
+    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
+
+    def located(self) -> Located:
+        """Where they are; InputError where that is not said."""
+        calibration, detections, source = self.calibration, self.detections, None
+        if self.project is not None:
+            from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+
+            source = read_pose2sim_project(self.project)
+            note(*source.notes)
+            calibration, detections = calibration or source.calibration, detections or source.detections
+        if calibration is None or detections is None:
+            places = {"--calibration": calibration, "--detections": detections}
+            missing = " and ".join(name for name, place in places.items() if place is None)
+            raise InputError(f"{missing}: missing; give them, or --project with the folder of a Pose2Sim project")
+        given = {each.name: getattr(self, each.name) for each in fields(DetectionOptions)}
+        return Located(**given | {"calibration": calibration, "detections": detections, "source": source})
+
+
+@dataclass(frozen=True, kw_only=True)
 class TimeOptions:
     """When frames were taken."""
 
@@ -205,7 +255,12 @@ class TimeOptions:
     timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
 
     def read(
-        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path, own_frames: bool = False
+        self,
+        detections: Path,
+        skeleton: "str | DeclaredJoints | None",
+        rig: "Rig",
+        kept: Path,
+        own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes | None]":
         """The recording, and the times of its frames where something says them (`read_recording`); what is odd is
         said.
@@ -227,7 +282,12 @@ class RateOptions(TimeOptions):
     frames: str | None = frames_option()
 
     def part(
-        self, detections: Path, skeleton: str | None, rig: "Rig", kept: Path, own_frames: bool = False
+        self,
+        detections: Path,
+        skeleton: "str | DeclaredJoints | None",
+        rig: "Rig",
+        kept: Path,
+        own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes, range]":
         """The recording, its times, 30 frames a second where nothing says them, and the frames that are used."""
         from shapepose_fg.core.frame_times import FrameTimes

@@ -10,7 +10,7 @@ from shapepose_fg.cli.found_cameras import report_option
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
-    DetectionOptions,
+    ProjectOptions,
     RateOptions,
     grouped,
     json_option,
@@ -42,11 +42,11 @@ class FreedomOptions:
 
 @grouped
 def refine_calibration(
-    seen: DetectionOptions,
+    given: ProjectOptions,
     rate: RateOptions,
     may: FreedomOptions,
     output: Path = option(
-        RESULT, "File, or folder, for the refined cameras, in the format they came in.", REQUIRED
+        RESULT, "File, or folder, for the refined cameras: in the format they came in, or .json.", REQUIRED
     ),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
@@ -57,13 +57,16 @@ def refine_calibration(
     """
     from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.refinement import refine
-    from shapepose_fg.io.calibration import write_like
+    from shapepose_fg.io.calibration import check_target, write_like
 
     if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
         raise InputError("--off-degrees must be above 0, up to 20, and --off-cm above 0, up to 200")
     if may.stature is not None and not 0.5 <= may.stature <= 2.5:
         raise InputError(f"--stature {may.stature:g}: must be 0.5 to 2.5 metres")
+    seen = given.located()
+    rate, source = seen.rate(rate), cast(Path, seen.calibration)
     rig = seen.still_rig("refine-calibration")
+    check_target(source, output)
     if may.reference is not None and may.reference not in rig.names:
         raise InputError(f"--reference {may.reference}: no such camera; give one of {' '.join(rig.names)}")
     bent = [camera.name for camera in rig.cameras if camera.lens == "fisheye" or camera.distortion[4:].any()]
@@ -79,13 +82,13 @@ def refine_calibration(
         0.02 if may.lens else 0.0,
     )
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, times, span = rate.part(seen.detections, seen.skeleton, rig, Path(folder))
+        recording, times, span = rate.part(seen.detections, seen.joints, rig, Path(folder))
         reference = None if may.reference is None else rig.names.index(may.reference)
         with progress("refining", "rounds") as done:
             found = refine(recording, rig, times, span, freedom, reference, done)
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
-    form, output = write_like(cast(Path, seen.calibration), new, output, cast("Unit | None", seen.unit))
+    form, output = write_like(source, new, output, cast("Unit | None", seen.unit))
     heads, rows = _figures(found, may)
     lines = _words(found, may)
     if report is not None:
@@ -113,9 +116,9 @@ def refine_calibration(
         print("\n".join(lines[1:]))
         print(f"{output}: {form}")
         # Our own file says axis, unit and size itself.
-        options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
+        options = {"--calibration": output} | seen.given()
         options |= {} if form == "our own rig file" else seen.said()
-        print(next_reconstruct(options | rate.given() | {"--output": "results"}))
+        print(next_reconstruct(options | rate.given() | ({} if seen.source else {"--output": "results"})))
 
 
 def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from shapepose_fg.cli.options import (
-    DetectionOptions,
+    ProjectOptions,
     TimeOptions,
     frame_range,
     frames_option,
@@ -20,7 +20,7 @@ from shapepose_fg.cli.terminal import show
 
 @grouped
 def check_calibration(
-    seen: DetectionOptions,
+    given: ProjectOptions,
     pictures: PictureOptions,
     rate: TimeOptions,
     frames: str | None = frames_option(),
@@ -35,9 +35,10 @@ def check_calibration(
     from shapepose_fg.setup_check.report import check_setup
     from shapepose_fg.setup_check.table import setup_report
 
+    seen = given.located()
     rig = seen.still_rig("check-calibration")
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, _ = rate.read(seen.detections, seen.skeleton, rig, Path(folder))
+        recording, _ = rate.read(seen.detections, seen.joints, rig, Path(folder))
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
         if pictures.videos is None and (used := seen.detections / FOOTAGE).is_file():
             sizes = detected_sizes(used, rig)

@@ -11,7 +11,7 @@ from shapepose_fg.cli.found_cameras import MOST_S, check_most, found_clocks, sho
 from shapepose_fg.cli.options import (
     RESULT,
     TIME,
-    DetectionOptions,
+    ProjectOptions,
     check_fps,
     frames_option,
     grouped,
@@ -25,7 +25,7 @@ from shapepose_fg.core.errors import InputError
 
 @grouped
 def synchronise(
-    seen: DetectionOptions,
+    given: ProjectOptions,
     fps: float | None = option(TIME, "Frames a second of all cameras; needed."),
     most: float = option(TIME, "Largest offset that is looked for, seconds.", MOST_S),
     frames: str | None = frames_option(),
@@ -38,12 +38,14 @@ def synchronise(
     """
     from shapepose_fg.io.timestamps import write_timestamps
 
+    seen = given.located()
+    fps = seen.source.fps if fps is None and seen.source is not None else fps
     if fps is None:
         raise InputError("--fps: missing; say how many frames a second the cameras took")
     check_fps(fps)
     check_most(most)
     rig = seen.still_rig("synchronise")
-    found, count = found_clocks(seen.detections, rig, seen.skeleton, fps, most, frames)
+    found, count = found_clocks(seen.detections, rig, seen.joints, fps, most, frames)
     problems = found.undetermined(rig)
     if output is not None and not problems:
         write_timestamps(output, rig.names, found.at(np.arange(count) / fps))
@@ -62,8 +64,8 @@ def synchronise(
             f"of videos: shapepose-fg detect {shlex.join(words)}, and --fps, --calibration and the rest as before"
         )
         if output is not None:
-            options = {"--calibration": seen.calibration, "--detections": seen.detections}
-            options |= {"--skeleton": seen.skeleton} | seen.said()
-            options |= {"--timestamps": output, "--output": "results"}
+            options = seen.given() | seen.said() | {"--timestamps": output}
+            calibration = {"--calibration": seen.calibration, "--output": "results"}
+            options = options if given.project is not None else calibration | options
             print(f"{output}: times of {count} frames")
             print(next_reconstruct(options))

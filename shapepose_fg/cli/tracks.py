@@ -210,6 +210,9 @@ def _solver(folder: Path) -> "Solve | None":
     with Reconstruction.open(folder) as opened:
         if not opened.run.get("configuration", {}).get("temporal", False):
             return None
+        if functions := opened.run.get("extra_factors"):
+            names = ", ".join(map(str, functions))
+            note(f"who is solved anew is so without the factors of {names}, which only Python has")
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
         from shapepose_fg.pipeline.solving import Solver, solve_rows

@@ -13,7 +13,7 @@ def least_cost_pairs(cost: Array) -> tuple[Index, Index]:
     """
     if len(cost) > cost.shape[1]:
         columns, rows = least_cost_pairs(cost.T)
-        order = np.argsort(rows)
+        order = np.argsort(rows, kind="stable")
         return rows[order], columns[order]
     price, row_of = np.zeros(cost.shape[1]), np.full(cost.shape[1], -1)
     worth, column_of = np.zeros(len(cost)), np.full(len(cost), -1)

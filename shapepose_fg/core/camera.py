@@ -10,6 +10,7 @@ import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
 from shapepose_fg.core.arrays import Array, Index, Real
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
 from shapepose_fg.core.trajectory import Carried, Trajectory
 
@@ -101,11 +102,14 @@ class Camera:
         """
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
-        if not np.isfinite(cTw).all() or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE:
-            raise ValueError(f"camera {name}: the rotation must be orthonormal and finite")
-        U, _, Vt = np.linalg.svd(R)
+        if (
+            not np.isfinite(cTw).all()
+            or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE
+            or np.linalg.det(R) < 0
+        ):
+            raise ValueError(f"camera {name}: the rotation must be orthonormal with determinant 1, and finite")
         wTc = np.eye(4)
-        wTc[:3, :3] = (U @ Vt).T
+        wTc[:3, :3] = nearest_rotation(R).T
         wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
         coefficients = padded_distortion(distortion, lens)
         return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)

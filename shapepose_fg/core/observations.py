@@ -67,5 +67,5 @@ def rows_in(before: Observations, now: Observations) -> Index:
     """(N,) where the rows of `now` stand among those `before`: the same people, fewer or in another order."""
     most = 1 + max(before.track.max(initial=0), now.track.max(initial=0))
     was, key = (each.frame * most + each.track for each in (before, now))
-    order = np.argsort(was)
+    order = np.argsort(was, kind="stable")
     return order[np.searchsorted(was[order], key)]

@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import open_regular
 
 _PACKAGES = {
     "shapepose-fg": ("shapepose-fg",),
@@ -95,7 +96,7 @@ def _digest(path: Path, endings: tuple[str, ...]) -> str:
             for file in sorted(_files(path, endings)):
                 whole.update(f"{file.relative_to(path).as_posix()} {_digest(file, endings)}\n".encode())
             return whole.hexdigest()
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None

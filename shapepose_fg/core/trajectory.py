@@ -19,6 +19,10 @@ _M_A_RAD, _M_A_S = 0.5, 0.05
 _RAD_A_M = 0.5
 """An odometry errs by so many radians where it errs by a metre: after 10 m of a straight way both count alike."""
 _ROTATION_TOLERANCE = 1e-3
+MOST_VARIANCE = 1e18
+"""Largest entry of a pose's covariance, rad² or m²: what is known this badly is not known at all."""
+_MOST_METRES = 1e6
+"""Largest coordinate of a place, m, as in `core.camera`: farther away doubles are too coarse for joints."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,8 @@ class Trajectory:
             )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
+        if (most := float(np.abs(wTb[:, :3, 3]).max())) > _MOST_METRES:
+            raise refuse(f"poses must be at most {_MOST_METRES:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
             raise refuse(f"times must rise, at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1} they do not")
         R = wTb[:, :3, :3]
@@ -61,6 +67,8 @@ class Trajectory:
             covariance = np.asarray(self.covariance, dtype=np.float64)
             if covariance.shape != (len(time_s), 6, 6) or not np.isfinite(covariance).all():
                 raise refuse(f"covariance must be finite and {(len(time_s), 6, 6)}, got {covariance.shape}")
+            if np.abs(covariance).max(initial=0.0) > MOST_VARIANCE:
+                raise refuse(f"covariance must be at most {MOST_VARIANCE:g}, got {np.abs(covariance).max():.3g}")
             if np.linalg.eigvalsh(covariance)[:, 0].min() < -1e-9:
                 raise refuse("covariances must have no negative eigenvalue")
             object.__setattr__(self, "covariance", covariance)

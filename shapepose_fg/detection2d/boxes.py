@@ -66,7 +66,7 @@ class BoxNetwork:
         # What is no number is not less than this either.
         sound = (np.abs(boxes) < _FARTHEST).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
-        there = there[np.argsort(score[there])[::-1]]
+        there = there[np.argsort(-score[there], kind="stable")]
         boxes, score = boxes[there] / scale, score[there]
         if least == _LEAST:
             # Sides that count their last pixel too.

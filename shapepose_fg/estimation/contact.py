@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.decompositions import principal_axes
 from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.joint_chains import Problem
 
@@ -75,7 +76,7 @@ def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Arra
 
 def log_densities(velocity: Array, covariance: Array) -> Array:
     """(T, F, K) log density of velocities under each way to move, but for a constant."""
-    values, axes = np.linalg.eigh(covariance)
+    values, axes = principal_axes(covariance)
     along = np.einsum("tfia,tfi->tfa", axes, velocity)
     variance = np.maximum(values, 0.0)[..., None] + SPEEDS_M_S**2
     return -0.5 * (along[..., None] ** 2 / variance + np.log(variance)).sum(axis=2)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.decompositions import basis_across
 
 LOOK_S = 1.5
 """A foot that stands for so long is one look at the floor: so long errors are correlated
@@ -76,12 +77,12 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
     if len(numbers) < LEAST_LOOKS:
         return f"{len(numbers)} looks at standing feet, {LEAST_LOOKS} are the least"
     weight, height = 1.0 / count[whose], points @ up
-    order = np.argsort(height)
+    order = np.argsort(height, kind="stable")
     total = np.concatenate([[0.0], np.cumsum(weight[order])])
     within = total[np.searchsorted(height[order], height[order] + 2 * NEAR_M, side="right")] - total[:-1]
     start = height[order][within.argmax()] + NEAR_M
     middle = np.average(points, axis=0, weights=weight * (np.abs(height - start) <= NEAR_M))
-    across = np.linalg.svd(up[None])[2][1:]
+    across = basis_across(up)
     design = np.concatenate([np.ones((len(points), 1)), (points - middle) @ across.T], axis=1)
     prior = np.diag([0.0, *np.full(2, (SCALE_M / tilt_rad) ** 2)])
     found = np.array([start, 0.0, 0.0])

@@ -2,17 +2,64 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 
 SPEED_S = 0.1
-"""Speeds are taken over this time before and after a step, so that noise does not pass for speed."""
+"""Time before and after a frame over which a velocity is taken, s."""
+_AROUND_S = 0.3
+"""Time before and after a step over which motion is averaged, s: what is wrong for a quarter of it does not
+count."""
+_HOP_S = 0.045
+"""Shortest time over which a displacement counts as motion, s: over less, noise is larger."""
+_KNOWN_M = 0.1
+"""Standard deviation along an axis above which a point says nothing of motion, m."""
 
 
-def speeds(points: Array, times_s: Array) -> Array:
-    """(T - 1, J) how fast points (T, J, 3) are in each step, m/s, over `SPEED_S` on either side."""
-    first = np.searchsorted(times_s, times_s[:-1] - SPEED_S, side="left")
-    last = np.searchsorted(times_s, times_s[1:] + SPEED_S, side="right") - 1
-    return np.linalg.norm(points[last] - points[first], axis=2) / (times_s[last] - times_s[first])[:, None]
+def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
+    """(T - 1, J) speed, m/s, and (T - 1, J) power spectral density of the acceleration along an axis, m²/s³, of
+    points (T, J, 3), metres, around each step.
+
+    The speed is the length of the path per second: a limb that swings to and fro is fast. The density is that of
+    second differences, without what noise of `variance` (T, J) along an axis, m², adds to them. Both are medians
+    over time, which a few wrong points do not change, from points known to `_KNOWN_M`; 0 where there are none.
+    """
+    at, joint = np.arange(len(times_s))[:, None], np.arange(points.shape[1])
+    known = np.asarray(np.isfinite(points).all(axis=2) & (variance < _KNOWN_M**2))
+    velocity, hops, noise = [], [], [variance]
+    for end in _hop_ends(known, times_s):
+        hop = np.where(known & (end != at), times_s[end] - times_s[:, None], np.nan)
+        hops.append(np.where((np.abs(hop) < _AROUND_S) | (np.abs(end - at) == 1), hop, np.nan))
+        velocity.append((points[end, joint] - points) / hops[-1][..., None])
+        noise.append(variance[end, joint] / hops[-1] ** 2)
+    noise[0] = variance * (1 / hops[1] - 1 / hops[0]) ** 2
+    turned = np.square(velocity[1] - velocity[0]).sum(axis=2) - 3 * np.sum(noise, axis=0)
+    first = np.searchsorted(times_s, times_s[:-1] - _AROUND_S - 1e-6)
+    until = np.searchsorted(times_s, times_s[1:] + _AROUND_S + 1e-6)
+    speed = np.linalg.norm(velocity, axis=3)
+    return _median(speed, first, until), _median(turned[None] / (hops[1] - hops[0]), first, until)
+
+
+def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
+    """(T, J) the nearest frame at least `_HOP_S` before each in which a joint is `known` (T, J), and after it; the
+    frame itself where there is none.
+    """
+    T, at = len(times_s), np.arange(len(times_s))[:, None]
+    before = np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1
+    after = np.searchsorted(times_s, times_s + _HOP_S)
+    earlier = np.maximum.accumulate(np.where(known, at, -1))[np.minimum(before, at[:, 0] - 1)]
+    later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][np.clip(after, at[:, 0] + 1, T) % T]
+    return np.where((earlier >= 0) & (earlier < at), earlier, at), np.where((at < later) & (later < T), later, at)
+
+
+def _median(values: Array, first: Index, until: Index) -> Array:
+    """(S, J) medians of `values` (K, T, J), K alike, from frames `first` (S,) `until` (S,), at least 0; NaN does
+    not count, and without any value it is 0.
+    """
+    near = first[:, None] + np.arange(int((until - first).max(initial=1)))
+    each = np.where((near < until[:, None])[..., None], values[:, np.minimum(near, values.shape[1] - 1)], np.nan)
+    each = np.sort(np.concatenate(list(each), axis=1), axis=1)
+    middle = np.isfinite(each).sum(axis=1, keepdims=True) // 2
+    return np.nan_to_num(np.maximum(np.take_along_axis(each, middle, axis=1)[:, 0], 0.0))
 
 
 def velocities(points: Array, times_s: Array) -> Array:

@@ -19,6 +19,7 @@ from factors import (
 )
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.carried_error import goes_with_poses
@@ -115,13 +116,12 @@ class JoinedPeople:
             if goes is not None and views.carried is not None:
                 carried = views.carried
                 moves = np.linalg.norm(goes[j], axis=(1, 2))
-                for b in np.argsort(-moves)[:2][np.sort(-moves)[:2] < 0].tolist():
+                for b in np.argsort(-moves, kind="stable")[:2][np.sort(-moves)[:2] < 0].tolist():
                     name = self._rig.trajectories[b].name
                     poses.append((self._pose_key(name, frame), gtsam.Pose3(carried.wTb[n, b]), goes[j, b]))
                     # What comes of the poses is your graph's to say: no less than a tenth is the joint's own.
                     own = own - goes[j, b] @ carried.covariance[n, b] @ goes[j, b].T
-                values, axes = np.linalg.eigh(own)
-                own = (axes * np.maximum(values, np.trace(C[j]) / 30)) @ axes.T
+                own = raise_eigenvalues(own, np.trace(C[j]) / 30)
             made.graph.push_back(reported_factor(key, X[j], own, poses))
             made.values.insert(key, X[j])
             made.times_s[key] = time_s

@@ -13,10 +13,11 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.in_time import spanned
 from shapepose_fg.estimation.kernels import ready, solve_chains
-from shapepose_fg.estimation.linearisation import Message, symmetric_roots
+from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import Lasting
 
 _SETTLED_M = 5e-4
@@ -234,7 +235,7 @@ class Problem:
         message, span = said.message, spanned(said.where)[:, joints].T
         there = (said.where & message.known)[:, joints].T
         xyz, information = (each[:, joints].swapaxes(0, 1)[there] for each in (message.xyz, message.information))
-        roots = symmetric_roots(information / said.scale)
+        roots = symmetric_root(information / said.scale)
         of_joint, of_offset, expected = lasting_blocks(xyz, roots, said.errors.white_share)
         for one, first in ((0, of_joint), (at, of_offset)):
             right[there, one] += (first.mT @ expected[..., None])[..., 0]

@@ -120,12 +120,6 @@ class Message:
         return Message(np.where(chosen[..., None], self.xyz, 0.0), information)
 
 
-def symmetric_roots(information: Array) -> Array:
-    """Symmetric square roots (..., n, n) of positive semi-definite matrices."""
-    values, vectors = np.linalg.eigh(information)
-    return np.einsum("...ik,...k,...jk->...ij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
-
-
 def inverses(A: Array) -> Array:
     """Inverses (..., 3, 3) of symmetric matrices, by their cofactors; nothing is raised for singular ones."""
     a, b, c, d, e, f = (A[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))

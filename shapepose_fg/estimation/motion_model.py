@@ -85,6 +85,12 @@ class MotionModel:
         """Power spectral density (..., J) of the accelerations of joints of this speed (..., J), m²/s³."""
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
+    def density_of(self, speed_m_s: Array, turning: Array) -> Array:
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
+        have a power spectral density of at least `turning` (..., J), m²/s³.
+        """
+        return self.law.density(np.maximum(self.acceleration(speed_m_s), turning))
+
     def density_lost(self, speed_m_s: Array) -> Array:
         """The same while joints are lost from sight, and their speed is a guess."""
         return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))

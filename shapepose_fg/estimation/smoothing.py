@@ -3,12 +3,13 @@
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Whole
+from shapepose_fg.estimation.in_time import motion_of
 from shapepose_fg.estimation.joint_chains import motion_information
 from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_model import MotionModel
 
 SPEED_M_S = 1.5
-"""How fast a joint is taken to be for the density of its accelerations: a walker's, whose feet are faster."""
+"""Least speed of a joint for the density of its accelerations: a walker's, m/s."""
 LEAST_SIGMA_M = 0.03
 """A draft's error is not new in every frame: its sigma counts twice, and this much is added."""
 KERNEL = 6.0
@@ -32,10 +33,12 @@ def smoothed(
     place, variance = np.full((len(people), J, T, 3), np.nan), np.full((len(people), J, T), np.nan)
     place[who, :, at] = joints
     variance[who, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
+    by_time = np.moveaxis(place, 2, 0).reshape(T, C, 3), np.moveaxis(variance, 2, 0).reshape(T, C)
+    speed, turning = (each.reshape(T - 1, len(people), J) for each in motion_of(*by_time, times))
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
     information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(C, T)
-    density = np.tile(motion.density(np.full(J, SPEED_M_S)), (T - 1, len(people)))
+    density = motion.density_of(np.maximum(speed, SPEED_M_S), turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     unseen = np.zeros((1, 0, 3, 4)), np.zeros((T, 1, 0, 2)), np.zeros((T, 1, 0)), np.zeros((T, 1, 0)), 0, 1.0
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information

@@ -3,15 +3,17 @@
 Of any `Reconstruction`: saved, handed out by `OnlineReconstructor.people`, or solved with factors of your own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.carried_error import POSES_LAST_S, goes_with_poses
@@ -20,8 +22,8 @@ from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     linearise,
     observation_sigmas,
-    symmetric_roots,
 )
+from shapepose_fg.estimation.window_solution import PersonGraph
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
@@ -92,7 +94,7 @@ class Distance:
         Gauss and Legendre's rule.
         """
         limit = np.asarray(limit_m, dtype=np.float64)
-        values, axes = np.linalg.eigh(self.covariance)
+        values, axes = principal_axes(self.covariance)
         sigma = np.sqrt(np.maximum(values, 1e-12))
         mean = np.einsum("...ij,...i->...j", axes, self.apart)
         shape = np.broadcast_shapes(limit.shape, mean.shape[:-1])
@@ -181,13 +183,17 @@ class SurfaceDistance:
         return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
 
 
-def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -> Marginal:
+def marginal(
+    people: Reconstruction, *joints: JointAt, rig: Rig | None = None, graphs: Iterable[PersonGraph] = ()
+) -> Marginal:
     """Joints of any people and frames together.
 
     Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
     correlate as was measured (`correlation`). With the `rig` that people were solved with (`cameras.json`), what
-    comes of the poses of cameras that move is shared by all that they see. NotDetermined for a joint without a
-    place, ValueError for one that is not there.
+    comes of the poses of cameras that move is shared by all that they see. With the `graphs` of a result that was
+    solved with factors of your own (`window_solutions(people, rig, extra_factors=...)`), joints that these tie to
+    each other correlate as the graph has it, also those of two people. NotDetermined for a joint without a place,
+    ValueError for one that is not there.
     """
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
     K = len(joints)
@@ -195,12 +201,48 @@ def marginal(people: Reconstruction, *joints: JointAt, rig: Rig | None = None) -
     shared = np.zeros((K, 3, K, 3))
     if rig is not None and rig.trajectories and K > 0:
         shared = _of_poses(people, rig, rows, numbers, reported)
-    roots = symmetric_roots(reported - np.einsum("aiaj->aij", shared))
+    roots = symmetric_root(reported - np.einsum("aiaj->aij", shared))
     names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
     rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
     rho *= people.person[rows][:, None] == people.person[rows]
-    covariance = np.einsum("aik,ab,bjk->aibj", roots, rho, roots) + shared
+    errors = np.einsum("ab,ij->aibj", rho, np.eye(3))
+    found = _of_graphs(list(graphs), joints, numbers, errors)
+    covariance = np.einsum("aik,akbl,bjl->aibj", roots, found, roots) + shared
     return Marginal(people.joints[rows, numbers], covariance.reshape(3 * K, 3 * K))
+
+
+def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers: Index, errors: Array) -> Array:
+    """Correlations `errors` (K, 3, K, 3) of K joints, in standard deviations; from the graph where factors of the
+    user's own tie two of them.
+    """
+    K, found, tied = len(joints), errors.copy(), False
+    for graph in {id(each.window.ties): each for each in graphs if len(each.window.ties.active) > 0}.values():
+        members = {each.person: each for each in graph.together or [graph]}
+        keys = dict[int, int]()
+        for n, asked in enumerate(joints):
+            person = members.get(asked.person)
+            if person is not None and asked.frame in person.frames:
+                key = int(person.keys[np.flatnonzero(person.frames == asked.frame)[0], numbers[n]])
+                keys |= {n: key} if graph.values.exists(key) else {}
+        parts = graph.window.ties.parts
+        nodes = {n: (joints[n].person, int(numbers[n])) for n in keys}
+        pairs = [(a, b) for a in keys for b in keys if a < b and keys[a] != keys[b]]
+        pairs = [(a, b) for a, b in pairs if any({nodes[a], nodes[b]} <= part for part in parts)]
+        asked = sorted({keys[n] for pair in pairs for n in pair})
+        if len(asked) == 0:
+            continue
+        joint = gtsam.Marginals(graph.graph, graph.values).jointMarginalCovariance(gtsam.KeyVector(asked))
+        white = {key: np.linalg.inv(symmetric_root(joint.at(key, key)[None])[0]) for key in asked}
+        tied = True
+        for a, b in pairs:
+            across = white[keys[a]] @ joint.at(keys[a], keys[b]) @ white[keys[b]].T
+            found[a, :, b], found[b, :, a] = across, across.T
+    if not tied:
+        return errors
+    # Correlations from two sources: no stronger than leaves the whole positive definite.
+    apart = found.reshape(3 * K, 3 * K) - np.eye(3 * K)
+    least = np.linalg.eigvalsh(apart).min(initial=0.0)
+    return (np.eye(3 * K) + apart / max(1.0, -least)).reshape(K, 3, K, 3)
 
 
 def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
@@ -216,10 +258,10 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     sigmas = observation_sigmas(seen, own.joints, views, config, own.joint_names.tolist())
     evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
     goes = goes_with_poses(evidence, Message(own.joints, nothing), sigmas, views, config)
-    goes = goes[np.arange(len(rows)), numbers] @ symmetric_roots(views.carried.covariance)
-    ends = symmetric_roots(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(
-        goes, 1, 2
-    ).reshape(len(rows), 3, -1)
+    goes = goes[np.arange(len(rows)), numbers] @ symmetric_root(views.carried.covariance)
+    ends = symmetric_root(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(goes, 1, 2).reshape(
+        len(rows), 3, -1
+    )
     most = np.linalg.eigvalsh(ends @ ends.mT)[:, -1]
     goes /= np.sqrt(np.maximum(most, 1.0))[:, None, None, None]
     lasting = np.exp(-np.abs(own.time_s[:, None] - own.time_s) / POSES_LAST_S)
@@ -227,13 +269,18 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
 
 
 def distance(
-    people: Reconstruction, one: JointAt, other: JointAt | ArrayLike, *, rig: Rig | None = None
+    people: Reconstruction,
+    one: JointAt,
+    other: JointAt | ArrayLike,
+    *,
+    rig: Rig | None = None,
+    graphs: Iterable[PersonGraph] = (),
 ) -> Distance:
-    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` as of
-    `marginal`.
+    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` and `graphs` as
+    of `marginal`.
     """
     if isinstance(other, JointAt):
-        both = marginal(people, one, other, rig=rig)
+        both = marginal(people, one, other, rig=rig, graphs=graphs)
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance)
@@ -279,7 +326,7 @@ def surface_distance(
     known = np.isfinite(people.covariance[row]).all(axis=(1, 2)) & np.isfinite(people.joints[row]).all(axis=1)
     weight = np.exp(-0.5 * ((people.joints[row] - nearest) ** 2).sum(axis=1) / _REACH_M**2)
     weight = np.where(known, weight, 0.0)
-    chosen = np.argsort(-weight)[:4]
+    chosen = np.argsort(-weight, kind="stable")[:4]
     chosen = chosen[known[chosen]]
     if len(chosen) == 0:
         raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a place")

@@ -31,12 +31,13 @@ from factors import (
 )
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import near_in_time, spanned, speeds
+from shapepose_fg.estimation.in_time import motion_of, near_in_time, spanned
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
-from shapepose_fg.estimation.linearisation import Message, symmetric_roots
+from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import leads
@@ -387,8 +388,10 @@ class WindowGraph:
         of_views = of_body = self.present & self.with_offsets
         density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
         if self.temporal:
-            share, speed = self._motion.views.white_share, speeds(near, self.times_s)
-            density = self._motion.density(speed)
+            share = self._motion.views.white_share
+            variance = 1.0 / np.maximum(np.linalg.eigvalsh(views.information)[..., 0], 1.0)
+            speed, turning = motion_of(near, variance, self.times_s)
+            density = self._motion.density_of(speed, turning)
             if lost is not None:
                 around = near_in_time(lost, self.times_s, self._motion.around_s)
                 of_body = self.present & (self.with_offsets | around)
@@ -469,7 +472,7 @@ class WindowGraph:
         if not said.where.any():
             return []
         known, keys = said.message.known & said.where, self._offset_keys[source]
-        roots = symmetric_roots(said.message.information[known] / said.scale)
+        roots = symmetric_root(said.message.information[known] / said.scale)
         xyz, share = said.message.xyz[known], said.errors.white_share
         factors = lasting_prior_factors(self.keys[known], keys[known], xyz, roots, share)
         # An offset in every frame between two, so that a joint's states are a chain.

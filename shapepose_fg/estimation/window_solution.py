@@ -12,6 +12,7 @@ from factors import lasting_difference_factors, offset_factors, offset_keys, rep
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
@@ -237,8 +238,7 @@ class PersonGraph:
     def _more(self) -> Array:
         """(T, J, 3, 3) what the reported covariances are larger by, m²: positive definite."""
         more = np.where(self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3))
-        values, vectors = np.linalg.eigh((more + more.mT) / 2)
-        return (vectors * np.maximum(values, LEAST_M**2)[..., None, :]) @ vectors.mT
+        return raise_eigenvalues(more, LEAST_M**2)
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:

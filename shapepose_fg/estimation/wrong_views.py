@@ -13,6 +13,8 @@ _REST_M = 0.05
 """What body and motion say of a joint, about, one sigma per axis."""
 _MOST = 36.0
 """Squared distances count up to 6 sigmas: some detections are somebody else's."""
+_WIDTH, _ROUNDS = 3.0, 12
+"""Width of Cauchy's kernel, in sigmas, and rounds of reweighting in which a pose gives way."""
 _TURN_RAD, _SHIFT_M = np.radians(5.0), 0.5
 """How far a camera may have come off, one sigma per axis."""
 _TOGETHER = 50.0
@@ -30,10 +32,10 @@ class WrongView:
 
     view: int
     """Which."""
-    turn_deg: float
-    """How far turning it would make it fit."""
-    shift_m: float
-    """And moving it, together with that."""
+    turn_deg: tuple[float, float]
+    """How far turning it would make it fit, and the sigma of that."""
+    shift_m: tuple[float, float]
+    """How far moving it, together with that turn, and the sigma of that."""
     before: float
     """Mean squared distance of its detections from what the others say, in sigmas, up to 36; 2 is usual."""
     after: float
@@ -58,8 +60,9 @@ def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfi
     """The view whose pose, let go, makes all views agree best on `joints` (N, J, 3); None where none does so by
     much.
 
-    Each detection is compared with the joint as it is without that view, and each view's pose gets one robust
-    Gauss-Newton step from there. Then all joints are solved once more, linearly, with that pose.
+    Each detection is compared with the joint as it is without that view, and each view's pose gets one
+    Gauss-Newton step from there, robust by iterated reweighting. Then all joints are solved once more, linearly,
+    with that pose.
     """
     points = np.nan_to_num(joints)
     _, _, slope = views.project(points)
@@ -87,7 +90,7 @@ def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfi
     best, found = before / _BETTER, None
     for view in np.flatnonzero(there.sum(axis=(0, 1)) >= _LEAST).tolist():
         twist = _slope_of_pose(points, slope, views, view)
-        step = _pose_step(root[:, :, view] @ twist, off[:, :, view], there[:, :, view])
+        step, covariance = _pose_step(root[:, :, view] @ twist, off[:, :, view], there[:, :, view])
         changed = residual.copy()
         changed[:, :, view] -= twist @ step
         change = np.einsum(
@@ -97,9 +100,12 @@ def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfi
         after = whitened(changed)
         if _cost(after, there) < best:
             best, only = _cost(after, there), there[:, :, [view]]
-            turn, shift = float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:]))
+            turn, shift = (
+                (float(np.linalg.norm(step[part])), float(np.sqrt(np.linalg.norm(covariance[part, part], ord=2))))
+                for part in (slice(3), slice(3, 6))
+            )
             costs = _cost(off[:, :, [view]], only), _cost(after[:, :, [view]], only)
-            found = WrongView(view, turn, shift, *costs)
+            found = WrongView(view, (np.degrees(turn[0]), np.degrees(turn[1])), shift, *costs)
     return found
 
 
@@ -119,10 +125,14 @@ def _slope_of_pose(points: Array, slope: Array, views: Views, view: int) -> Arra
     return np.concatenate([of_camera @ turned, of_camera], axis=-1)
 
 
-def _pose_step(slope: Array, off: Array, there: Mask) -> Array:
-    """(6,) the turn and shift that take most of `off` away, whitened."""
+def _pose_step(slope: Array, off: Array, there: Mask) -> tuple[Array, Array]:
+    """(6,) the turn and shift that take most of `off` away, whitened, and their covariance (6, 6)."""
     slope, off = slope[there], off[there]
-    weight = np.minimum(1.0, np.sqrt(_MOST) / np.maximum(np.linalg.norm(off, axis=-1), 1e-9)) / _TOGETHER
     prior = np.diag([_TURN_RAD**-2.0] * 3 + [_SHIFT_M**-2.0] * 3)
-    normal = np.einsum("n,nki,nkl->il", weight, slope, slope) + prior
-    return np.linalg.solve(normal, np.einsum("n,nki,nk->i", weight, slope, off))
+    step, normal = np.zeros(6), prior
+    for _ in range(_ROUNDS):
+        left = np.linalg.norm(off - slope @ step, axis=-1)
+        weight = kernel_weight("cauchy", left, _WIDTH) / _TOGETHER
+        normal = np.einsum("n,nki,nkl->il", weight, slope, slope) + prior
+        step = np.linalg.solve(normal, np.einsum("n,nki,nk->i", weight, slope, off))
+    return step, np.linalg.inv(normal)

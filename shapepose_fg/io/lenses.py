@@ -1,5 +1,6 @@
 """Cameras of which only the field of view is known: names from files of detections, sizes from the footage."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,12 +8,16 @@ import numpy as np
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError, naming, optional
+from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.footage.placement import read_used_footage
 
 _NARROWEST, _WIDEST = 5.0, 150.0
 """Degrees from left to right that a lens without distortion can see."""
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+_FORMATS = ("JPEG", "PNG", "TIFF")
+"""Pillow's names of what these hold: its other readers, of which some start programs, are not tried."""
+_MOST_BYTES = 2**28
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """The tags of EXIF's own directory in a photo, and of FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
@@ -116,11 +121,15 @@ def _focal_of_photo(file: Path) -> float:
     """
     image = optional("PIL.Image", "photos")
     cure = "give a photo as the camera wrote it, or degrees"
-    try:
-        with image.open(file) as photo:
-            sides, found = photo.size, photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM)
-    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
-        raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
-    if not isinstance(found, int | float) or not 0 < found < 2000:
+    with open_regular(file, cure, _MOST_BYTES) as stream, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's on large pictures: none is unpacked here
+        try:
+            with image.open(stream, formats=_FORMATS) as photo:
+                # Without EXIF in its head a PNG would be unpacked to look behind the picture.
+                known = photo.format != "PNG" or "exif" in photo.info
+                sides, found = photo.size, photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM) if known else None
+        except Exception as error:  # of damaged files the library raises anything: SyntaxError, struct.error
+            raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
+    if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
         raise InputError(f"{file}: its EXIF does not say FocalLengthIn35mmFilm; {cure}")
     return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))

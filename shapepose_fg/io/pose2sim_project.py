@@ -102,15 +102,15 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         given = rate != "auto"
         fps, origin = (rate, f", as {CONFIG} says") if given else next((e for e in told if e[0] > 0), assumed)
         said = f"{fps:g} frames a second{origin}"
-    # Results have the numbers of the files' names, 0 where they have none.
-    folders = [each for each in detections.iterdir() if each.is_dir()]
-    numbers = (frame_number(file) for each in folders for file in frame_files(each))
+    # Results have the numbers of the files' names, 0 where they have none, from the first that all have.
+    folders = [frame_files(each) for each in detections.iterdir() if each.is_dir()]
+    numbers = (min(map(frame_number, files)) for files in folders if len(files) > 0)
     return Pose2SimProject(
         folder,
         calibration,
         detections,
         None if fps is None else float(fps),
-        min(numbers, default=0),
+        max(numbers, default=0),
         (span[0], span[1]) if isinstance(span, list) and len(span) == 2 else None,
         multi_person,
         _joints(config, folder / CONFIG),

@@ -41,6 +41,8 @@ class CameraState(IntEnum):
     """It sees people elsewhere than the others do: its detections are left out until it agrees again."""
     DOUBTED = 4
     """Too many cameras see people elsewhere to tell which of them are right: all are used."""
+    OFF_CLOCK = 5
+    """Its times are seconds away from those of the other cameras: its views are left out until they agree."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import threading
 from bisect import bisect_left
 from collections import deque
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +23,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.cameras import CameraState, CameraWatch
+from shapepose_fg.live.clock import JUMP_S, CommonClock
 from shapepose_fg.live.filtering import Filter
 from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
@@ -29,7 +31,7 @@ from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_s
 from shapepose_fg.live.views import ViewsInStep, joined, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
-from shapepose_fg.pipeline.workers import Workers
+from shapepose_fg.pipeline.workers import workers as worker_processes
 from shapepose_fg.proposal.thinning import thinned
 
 AHEAD_S = 1.0
@@ -39,12 +41,20 @@ _ROUNDS = 1
 rounds take a seventh to a fifth more for the same figures (Shelf, crossing)."""
 _KEPT_S = 10.0
 """What is settled and nobody takes is kept for so long."""
+_SETTLES = 2 / 3
+"""What a window settles at least, of the lag, where there are several frames in a lag."""
 _BEFORE = 7.0
 """A window has the lag over this before what it settles: a frame or two. With a third of the lag it takes an
 eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
 _BEHIND = 3.0
 """Frames older than so many lags are settled as they are, where solving does not keep up."""
 _MOST_SAID = 1000
+_OFF_CLOCK = 10
+"""Views in a row whose time is elsewhere, after which a camera is named, and the frames of `push` are believed."""
+_STANDS = 30
+"""So many more views without a pose than with one say that a camera is where the rig has it after all."""
+_MOST_S = 1e12
+"""Largest time, seconds: behind it, doubles are too coarse for pictures."""
 _BACK_S = 1.0
 """Poses of cameras that move are kept for so much longer than a frame can wait to be solved."""
 
@@ -75,6 +85,9 @@ class LiveReport:
     """Frames that nobody refined, because solving did not keep up."""
     not_taken: int
     """Settled rows that nobody took in time."""
+    jumps: int
+    """How often the clock of all cameras jumped, by a pause or because it was set: people are followed anew where
+    it went back, or by more than people can be gone."""
     cameras: dict[str, CameraState]
     """How each camera is."""
 
@@ -122,10 +135,13 @@ class OnlineReconstructor:
         self._filter = Filter(setup.engine(Notebook()).tracker, config.stitching)
         self._motion = MotionModel.load(skeleton.joints, config.motion, config.law)
         self._lock = threading.RLock()
-        self._workers = Workers(workers, setup).__enter__()
+        self._open = ExitStack()
+        pool = self._open.enter_context(worker_processes(workers, setup))
         self._most_waiting = 1 if workers == 1 else 2 * workers
-        self._refinery = Refinery(self._workers, self._filter)
-        self._state = LiveState(rig, CameraWatch.of(len(rig)), ViewsInStep(len(rig)))
+        self._refinery = Refinery(pool, self._filter)
+        start = CameraWatch.of(len(rig)), ViewsInStep(len(rig)), CommonClock(len(rig)), self._filter.nobody
+        self._state = LiveState(rig, *start)
+        self._behind = 0
         self._said = deque[Said](maxlen=_MOST_SAID)
         self._now = Newest(0, self._filter.nobody, fitter)
 
@@ -162,22 +178,30 @@ class OnlineReconstructor:
     def close(self) -> None:
         """End the processes that refine. What was settled can still be taken."""
         with self._lock:
-            self._workers.__exit__(None)
+            self._open.close()
 
     def push(self, detections: Detections, time_s: float | Array) -> None:
         """Take in a frame of all cameras, taken at `time_s`: seconds, or (V,) for cameras out of step.
 
         A camera that gave nothing has no detections in it. Frames may come late or out of order by up to the lag:
         everything after them is followed once more. Older ones, and a second one of the same time, are counted and
-        left out. ValueError where a detection is of a camera or joint that there is not, or not finite, or of a
-        camera that moves (`push_view`) and nothing says where it was.
+        left out; ten in a row that are seconds old say that the clock was set back, and people are followed anew.
+        ValueError where a detection is of a camera or joint that there is not, or not finite, or of a camera that
+        moves (`push_view`) and nothing says where it was, and for times seconds apart.
         """
         times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
-        if not np.isfinite(times).all():
-            raise ValueError("time_s must be finite")
+        self._check_time(times)
+        if np.ptp(times) > JUMP_S:
+            raise ValueError(f"time_s of one frame must lie within {JUMP_S:g} s, got {np.ptp(times):g} s")
         self._check(detections)
         with self._lock:
+            slots = self._state.slots
             self._check_places(detections, times)
+            ahead_s = float(times.mean()) - slots[-1].time_s if len(slots) > 0 else 0.0
+            self._behind = self._behind + 1 if ahead_s < -JUMP_S else 0
+            if self._behind >= _OFF_CLOCK or ahead_s > self._config.stitching.longest_gap_s:
+                self._begin_anew()
+                self._behind, self._state.jumps = 0, self._state.jumps + 1
             self._take(detections, times)
 
     def push_view(
@@ -195,29 +219,101 @@ class OnlineReconstructor:
         it is within half a frame of it and within the lag; else it is counted and left out. `detections` are of
         this camera whatever their `view` says.
 
+        A view whose time is seconds away from the others' waits until those of other cameras confirm it: one
+        camera does not move the clock of the others. Where all of them jump, the views that waited are taken in.
+
         `pose` (4, 4) is world from camera then, or from what carries it (`Camera.carrier`), metres;
         `pose_covariance` (6, 6) how surely, turn then way along its own axes, rad² and m² (GTSAM's order); without
-        it, exactly. Between poses at most half a second apart they are interpolated. ValueError as `push`, and
-        for a camera that there is not.
+        it, exactly. Between poses at most half a second apart they are interpolated. A camera that nothing carries
+        moves if its first view has a pose. ValueError as `push`, for a camera that there is not, and for the pose
+        of a camera that stands still; nothing has changed then.
         """
         if camera not in self.rig.names:
             raise ValueError(f"there is no camera {camera}; there are {', '.join(self.rig.names)}")
-        if not np.isfinite(time_s):
-            raise ValueError("time_s must be finite")
+        self._check_time(np.array(time_s))
         view = self.rig.names.index(camera)
         own = replace(detections, view=np.full(len(detections), view))
         self._check(own)
         with self._lock:
-            if pose is not None:
-                since_s = max(self._state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - _BACK_S
-                self._state.rig = with_pose(self._state.rig, view, time_s, pose, pose_covariance, since_s)
-            self._check_places(own, np.full(len(self.rig), time_s))
-            if self._state.views.is_late(view, time_s):
-                self._state.views.heard(view, time_s)
-                self._join(view, own, time_s)
-                return
-            for frame, times in self._state.views.add(view, own, time_s):
-                self._take(frame, times)
+            state = self._state
+            rig = self._placed(view, time_s, pose, pose_covariance)
+            self._check_places(own, np.full(len(self.rig), time_s), rig)
+            was_off, given = state.clock.off.get(view, 0), (view, own, time_s, pose, pose_covariance)
+            taken, jumps = state.clock.admit(view, time_s, state.views.done_s, given)
+            self._say_clock(view, was_off, state.clock.off.get(view, 0))
+            if jumps:
+                self._jump(taken[0][2])
+            refused = None
+            for each in taken:
+                try:
+                    self._take_view(*each)
+                except ValueError as error:
+                    refused = error if each is given else refused
+            if refused is not None:
+                raise refused
+
+    def _placed(self, view: int, time_s: float, pose: Array | None, covariance: Array | None) -> Rig:
+        """The cameras with a pose that came with a view, which is checked. ValueError, and nothing has changed."""
+        state, name = self._state, self.rig.names[view]
+        moves, alone = bool(state.rig.cameras[view].carrier), not self.rig.cameras[view].carrier
+        if pose is None:
+            state.without_pose[view] = min(state.without_pose[view] + 1, _STANDS)
+            if moves and alone and state.without_pose[view] >= _STANDS:
+                stands = replace(state.rig.cameras[view], carrier="", bTc=np.eye(4))
+                others = tuple(each for each in state.rig.trajectories if each.name != name)
+                cameras = tuple(stands if n == view else each for n, each in enumerate(state.rig.cameras))
+                state.rig = replace(state.rig, cameras=cameras, trajectories=others)
+            return state.rig
+        if alone and not moves and state.without_pose[view] > 0:
+            raise ValueError(f"{name} stands still, as it was seen without a pose before: leave its pose out")
+        since_s = max(state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - _BACK_S
+        rig = with_pose(state.rig, view, time_s, pose, covariance, since_s)
+        rig.at(np.full(len(rig), time_s))
+        return rig
+
+    def _take_view(
+        self, view: int, own: Detections, time_s: float, pose: Array | None, covariance: Array | None
+    ) -> None:
+        """A view whose time fits, into its frame."""
+        if pose is not None:
+            self._state.rig = self._placed(view, time_s, pose, covariance)
+            self._state.without_pose[view] = max(self._state.without_pose[view] - 1, 0)
+        if self._state.views.is_late(view, time_s):
+            self._state.views.heard(view, time_s)
+            self._join(view, own, time_s)
+            return
+        for frame, times in self._state.views.add(view, own, time_s):
+            self._take(frame, times)
+
+    def _say_clock(self, view: int, was_off: int, off: int) -> None:
+        """Count a view that is kept back for good, and name its camera after several."""
+        self._state.dropped += int(off > 1)
+        if off == _OFF_CLOCK or (off == 0 and was_off >= _OFF_CLOCK):
+            code = CameraState.OFF_CLOCK if off > 0 else CameraState(int(self._state.watch.state[view]))
+            self._said.append(Said(self._state.views.done_s, self.rig.names[view], code))
+
+    def _jump(self, time_s: float) -> None:
+        """The clock of all cameras goes on at `time_s`."""
+        state = self._state
+        for frame, times in state.views.rest():
+            self._take(frame, times)
+        ahead_s = time_s - state.views.done_s
+        state.views = ViewsInStep(len(self.rig), period_s=state.views.period_s)
+        state.jumps += 1
+        if not 0 <= ahead_s <= self._config.stitching.longest_gap_s:
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Settle all frames; the next one is a first one, and its people are new ones."""
+        state = self._state
+        self._refine(last=True)
+        if len(state.slots) > 0:
+            last = state.slots[-1].moment
+            state.begin = replace(
+                self._filter.nobody, next_track=last.next_track, next_identity=last.next_identity
+            )
+        state.slots.clear()
+        state.before, state.watch, state.rig = None, CameraWatch.of(len(self.rig)), self.rig
 
     def people(self, time_s: float | None = None) -> Reconstruction:
         """The people at `time_s`, from the newest frame's time (the default) to a second after it.
@@ -275,12 +371,17 @@ class OnlineReconstructor:
             self._state.dropped,
             self._state.unrefined,
             self._state.not_taken,
+            self._state.jumps,
         )
         return LiveReport(*counts, cameras)
 
     def said(self) -> list[Said]:
         """What was noticed of cameras, oldest first; the last thousand."""
         return list(self._said)
+
+    def _check_time(self, time_s: Array) -> None:
+        if not (np.abs(time_s) <= _MOST_S).all():
+            raise ValueError(f"time_s must be finite, and at most {_MOST_S:g}")
 
     def _check(self, detections: Detections) -> None:
         for name, values, count in (
@@ -292,9 +393,9 @@ class OnlineReconstructor:
         if not (np.isfinite(detections.xy).all() and np.isfinite(detections.confidence).all()):
             raise ValueError("xy and confidence must be finite")
 
-    def _check_places(self, detections: Detections, times: Array) -> None:
+    def _check_places(self, detections: Detections, times: Array, rig: Rig | None = None) -> None:
         """ValueError where nothing says where a camera was that moves and has detections."""
-        rig = self._state.rig
+        rig = self._state.rig if rig is None else rig
         for view in np.flatnonzero(rig.carrier >= 0).tolist():
             if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(times[view]):
                 raise ValueError(f"{rig.names[view]} moves: give a pose with what it sees at {times[view]:g} s")
@@ -302,7 +403,7 @@ class OnlineReconstructor:
     def _take(self, detections: Detections, times: Array) -> None:
         """A frame, in its place among those that came."""
         time_s, slots = float(times.mean()), self._state.slots
-        detections, _ = thinned(detections, len(self.rig), self._config.candidates)
+        detections, _ = thinned(detections, self.rig, self._config.candidates)
         if len(slots) > 0 and time_s <= slots[-1].time_s:
             self._insert(detections, times, time_s)
             return
@@ -310,7 +411,7 @@ class OnlineReconstructor:
         before, stands = self._state.watch, self._state.rig.at(times)
         watch, rig = before.seen(detections, self._state.before, stands, time_s)
         given = Input(self._state.frames, times, _without(detections, rig), rig)
-        moment, candidate = self._filter.step(slots[-1].moment if len(slots) > 0 else self._filter.nobody, given)
+        moment, candidate = self._filter.step(slots[-1].moment if len(slots) > 0 else self._state.begin, given)
         self._state.frames += 1
         self._state.before = detections
         seen = (moment.views >= 2) & moment.named[:, None]
@@ -411,9 +512,9 @@ class OnlineReconstructor:
                 self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
                 self._restart(refined.newest)
-        newest_s = self._state.slots[-1].time_s if len(self._state.slots) > 0 else -np.inf
-        while len(self._state.settled) > 0 and newest_s - float(self._state.settled[0].time_s.max()) > _KEPT_S:
-            self._state.not_taken += len(self._state.settled.popleft())
+        settled = self._state.settled
+        while len(settled) > _KEPT_S / (_SETTLES * self.lag_s):
+            self._state.not_taken += len(settled.popleft())
         self._show()
 
     def _show(self) -> None:

@@ -1,8 +1,9 @@
 """Behind the newest moment: windows of frames solved by stage II, in order, here or in processes of their own."""
 
-from collections import deque
+from collections import Counter, deque
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +13,13 @@ from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.live.cameras import CameraWatch
+from shapepose_fg.live.clock import CommonClock
 from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
 from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.windows import Span
-from shapepose_fg.pipeline.workers import Workers
+from shapepose_fg.pipeline.workers import Pool, naming_lost_work
 
 
 @dataclass
@@ -51,6 +53,12 @@ class LiveState:
     """Which cameras are believed."""
     views: ViewsInStep
     """Views that wait for the others of their frame."""
+    clock: CommonClock[tuple[Any, ...]]
+    """Views that wait until other cameras confirm their time. Not saved."""
+    begin: Moment
+    """The people before the first frame: nobody, and the next identity. Not saved."""
+    without_pose: Counter[int] = field(default_factory=Counter)
+    """By view: how many more were given without a pose than with one. Not saved."""
     slots: list[Slot] = field(default_factory=list)
     """The last frames, in order of time: those that are not settled, and what a window needs before them."""
     before: Detections | None = None
@@ -63,6 +71,7 @@ class LiveState:
     dropped: int = 0
     unrefined: int = 0
     not_taken: int = 0
+    jumps: int = 0
 
 
 @dataclass(frozen=True)
@@ -92,8 +101,8 @@ class _Sent:
 class Refinery:
     """Sends windows to be solved, and gives back what came of them in the order in which they were sent."""
 
-    def __init__(self, workers: Workers[Setup], following: Filter) -> None:
-        self._workers, self._filter = workers, following
+    def __init__(self, pool: Pool[Setup], following: Filter) -> None:
+        self._pool, self._filter = pool, following
         self._sent = deque[_Sent]()
 
     @property
@@ -117,7 +126,7 @@ class Refinery:
         if len(rows) == 0:
             return
         frames = np.array([slot.given.frame for slot in window])
-        part = self._workers.submit(
+        part = self._pool.submit(
             Setup.solve, Span(tuple(decided), start, len(decided), rig=rig if rig.moves else None)
         )
         self._sent.append(_Sent(part, frames, names, own, start))
@@ -127,7 +136,8 @@ class Refinery:
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()
-            rows = sent.part.result().rows
+            with naming_lost_work():
+                rows = sent.part.result().rows
             at = rows.frame
             person = np.array([sent.names[track] for track in rows.person.tolist()], dtype=np.int64)
             # Of two tracks of one identity in a frame, who came back while they were still followed, one stays.

@@ -20,6 +20,7 @@ from shapepose_fg.core.storage.npz import read_npz, write_npz
 from shapepose_fg.core.storage.schema import Column
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import CameraState, CameraWatch
+from shapepose_fg.live.clock import CommonClock
 from shapepose_fg.live.filtering import OF_TRACKS, Filter, Gone, Moment
 from shapepose_fg.live.refining import LiveState, Slot
 from shapepose_fg.live.views import ViewsInStep, joined
@@ -27,14 +28,14 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
-FORMAT = "shapepose-fg live state 1"
+FORMAT = "shapepose-fg live state 2"
 _CURE = "begin without it"
 _WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """The columns of detections."""
 _POSES = ("time_s", "wTb", "covariance")
 """The columns of poses of cameras that move, beside the carrier's name."""
-_COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken")
+_COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """The counts of a state."""
 _COLUMNS = {
     "slots": Column("T 8", _WHOLE),
@@ -252,7 +253,8 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
         raise ValueError("cameras must have states that there are")
     watch = CameraWatch(apart_m, heard_s, code.astype(np.int64))
     rig = _carried(arrays, rig)
-    state = LiveState(rig, watch, ViewsInStep(V, waiting, last_s, *arrays["clock"].tolist()))
+    views = ViewsInStep(V, waiting, last_s, *arrays["clock"].tolist())
+    state = LiveState(rig, watch, views, CommonClock(V), following.nobody)
     for name, value in zip(_COUNTS, arrays["counts"].tolist(), strict=True):
         setattr(state, name, int(value))
     if "settled.frame" in arrays:

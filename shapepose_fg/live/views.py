@@ -8,6 +8,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.live.clock import JUMP_S
 
 _HEARD_S = 0.5
 """A frame waits for cameras that were heard so lately."""
@@ -15,6 +16,8 @@ _ASSUMED_S = 1 / 30
 """Between a camera's pictures, until it has given two."""
 _FRESH = 0.05
 """How much of a camera's period its last step is."""
+_SHORTEST_S = 1 / 250
+"""Shortest time between a camera's pictures: closer ones are one picture, told twice."""
 
 _BEFORE_S = 0.4
 """A camera was so long where its first pose has it."""
@@ -43,8 +46,9 @@ class ViewsInStep:
             self.heard_s = np.full(self.views, -np.inf)
 
     def is_late(self, view: int, time_s: float) -> bool:
-        """Whether the frame of this view is complete without it."""
-        return time_s <= max(self.heard_s[view], self.done_s + self.period_s / 2)
+        """Whether the frame of this view is complete without it, or it is the camera's last one again."""
+        step_s = min(self.period_s, max(time_s - float(self.heard_s[view]), _SHORTEST_S))
+        return time_s <= max(self.heard_s[view], self.done_s + step_s / 2)
 
     def heard(self, view: int, time_s: float) -> None:
         """A camera was heard, if late."""
@@ -54,8 +58,8 @@ class ViewsInStep:
         """Take in a view; the frames that are complete with it."""
         found = self.rest() if view in self.waiting else []
         step_s = time_s - float(self.heard_s[view])
-        if step_s < 3 * self.period_s:
-            self.period_s += _FRESH * (step_s - self.period_s)
+        if np.isfinite(step_s):
+            self.period_s += _FRESH * (min(max(step_s, _SHORTEST_S), 3 * self.period_s) - self.period_s)
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
         # Before the first frame every camera is waited for, until one comes again.
@@ -64,9 +68,13 @@ class ViewsInStep:
         return found + (self.rest() if all(each in self.waiting for each in alive) else [])
 
     def rest(self) -> list[Frame]:
-        """What waits, as a frame."""
+        """What waits, as a frame: of views whose times are far apart, as the first ones may be, most of them."""
         if len(self.waiting) == 0:
             return []
+        every = [time_s for _, time_s in self.waiting.values()]
+        most = max(every, key=lambda time_s: sum(abs(other - time_s) <= JUMP_S for other in every))
+        self.heard_s = np.where(np.abs(self.heard_s - most) <= JUMP_S, self.heard_s, -np.inf)
+        self.waiting = {view: each for view, each in self.waiting.items() if abs(each[1] - most) <= JUMP_S}
         mean = float(np.mean([time_s for _, time_s in self.waiting.values()]))
         times = np.full(self.views, mean)
         for view, (_, time_s) in self.waiting.items():
@@ -106,7 +114,7 @@ def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array
         times, poses, surely = known[0].time_s, known[0].wTb, known[0].covariance_at(known[0].time_s)
     stays = (times != time_s) & (times >= times[times <= since_s].max(initial=-np.inf))
     times, poses = np.append(times[stays], time_s), np.append(poses[stays], pose[None], axis=0)
-    order, surely = np.argsort(times), np.append(surely[stays], covariance[None], axis=0)
+    order, surely = np.argsort(times, kind="stable"), np.append(surely[stays], covariance[None], axis=0)
     goes = Trajectory(name, times[order], poses[order], surely[order])
     cameras = [replace(each, carrier=name) if each is camera else each for each in rig.cameras]
     return replace(rig, cameras=tuple(cameras), trajectories=(*others, goes))

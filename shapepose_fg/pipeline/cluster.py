@@ -1,28 +1,24 @@
 """The same work for many items on the processes of a Dask cluster: this machine's, or that of many machines."""
 
+import multiprocessing
 import socket
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, TypeVar
+
+import cloudpickle
 
 from shapepose_fg.core.errors import InputError, WorkLost
 from shapepose_fg.core.provenance import program_digest, versions
-from shapepose_fg.pipeline.workers import get_ready, in_order, processes, what_workers_inherit
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
+from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, packed
 
 Shared = TypeVar("Shared")
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
-_LOADED = ("shapepose_fg.pipeline.pipeline", "distributed")
-"""Modules that have loaded what a process needs."""
 RETRIES = 2
 """So often an item whose process was lost, or that failed, is tried again."""
 _LEAST = 2
@@ -32,70 +28,50 @@ _SECONDS = 10
 _ITSELF = "shapepose-fg itself"
 
 
-class Cluster(Generic[Shared]):
-    """The processes of a Dask cluster, each of which has `shared`: what `Workers` is for one machine.
+@contextmanager
+def cluster(
+    address: str | None, count: int, shared: Shared, ahead: int = 2, *, sharing: int = 1
+) -> Iterator[Pool[Shared]]:
+    """The processes of a Dask cluster, each of which has `shared`: what `workers` is for one machine.
 
-    A context. Results come in order and do not depend on which process they come from, or how many there are.
+    Its scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here, while the block runs.
+    `ahead` items a process are under way, of all who are `sharing` the cluster together: they wait in its
+    scheduler's memory. Results do not depend on which process they come from, or how many there are; an item whose
+    process is lost is done again by another. InputError where Dask is not installed; `WorkLost` where processes
+    are lost too often, or the scheduler is gone.
     """
+    with ExitStack() as opened:
+        at = opened.enter_context(local_cluster(count)).address if address is None else address
+        client = opened.enter_context(_client(at))
+        if address is not None:
+            refuse_other_programs(client, at)
+        # A task, not data that was scattered: what is lost with a process can be made again.
+        there = client.submit(cloudpickle.loads, packed(shared), pure=False)
+        call = (one_item, tuple(this_program().items()), there)
+        with _naming_lost_work():
+            yield pool_of(client, call, ahead / sharing)
 
-    def __init__(
-        self, address: str | None, count: int, shared: Shared, ahead: int = 2, *, sharing: int = 1
-    ) -> None:
-        """The cluster whose scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here.
 
-        `ahead` items a process are under way, of all who are `sharing` the cluster together: they wait in its
-        scheduler's memory. InputError where Dask is not installed.
-        """
-        self._address, self._count, self._shared = address, count, shared
-        self._ahead = ahead / sharing
-        self._open = ExitStack()
-        self._client: Client | None = None
-        self._at: Future[Any] | None = None
+def pool_of(client: Any, call: tuple[Any, ...], ahead: float) -> Pool[Any]:
+    """A pool of a client's processes, of which each has `ahead` items ready, and all of them some."""
+    executor = client.get_executor(pure=False, retries=RETRIES)
+    return Pool(executor, call, lambda: max(_LEAST, ahead * len(client.nthreads())))
 
-    def __enter__(self) -> "Cluster[Shared]":
-        with ExitStack() as opened:
-            address = self._address
-            if address is None:
-                address = opened.enter_context(local_cluster(self._count)).address
-            client = opened.enter_context(_client(address))
-            if self._address is not None:
-                refuse_other_programs(client, address)
-            # A task, not data that was scattered: what is lost with a process can be made again.
-            self._client, self._at = client, client.submit(_same, self._shared, pure=False)
-            self._open = opened.pop_all()
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self._client = self._at = None
-        self._open.close()
+@contextmanager
+def _naming_lost_work() -> Iterator[None]:
+    """`WorkLost` where what the block waits for is lost."""
+    from distributed import KilledWorker
 
-    def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
-
-        An item whose process is lost is done again by another; `WorkLost` where that happens too often, or the
-        scheduler is gone.
-        """
-        from distributed import KilledWorker
-
-        client: Any = self._client
-        if client is None:
-            raise RuntimeError("a cluster is a context: use it in `with`")
-        how = {"pure": False, "retries": RETRIES}
-        submit = partial(client.submit, one_item, tuple(this_program().items()), work, self._at, **how)
-        try:
-            yield from in_order(submit, items, self._most_under_way, client.cancel)
-        except KilledWorker as error:
-            raise WorkLost(
-                f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
-                " work: there may be too little memory for one"
-            ) from None
-        except CancelledError:
-            raise WorkLost("the cluster's scheduler is gone") from None
-
-    def _most_under_way(self) -> float:
-        """As many items as keep every process of the cluster busy."""
-        client: Any = self._client
-        return max(_LEAST, self._ahead * len(client.nthreads()))
+    try:
+        yield
+    except KilledWorker as error:
+        raise WorkLost(
+            f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
+            " work: there may be too little memory for one"
+        ) from None
+    except CancelledError:
+        raise WorkLost("the cluster's scheduler is gone") from None
 
 
 @dataclass(frozen=True)
@@ -116,27 +92,43 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
 
     InputError where Dask is not installed. With `dashboard`, and bokeh installed, the scheduler has one.
     """
-    _, LocalCluster = _dask()
-    import dask.config
+    _dask()
+    # Dask imports `__main__` in its processes, which not every notebook or script allows: that of ours does.
+    with Processes(1, _nothing) as one, naming_lost_work():
+        yield one.submit(_local_cluster, count, dashboard and has_dashboard()).result()
+        one.submit(_end_local_cluster).result()
 
-    shown = dashboard and has_dashboard()
-    get_ready(*_LOADED)
-    method = processes(*_LOADED).get_start_method()
-    with dask.config.set({"distributed.worker.multiprocessing-method": method}), ExitStack() as opened:
-        # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself. Ctrl-C is
-        # for this process alone.
-        with what_workers_inherit(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # another port is taken where the dashboard's usual one is
-            cluster = LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:8787" if shown else None,
-                silence_logs=50,
-            )
-        opened.callback(cluster.close)
-        yield Scheduler(cluster.scheduler_address, count, cluster.dashboard_link if shown else None)
+
+_running: list[Any] = []
+"""In the process that leads it: the cluster of this machine."""
+
+
+def _local_cluster(count: int, dashboard: bool) -> Scheduler:
+    import dask.config
+    from distributed import LocalCluster
+
+    multiprocessing.set_start_method("spawn", force=True)  # that of loky's own processes is unknown to others
+    # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself.
+    with dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # another port is taken where the dashboard's usual one is
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:8787" if dashboard else None,
+            silence_logs=50,
+        )
+    _running.append(cluster)
+    return Scheduler(cluster.scheduler_address, count, cluster.dashboard_link if dashboard else None)
+
+
+def _end_local_cluster() -> None:
+    _running.pop().close()
+
+
+def _nothing() -> None:
+    """What the process that leads a cluster needs beforehand."""
 
 
 def has_dashboard() -> bool:
@@ -155,7 +147,7 @@ def look_at(address: str) -> Scheduler:
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
     """A connexion to the scheduler at an address; bodies and minutes of footage are large tasks to it."""
-    Client, _ = _dask()
+    Client = _dask()
     import dask.config
 
     try:
@@ -198,20 +190,16 @@ def this_program() -> dict[str, str]:
     return {**versions(), _ITSELF: program_digest()}
 
 
-def _dask() -> tuple[Any, Any]:
+def _dask() -> Any:
+    """Dask's client; InputError where it is not installed."""
     try:
-        from distributed import Client, LocalCluster
+        from distributed import Client
     except ImportError:
         raise InputError('Dask is not installed: pip install "shapepose-fg[cluster]", or leave it out') from None
-    return Client, LocalCluster
+    return Client
 
 
-def _same(shared: Shared) -> Shared:
-    """What all work shares."""
-    return shared
-
-
-def one_item(program: tuple[tuple[str, str], ...], work: Callable[[Any, Any], Any], shared: Any, item: Any) -> Any:
+def one_item(program: tuple[tuple[str, str], ...], shared: Any, work: Callable[[Any, Any], Any], item: Any) -> Any:
     """One item, in a process of the cluster; InputError where it has another `program` than the one that asks.
 
     Processes may come at any time, after the others were looked at.

@@ -1,16 +1,14 @@
 """What runs a reconstruction: processes, a cluster, chunks, and who is told how far it is."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from shapepose_fg.pipeline.cluster import Cluster
-from shapepose_fg.pipeline.workers import Workers, suitable_workers
+from shapepose_fg.pipeline.cluster import cluster
+from shapepose_fg.pipeline.workers import Pool, suitable_workers, workers
 
 Shared = TypeVar("Shared")
-Pool = Workers[Shared] | Cluster[Shared]
-"""Processes that do the same work for many items, in order, each with what is shared."""
-
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all."""
 _FRAMES_WORTH_A_WORKER = 100
@@ -38,9 +36,9 @@ class Execution:
         count = suitable_workers(frames, _FRAMES_WORTH_A_WORKER) if self.workers is None else self.workers
         return replace(self, workers=count)
 
-    def pool(self, shared: Shared, frames: int) -> Pool[Shared]:
+    def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:
         """The processes that take part in solving so many frames; all have what is `shared`."""
         count = self.worth(frames).workers or 0
         if self.cluster is None:
-            return Workers(count, shared)
-        return Cluster(None if self.cluster == "local" else self.cluster, count, shared, sharing=self.sharing)
+            return workers(count, shared)
+        return cluster(None if self.cluster == "local" else self.cluster, count, shared, sharing=self.sharing)

@@ -8,6 +8,7 @@ import numpy as np
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate, ObservationTable
@@ -157,7 +158,7 @@ def _with_strays(
     for v in np.unique(view).tolist():
         mine = np.flatnonzero(view == v)
         off = np.linalg.norm(away[mine] - _commonest(away[mine]), axis=-1)
-        order = np.argsort(-off)  # the nearest is written last
+        order = np.argsort(-off, kind="stable")  # the nearest is written last
         mine = mine[order[off[order] < _BESIDE_RAD]]
         xy[row[mine], joint[mine], v], confidence[row[mine], joint[mine], v] = at[mine], score[mine]
     return replace(rows, xy=xy, confidence=confidence)
@@ -234,7 +235,7 @@ def _view_reasons(
         like = ""
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
             least = np.eye(3)  # a metre
-            without = inverses(_positive(whole - information[v]) + least)
+            without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
             away = residual[v] + slope[v] @ without @ gradient[v]
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
             off_px = float(np.linalg.norm(away))
@@ -339,9 +340,11 @@ def _findings(
     found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
     if wrong is not None and all(views[wrong.view].camera not in each.cameras for each in found):
         name = views[wrong.view].camera
+        (turn, turn_sigma), (shift, shift_sigma) = wrong.turn_deg, wrong.shift_m
         words = (
-            f"Camera {name} is off with whatever it sees around this time: turned by {wrong.turn_deg:.1f} degrees"
-            f" and moved by {100 * wrong.shift_m:.0f} cm it would fit the others. Check its pose, lens and clock."
+            f"Camera {name} is off with whatever it sees around this time: turned by {turn:.1f} ± {turn_sigma:.1f}"
+            f" degrees and moved by {100 * shift:.0f} ± {100 * shift_sigma:.0f} cm it would fit the others."
+            " Check its pose, lens and clock."
         )
         found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
@@ -437,12 +440,6 @@ def _mirrored(name: str) -> str:
             if name.startswith(one):
                 return other + name.removeprefix(one)
     return name
-
-
-def _positive(matrix: Array) -> Array:
-    """The nearest positive semi-definite matrix."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
 
 def _pair(values: Array) -> tuple[float, float] | None:

@@ -44,7 +44,7 @@ def estimate_offsets(
     config = config or PipelineConfig()
     fitter = fitter or make_fitter(config.body)
     config = replace(config, offsets=replace(config.offsets, source="recording"))
-    thinned = ThinnedFrames(WithoutRepeats(detections, len(rig)), len(rig), config.candidates)
+    thinned = ThinnedFrames(WithoutRepeats(detections, len(rig)), rig, config.candidates)
     times = FrameTimes.assumed(len(detections)) if times is None else times
     offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, times, Notebook())
     if offsets is None:

@@ -157,7 +157,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         )
     book, fitter = Notebook(), task.fitter
     pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
-    detections = ThinnedFrames(pictures, len(rig), config.candidates)
+    detections = ThinnedFrames(pictures, rig, config.candidates)
     with book.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
@@ -224,7 +224,7 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
     if (known := kept_rig(kept, rig)) is None:
         frames, times, cuts = task.whole()
         pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
-        thinned = ThinnedFrames(pictures, len(rig), config.candidates)
+        thinned = ThinnedFrames(pictures, rig, config.candidates)
         # What it has to say of people is said when they are followed again.
         every = np.arange(frames.start, frames.stop)
         windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, every, Notebook())

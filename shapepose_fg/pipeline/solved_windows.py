@@ -13,11 +13,11 @@ from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
-from shapepose_fg.pipeline.execution import Pool
 from shapepose_fg.pipeline.runs.chunks import Border, Chunk, Identities, cut_in_chunks, windows_of
 from shapepose_fg.pipeline.runs.parts import Checkpoint, Part
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.windows import Span
+from shapepose_fg.pipeline.workers import Pool
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
 

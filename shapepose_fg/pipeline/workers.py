@@ -1,151 +1,139 @@
-"""Worker processes: the same work for many items, here or side by side, in order, with the same result."""
+"""Worker processes: the same work for many items, here or side by side, in order, with the same result.
+
+Everything is a `concurrent.futures.Executor`: this process (`Here`), processes of this machine (`Processes`, by
+loky, which need no importable `__main__`), or those of a Dask cluster (`pipeline/cluster.py`).
+"""
 
 import os
-import pickle
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
-from multiprocessing import forkserver, get_context, resource_tracker
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from typing import Any, Generic, TypeVar
+
+import cloudpickle
+from loky import ProcessPoolExecutor
 
 from shapepose_fg.core.errors import WorkLost
-
-if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext, SpawnContext
 
 Shared = TypeVar("Shared")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
+    "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"
+}
+"""Of worker processes: one thread each for linear algebra; loky is not to restart one whose memory grows, because
+recordings differ."""
+_LOOK_S = 0.5
+"""Interval at which a worker looks whether the process that started it is alive, s."""
 
 
-class Workers(Generic[Shared]):
-    """So many processes, each of which has `shared`; a count of 1 is none but this one.
+@dataclass(frozen=True)
+class Pool(Generic[Shared]):
+    """Does the same work for many items by an executor, each time with what is `shared`."""
 
-    A context: the processes start when it is entered and end when it is left, whatever happens in between.
-    """
-
-    def __init__(self, count: int, shared: Shared, ahead: int = 2) -> None:
-        """`ahead` items a worker are under way, so that none waits and memory stays bounded.
-
-        ValueError for a count under 1, and for something shared that cannot be sent to another process.
-        """
-        if count < 1:
-            raise ValueError(f"workers must be 1 (no further process) or more, got {count}")
-        self.count, self._shared, self._ahead = count, shared, ahead
-        self._pool: ProcessPoolExecutor | None = None
-
-    def __enter__(self) -> "Workers[Shared]":
-        if self.count > 1:
-            try:
-                content = pickle.dumps(self._shared)
-            except (pickle.PicklingError, AttributeError, TypeError) as error:
-                raise ValueError(
-                    f"this cannot be sent to worker processes ({error}): define functions and classes of your own"
-                    " at the top of a module, or use workers=1"
-                ) from error
-            context = processes(type(self._shared).__module__)
-            held, lifeline = context.Pipe(duplex=False)
-            self._lifeline: Any = lifeline
-            given: tuple[Any, ...] = (content, held)  # one end of a pipe, of one class or another by the system
-            self._pool = ProcessPoolExecutor(self.count, context, initializer=_begin, initargs=given)
-            with what_workers_inherit(), _telling_of_lost_ones():
-                for _ in range(self.count):  # the pool starts a process for each of its first jobs
-                    self._pool.submit(_nothing)
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._pool is not None:
-            if kind is not None:
-                self._lifeline.close()  # what they are at is not wanted any more
-            self._pool.shutdown(cancel_futures=True)
-            self._lifeline.close()
-            self._pool = None
+    executor: Executor
+    """Who does it."""
+    call: tuple[Any, ...]
+    """A function, and its first arguments; the work and the item are the last two."""
+    under_way: Callable[[], float]
+    """How many items may be submitted at a time: enough that nobody waits, few enough to bound memory."""
 
     def submit(self, work: Callable[[Shared, Item], Result], item: Item) -> Future[Result]:
-        """`work(shared, item)`, which is done on return where there are no further processes."""
-        if self._pool is not None:
-            with _telling_of_lost_ones():
-                return self._pool.submit(_work, work, item)
-        done: Future[Result] = Future()
-        done.set_result(work(self._shared, item))
-        return done
+        """`work(shared, item)`; it is done on return where there are no further processes."""
+        with naming_lost_work():
+            return self.executor.submit(*self.call, work, item)
 
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
 
         `WorkLost` where a process dies.
         """
-        if self._pool is None:
-            yield from (work(self._shared, item) for item in items)
-            return
-        pool: Any = self._pool
-        with _telling_of_lost_ones():
-            yield from in_order(partial(pool.submit, _work, work), items, lambda: self._ahead * self.count)
+        waiting: deque[Future[Result]] = deque()
+        with naming_lost_work():
+            for item in items:
+                waiting.append(self.submit(work, item))
+                if len(waiting) >= self.under_way():
+                    yield waiting.popleft().result()
+            while len(waiting) > 0:
+                yield waiting.popleft().result()
 
 
 @contextmanager
-def _telling_of_lost_ones() -> Iterator[None]:
-    """`WorkLost` where a process dies in the block, or the one that processes are forked off."""
+def workers(count: int, shared: Shared, ahead: int = 2) -> Iterator[Pool[Shared]]:
+    """So many processes, each of which has `shared`; a count of 1 is none but this one.
+
+    They start when the block is entered and end when it is left, whatever happens in between. `ahead` items a
+    worker are under way. ValueError for a count under 1, and for something shared that cannot be sent to another
+    process; functions and classes of a script or notebook can.
+    """
+    if count < 1:
+        raise ValueError(f"workers must be 1 (no further process) or more, got {count}")
+    if count == 1:
+        yield Pool(Here(), (_call, shared), lambda: 1)
+        return
+    with Processes(count, _keep, packed(shared)) as executor:
+        yield Pool(executor, (_with_shared,), lambda: ahead * count)
+
+
+class Here(Executor):
+    """An executor that does the work when it is submitted, in this process."""
+
+    def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
+        """`fn(*args, **kwargs)`, done on return; what it raises is raised here."""
+        done: Future[Result] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+class Processes(Executor):
+    """An executor of further processes, which start at once, ignore Ctrl-C, and end with the one that made it."""
+
+    def __init__(self, count: int, initializer: Callable[..., object], *arguments: Any) -> None:
+        """Each of `count` processes calls `initializer(*arguments)` first; it must be in an importable module."""
+        given = (os.getpid(), initializer, *arguments)
+        self._pool = ProcessPoolExecutor(count, initializer=_begin, initargs=given, env=_ENVIRONMENT)
+        with _ctrl_c_blocked(), naming_lost_work():
+            self._pool.submit(_nothing)  # the first job starts all processes
+
+    def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
+        """`fn(*args, **kwargs)` in one of the processes."""
+        return self._pool.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
+        """End the processes, whatever they are at: what is wanted of them has been waited for."""
+        self._pool.shutdown(wait=wait, kill_workers=True)
+
+
+@contextmanager
+def naming_lost_work() -> Iterator[None]:
+    """`WorkLost` where a process dies in the block."""
     try:
         yield
-    except (BrokenProcessPool, EOFError, ConnectionError) as error:
+    except BrokenProcessPool as error:
         raise WorkLost(
-            "a worker process was killed, as the system does where there is too little memory for so many (in a"
-            " script, call what takes `workers` below `if __name__ == '__main__':`)"
+            "a worker process was killed, as the system does where there is too little memory for so many"
         ) from error
 
 
-def in_order(
-    submit: Callable[[Item], Future[Result]],
-    items: Iterable[Item],
-    most: Callable[[], float],
-    forget: Callable[[list[Future[Result]]], object] | None = None,
-) -> Iterator[Result]:
-    """What comes of each item, in order; of those that were submitted `most` are under way at a time.
-
-    `forget` is given those that are not wanted any more. A pool of processes ends them by itself: to cancel them
-    while its processes end stops the thread that waits for these, and then the program waits for ever.
-    """
-    waiting: deque[Future[Result]] = deque()
+def packed(shared: object) -> bytes:
+    """Something as bytes for other processes; ValueError where that cannot be done."""
     try:
-        for item in items:
-            waiting.append(submit(item))
-            if len(waiting) >= most():
-                yield waiting.popleft().result()
-        while len(waiting) > 0:
-            yield waiting.popleft().result()
-    finally:
-        if forget is not None:
-            forget(list(waiting))
-
-
-def processes(*modules: str) -> "SpawnContext | ForkServerContext":
-    """How further processes of this program start.
-
-    On Linux each is forked off a process that has imported `modules` and done nothing else, so that loading takes
-    its seconds and its memory once; what was asked for first counts, as long as this process lives. Elsewhere,
-    where forks of loaded libraries are not safe, each imports what it needs.
-    """
-    if sys.platform != "linux":
-        return get_context("spawn")
-    context = get_context("forkserver")
-    context.set_forkserver_preload(list(modules))
-    return context
-
-
-def get_ready(*modules: str) -> None:
-    """Have `modules` imported where `processes` start, while this one does something else."""
-    if processes(*modules).get_start_method() == "forkserver":
-        with what_workers_inherit():
-            forkserver.ensure_running()
+        return cloudpickle.dumps(shared)
+    except Exception as error:  # whatever the user's own objects raise
+        reason = " ".join(str(error).split())[:300]
+        raise ValueError(
+            f"this cannot be sent to worker processes ({type(error).__name__}: {reason}): leave out what belongs"
+            " to this process alone, such as open files and locks, or use workers=1"
+        ) from error
 
 
 def suitable_workers(items: int, worth: int) -> int:
@@ -159,56 +147,59 @@ def cores() -> int:
 
 
 @contextmanager
-def what_workers_inherit() -> Iterator[None]:
-    """Processes that start now have one thread each for linear algebra, and ignore Ctrl-C.
-
-    The terminal sends it to all of them; it is this process that ends them.
-    """
-    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    can_block = hasattr(signal, "pthread_sigmask")
-    # Python's own helper of spawned processes lets the signal through again when it starts: it has to run by then.
+def _ctrl_c_blocked() -> Iterator[None]:
+    """Processes that start in the block do not get Ctrl-C, which a terminal sends to all: this one ends them."""
+    # Python's own helper of such processes lets the signal through again when it starts: it has to run by then.
     resource_tracker.ensure_running()
+    can_block = hasattr(signal, "pthread_sigmask")
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_block else set()
     try:
         yield
     finally:
-        for name in _ONE_THREAD:
-            del os.environ[name]
-        os.environ.update(before)
         if can_block:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 _shared: Any = None
-"""In a worker process: what all its work shares."""
+"""In a worker process: what all its work shares, or why it cannot be had here."""
 
 
-def _begin(content: bytes, lifeline: Any) -> None:
-    """What a worker does first."""
-    global _shared
+def _begin(parent: int, initializer: Callable[..., object], *arguments: Any) -> None:
+    """What a process does first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
-    _shared = pickle.loads(content)  # made by this program a moment ago
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    initializer(*arguments)
+
+
+def _end_with(parent: int) -> None:
+    """End this process, whatever it is at, when the one that started it has ended, were it killed."""
+    while os.getppid() == parent:
+        time.sleep(_LOOK_S)
+    os._exit(1)
+
+
+def _keep(content: bytes) -> None:
+    """Unpack what all work shares; it was packed by this program a moment ago."""
+    global _shared
+    try:
+        _shared = cloudpickle.loads(content)
+    except Exception as error:
+        _shared = error
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)
 
 
-def end_with(lifeline: Any) -> None:
-    """End this process, whatever it is at, when the one that started it lets go of the other end, or is killed.
-
-    A pipe and no event: a process that is killed while it waits for an event keeps the lock for ever.
-    """
-    try:
-        lifeline.recv_bytes()
-    except (EOFError, OSError):
-        os._exit(1)
-
-
-def _work(work: Callable[[Any, Item], Result], item: Item) -> Result:
+def _with_shared(work: Callable[[Any, Item], Result], item: Item) -> Result:
     """One item, in a worker."""
+    if isinstance(_shared, Exception):
+        raise _shared
     return work(_shared, item)
 
 
+def _call(shared: Any, work: Callable[[Any, Item], Result], item: Item) -> Result:
+    """One item, in this process."""
+    return work(shared, item)
+
+
 def _nothing() -> None:
-    """The job that starts a worker."""
+    """The job that starts the processes."""

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Index, Mask
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DerivedFrames, Detections
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints
+from shapepose_fg.proposal.view_faults import without_faults
 
 _LEAST_IN_A_VIEW = 8
 """Detections of a joint that a view may always have, however many views there are."""
@@ -27,24 +29,28 @@ class ThinnedFrames(DerivedFrames):
     are given: of equal ones the first is taken in many places.
     """
 
-    views: int
-    """V, its cameras."""
+    rig: Rig
+    """Its V cameras."""
     config: CandidateConfig
     """How many are allowed."""
 
     def __getitem__(self, frame: int, /) -> Detections:
-        return thinned(self.frames[frame], self.views, self.config)[0]
+        return thinned(self.frames[frame], self.rig, self.config)[0]
 
     def is_thinned(self, frame: int) -> bool:
         """Whether detections of a frame were left out."""
-        return kept_detections(self.frames[frame], self.views, self.config) is not None
+        return kept_detections(self.frames[frame], len(self.rig), self.config) is not None
 
 
-def thinned(every: Detections, views: int, config: CandidateConfig) -> tuple[Detections, bool]:
-    """What stays of a frame's detections, in an order of their own, and whether any were left out."""
+def thinned(every: Detections, rig: Rig, config: CandidateConfig) -> tuple[Detections, bool]:
+    """What stays of a frame's detections, in an order of their own, and whether there were too many.
+
+    What a view shows to be wrong is left out, too (`view_faults`).
+    """
     order = np.lexsort((every.confidence, every.joint, *every.xy.T))
-    kept = kept_detections(every.rows(order), views, config)
-    found = every.rows(order if kept is None else order[kept])
+    found = every.rows(order)
+    kept = kept_detections(found, len(rig), config)
+    found = without_faults(found if kept is None else found.only(kept), rig)
     order = np.lexsort(found.pairs.T)
     return replace(found, pairs=found.pairs[order], affinity=found.affinity[order]), kept is not None
 

@@ -128,6 +128,11 @@ class Build:
         """The world axis nearest to the people's up."""
         return _AXES[int(np.argmax(np.ravel(np.column_stack([self.up, -self.up]))))]
 
+    @property
+    def are_children(self) -> bool:
+        """Whether all or most are as tall as children, which adults in a rig that is too small are as well."""
+        return self.count >= MIN_SIGHTINGS and _SHORTEST <= self.stature < _CHILD
+
 
 def build_of(points: Array, skeleton: Skeleton) -> Build:
     """The build of people (P, J, 3), J the core joints of `skeleton`."""
@@ -181,8 +186,11 @@ _NOBODY = 0.05
 _STOPPED = 0.02
 """Share of pictures shown twice from which on a camera is named: fewer fill up dropped frames."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
-_SHORTEST, _TALLEST = 0.9, 2.4
-"""Median statures, metres, outside of which it is the calibration's unit and not the people."""
+_SHORTEST, _TALLEST = 0.45, 2.4
+"""Median statures outside of which the calibration's unit is wrong, not the people, metres: newborn children are
+0.5 m tall, the tallest people 2.5, and bones tell a stature to a tenth."""
+_CHILD = 1.2
+"""Median stature below which the people are children, metres, or else the calibration's lengths are too short."""
 
 
 @dataclass(frozen=True)
@@ -343,7 +351,7 @@ def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set
         return []
     shift = shifted.shift_deg.copy()
     shift[list(known)] = 0.0
-    order, findings = np.argsort(-shift), list[Finding]()
+    order, findings = np.argsort(-shift, kind="stable"), list[Finding]()
     first, second = shift[order[:2]]
     alone = problem.likely(int(order[0])) > 0 and first > _OUTLIER_RATIO * second
     if tells_apart and first > _OUTLIER_DEG and alone:

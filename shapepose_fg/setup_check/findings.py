@@ -123,11 +123,14 @@ def _words(finding: Finding, rig: Rig) -> str:
     )
 
 
+_POSE_AGAIN = "calibrate its pose again, or let shapepose-fg refine-calibration find it by the people"
+
+
 def _turned(finding: Finding, side_px: int) -> str:
     return (
         "{who} looks turned by about {degrees} degrees"
         + (" and moved by {moved}" if finding.moved > 0.1 else "")
-        + "; calibrate its pose again"
+        + f"; {_POSE_AGAIN}"
     )
 
 
@@ -165,7 +168,8 @@ def _duplicate(finding: Finding, side_px: int) -> str:
     return f"{{first}} and {{second}} have {same}; one of them has the other's {others}: give its own"
 
 
-_ADULT_M = 1.7
+ADULT_M = 1.7
+"""Mean stature of adults, metres, of the body model as of the world's women and men."""
 _UNITS = (
     (1e-3, "m", "mm"),
     (1e3, "mm", "m"),
@@ -178,7 +182,7 @@ _UNITS = (
 
 
 def _unit(finding: Finding, side_px: int) -> str:
-    factor = finding.amount / _ADULT_M
+    factor = finding.amount / ADULT_M
     for times, truth, taken in _UNITS:
         if 0.55 < factor / times < 1.45:
             unit = f"the calibration is probably in {truth}, and was read as {taken}; say its unit with --unit"
@@ -227,7 +231,7 @@ def _unfit(finding: Finding, side_px: int) -> str:
 
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TURNED: _turned,
-    Kind.MOVED: "{who} looks moved by about {moved} and turned by {amount:.1f} degrees; calibrate its pose again",
+    Kind.MOVED: f"{{who}} looks moved by about {{moved}} and turned by {{amount:.1f}} degrees; {_POSE_AGAIN}",
     Kind.LATE: _late,
     Kind.EXCHANGED: "{who} look exchanged: each sees what the other should see; exchange their names in the"
     " calibration, or their detections",

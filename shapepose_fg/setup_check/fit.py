@@ -9,6 +9,7 @@ import numpy as np
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
@@ -132,8 +133,7 @@ def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     away = away / np.linalg.norm(away, axis=1, keepdims=True)
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.K).T
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    U, _, Vt = np.linalg.svd(rays.T @ away)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(rays.T @ away)
     return Pinhole(camera.K, np.column_stack([R, -R @ centre]))
 
 

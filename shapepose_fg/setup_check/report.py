@@ -4,21 +4,22 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
-from shapepose_fg.core.trust import BELIEVED, Spell, Trust
-from shapepose_fg.setup_check.diagnosis import Diagnosis, diagnose
+from shapepose_fg.core.trust import BELIEVED, Spell, Trust, trust_in
+from shapepose_fg.setup_check.diagnosis import Build, Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, triangulate
-from shapepose_fg.setup_check.findings import Finding, Kind, sentence
+from shapepose_fg.setup_check.findings import ADULT_M, Finding, Kind, sentence
 from shapepose_fg.setup_check.fit import match
 from shapepose_fg.setup_check.matching import GATE, miss_px, size_of
 
@@ -83,7 +84,7 @@ class SetupReport:
     trust: Trust = BELIEVED
     """Which cameras a reconstruction is better without: for `reconstruct`."""
     notes: tuple[str, ...] = ()
-    """What is odd and not of the set-up: people whose detections are biased in one view."""
+    """What is odd and need not be a mistake: people whose detections are biased in one view, or who are small."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
         """The warnings, and what a reconstruction makes of them."""
@@ -136,8 +137,19 @@ def check_setup(
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
-        tuple(sentence(finding, rig) for finding in diagnosis.biased),
+        (*(sentence(finding, rig) for finding in diagnosis.biased), *_children(build)),
     )
+
+
+def _children(build: Build | None) -> list[str]:
+    """What a rig in which people are as tall as children may be instead."""
+    if build is None or not build.are_children:
+        return []
+    lengths = f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they should be"
+    return [
+        f"people come out {build.stature:.2f} m tall, as children are; if they are adults, {lengths}: check the"
+        " size of the board's squares"
+    ]
 
 
 def _spells(spells: Sequence[Spell], names: Sequence[str]) -> list[dict[str, Any]]:
@@ -208,6 +220,21 @@ _SHARE = 0.1
 """Of so many rows: fewer are single people that hardly any camera saw."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
 """Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
+_MOST, _FEW = 0.5, 50
+"""A camera of which less than this share of at least so many detections was used is named."""
+_LOST, _LOST_SHARE = 0.5, 0.1
+"""So many people a frame, and such a share of them, are missing before it is said."""
+_LOOKED_AT = 200
+"""Frames, spread over the recording, in which detections are counted for that."""
+_SHORT_S = 1.0
+"""In a recording shorter than this people whom two cameras see may lack evidence."""
+_REASONS = {
+    Gate.TOO_FAR: "are too far from the joint",
+    Gate.CONTRADICTS_BODY: "contradict the body",
+    Gate.BEHIND_CAMERA: "are of joints behind the camera",
+    Gate.NOT_PLACED: "are of joints that have no place",
+}
+"""Why detections that were given to people were not used."""
 _LEAST_USED = 0.1
 """Of detections on Shelf, false candidates among them, most are somebody's."""
 _WORST = 2.0
@@ -251,6 +278,8 @@ class CameraUse:
     """Those that were used."""
     left_out: Distances
     """All that were given to people: from where the other cameras alone put the joint."""
+    unused: dict[str, int] = field(default_factory=dict)
+    """Detections that were not used, by why: left out with their camera, given to nobody, or a gate."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +304,10 @@ class ResultCheck:
 def result_check(
     report: SetupReport, people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
 ) -> ResultCheck:
-    """The check of a set-up with what the reconstruction adds to it."""
+    """The check of a set-up with what the reconstruction adds to it.
+
+    `people` are the rows of all `frames`; detections of other frames are not counted.
+    """
     uses = tuple(camera_use(people, detections, rig, frames))
     warnings = report.with_consequences(rig)
     if len(people) == 0 and Kind.NOBODY not in {finding.kind for finding in report.findings}:
@@ -284,7 +316,8 @@ def result_check(
             if warnings
             else "Nobody was found; look with check-calibration whether cameras and detections fit"
         )
-    warnings += _shapes(people) + _speeds(people) + (_too_many(people) or _clutter(uses))
+    warnings += _shapes(people) + _speeds(people)
+    warnings += _too_many(people) or _clutter(uses) or _unused(uses) + _unseen(people, detections, rig, frames)
     if len(report.findings) == 0:
         warnings += _outlier(uses)
     return ResultCheck(report, uses, tuple(warnings))
@@ -297,9 +330,12 @@ def camera_use(
     table = people.observations
     if table is None:
         return []
-    offered = np.zeros(len(rig), dtype=np.int64)
+    trust = trust_in(detections)
+    offered, dark = (np.zeros(len(rig), dtype=np.int64) for _ in range(2))
     for frame in frames:
-        offered += np.bincount(detections[frame].view, minlength=len(rig))
+        count = np.bincount(detections[frame].view, minlength=len(rig))
+        offered += count
+        dark[list(trust.dark(frame))] += count[list(trust.dark(frame))]
     depth = np.moveaxis(rig.project(people.joints)[1], 0, 2)
     px = np.linalg.norm(table.residual_px.astype(np.float64), axis=-1)
     mm = 1e3 * px * depth / rig.focal_px
@@ -313,9 +349,22 @@ def camera_use(
             Distances.of(px[..., view], mm[..., view]),
             Distances.of(px[..., view][used[..., view]], mm[..., view][used[..., view]]),
             Distances.of(out_px[..., view], out_mm[..., view]),
+            _reasons(table.gate[..., view], int(offered[view]), int(dark[view])),
         )
         for view, name in enumerate(rig.names)
     ]
+
+
+LEFT_OUT, NOBODY = "are left out with the camera", "belong to nobody who was found"
+"""Why detections were not given to anybody."""
+
+
+def _reasons(gate: NDArray[np.uint8], offered: int, dark: int) -> dict[str, int]:
+    """Why those of a camera's detections were not used that were not, each reason that there is and its count."""
+    given = int((gate != Gate.NOT_SEEN).sum())
+    counts = {LEFT_OUT: dark, NOBODY: max(offered - given - dark, 0)}
+    counts |= {words: int((gate == each).sum()) for each, words in _REASONS.items()}
+    return {words: count for words, count in counts.items() if count > 0}
 
 
 def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
@@ -348,7 +397,9 @@ def _shapes(people: Reconstruction) -> list[str]:
 
 
 def _speeds(people: Reconstruction) -> list[str]:
-    """People who move as nobody does."""
+    """People who move as nobody does, where rows have identities."""
+    if not people.run.get("configuration", {}).get("temporal", True):
+        return []
     hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
     order = np.lexsort((people.frame, people.person))
     x, t = people.joints[order][:, hips].mean(axis=1), people.time_s[order]
@@ -388,6 +439,58 @@ def _clutter(uses: Sequence[CameraUse]) -> list[str]:
         f"people explain {100 * used / offered:.1f} % of the detections, and nobody the rest: who is who may be"
         " chance; ask the detector for surer ones only"
     ]
+
+
+def _unused(uses: Sequence[CameraUse]) -> list[str]:
+    """Cameras whose detections were mostly left out, and why."""
+    said = list[str]()
+    for use in uses:
+        if use.offered < _FEW or use.used >= _MOST * use.offered:
+            continue
+        why = [f"{count} {words}" for words, count in sorted(use.unused.items(), key=lambda each: -each[1])]
+        cure = (
+            "; either other cameras do not see these people, or it does not fit: look with check-calibration"
+            if use.unused.get(NOBODY, 0) > use.offered / 2
+            else ""
+        )
+        said.append(f"{use.camera}: {use.used} of {use.offered} detections were used: {', '.join(why)}{cure}")
+    return said
+
+
+def _unseen(people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]) -> list[str]:
+    """`unseen` of a result that has anybody."""
+    if len(people) == 0 or len(frames) == 0:
+        return []
+    fps = people.run.get("time", {}).get("fps")
+    alone = not people.run.get("configuration", {}).get("temporal", True)
+    rows = np.searchsorted(frames, people.frame[np.isin(people.frame, frames)])
+    per_frame = np.bincount(rows, minlength=len(frames))
+    return unseen(detections, len(rig), frames, per_frame, None if alone or not fps else len(frames) / fps)
+
+
+def unseen(
+    detections: DetectionSequence, views: int, frames: Sequence[int], per_frame: Whole, lasts_s: float | None
+) -> list[str]:
+    """A sentence where two cameras see more people than there are rows in a frame, `per_frame` (F,), and why.
+
+    A camera sees as many as it has detections of a core joint (median). `lasts_s` is how long the recording is,
+    None of frames by themselves.
+    """
+    core = list(detections.skeleton.core)
+    looked_at = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
+    seen = np.zeros((len(looked_at), views))
+    for row, frame in enumerate(looked_at.tolist()):
+        found = detections[frames[frame]]
+        for view in range(views):
+            joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
+            seen[row, view] = np.median(joints[core])
+    by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
+    if by_two - here < max(_LOST, _LOST_SHARE * by_two):
+        return []
+    why = "the others too little, or not as one"
+    if lasts_s is not None and lasts_s < _SHORT_S:
+        why = f"{lasts_s:.2g} s are too little to be sure of everybody; give more frames, or --no-temporal"
+    return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why}"]
 
 
 def _outlier(uses: Sequence[CameraUse]) -> list[str]:

@@ -262,7 +262,7 @@ class Problem:
         """The recording as if the person had been seen where the others see that person."""
         mine = self.members[self.who == bias.person, bias.view]
         mine = look.sightings.only(mine[mine >= 0])
-        order = np.argsort(mine.frame)
+        order = np.argsort(mine.frame, kind="stable")
         way = [np.interp(look.shifted.frame, mine.frame[order], x[order]) for x in _middle(mine.xy).T]
         away = np.linalg.norm(_middle(look.shifted.xy).T - way, axis=0) / look.shifted.size_px
         away[look.shifted.view != bias.view] = np.inf
@@ -361,7 +361,7 @@ class Problem:
         weights = np.exp(gains - max(gains.max(), 0.0))
         weights /= weights.sum() + np.exp(-max(gains.max(), 0.0))
         of = np.bincount([view for _, view, _ in self.singles], weights, len(self.views))
-        return {view: float(of[view]) for view in np.argsort(-of).tolist()}
+        return {view: float(of[view]) for view in np.argsort(-of, kind="stable").tolist()}
 
     def causes(self) -> list[tuple[Finding, Views]]:
         """What one camera may have wrong, likeliest first, as `kinds`, of all cameras that are not unlikely."""

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.simulation.choices import comparable
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.motion import along, left_of
@@ -126,7 +127,7 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     first, last = np.arange(seam, count // 2), np.arange(count // 2, count)
     gap = np.linalg.norm(features[first][:, None] - features[last][None], axis=-1)
     # A shorter loop shows its seam more often: prefer the longer of two that close equally well.
-    begin, end = np.unravel_index(np.argmin(gap - 0.002 * (last[None] - first[:, None])), gap.shape)
+    begin, end = np.unravel_index(np.argmin(comparable(gap - 0.002 * (last[None] - first[:, None]))), gap.shape)
     begin, end = int(first[begin]), int(last[end])
     share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
     rotations, joints = walk.rotations[begin:end].copy(), walk.joints[begin:end].copy()
@@ -156,7 +157,7 @@ def way_through(
 ) -> Way:
     """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more."""
     ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
-    return max(ways, key=lambda way: _way_worth(way, others, distance_m))
+    return max(ways, key=lambda way: comparable(_way_worth(way, others, distance_m)))
 
 
 def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
@@ -187,7 +188,7 @@ def _walk(
         apart_x, apart_y = (options[..., None, axis] - others[ahead, :, axis] for axis in (0, 1))
         gaps = np.sqrt(apart_x**2 + apart_y**2)  # most of the time goes here: five times as fast as norm
         cost += 200.0 * (np.maximum(distance + 0.08 - gaps, 0.0) ** 2).sum(axis=(1, 2))
-        best = int(np.argmin(cost))
+        best = int(np.argmin(comparable(cost)))
         rate, pace = float(turns[best]), float(paces[best])
         for later in range(frame, min(frame + hold, frames)):
             places[later], headings[later] = xy, heading
@@ -210,7 +211,7 @@ def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Ar
     if others.size > 0:
         early = others[: max(1, min(len(others), 20)) : 4]
         free = np.linalg.norm(spots[:, None, None] - early, axis=-1).min(axis=(1, 2))
-        spots = spots[[int(np.argmax(np.minimum(free, 0.9)))]]
+        spots = spots[[int(np.argmax(comparable(np.minimum(free, 0.9))))]]
     return spots[0], float(np.arctan2(-spots[0][1], -spots[0][0]) + rng.uniform(-0.5, 0.5)), 0.75
 
 

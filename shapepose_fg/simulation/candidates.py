@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics
 
@@ -132,8 +133,7 @@ class FalseCandidateProcess:
 
 def _root(correlation: Array) -> Array:
     """What independent rows (..., 25) are multiplied with from the right to correlate so; rounding is forgiven."""
-    values, vectors = np.linalg.eigh(correlation)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = symmetric_root(correlation)
     return (root / np.linalg.norm(root, axis=1, keepdims=True)).T
 
 

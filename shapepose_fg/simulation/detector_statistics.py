@@ -3,7 +3,6 @@
 The code that measures is `simulation/measurement` of commit 77ab725.
 """
 
-import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.files import read_json
 
 _FILE = Path(__file__).parent / "data" / "detector.json"
 _MIRROR = np.array(BODY_25.mirror)
@@ -121,7 +121,7 @@ class DetectorStatistics:
     @classmethod
     def read(cls, path: Path) -> "DetectorStatistics":
         """From a file like the shipped one: an entry for each field."""
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         tables: dict[str, Any] = {name: content[name] for name in cls.__dataclass_fields__}
         for name, table in tables.items():
             tables[name] = np.array(table, dtype=np.float64) if isinstance(table, list) else table

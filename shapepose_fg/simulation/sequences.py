@@ -15,6 +15,7 @@ import numpy as np
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.bystanders import stand, standing_clips, walk_along, walking_clips, way_through
+from shapepose_fg.simulation.choices import comparable
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.motion import Motion
@@ -104,7 +105,7 @@ class Room:
         worth = [self._worth(two, turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         placed = (
             [one.moved(shifts[index], float(turns[index])) for one in two]
-            for index in np.argsort(worth)[::-1][:_TRIED]
+            for index in np.argsort(comparable(-np.array(worth)), kind="stable")[:_TRIED]
         )
         for one, clip in zip(self._roomiest(placed), pair, strict=True):
             self._add(one, clip.name)
@@ -123,7 +124,8 @@ class Room:
             nearest, towards = np.full(_SPOTS, self.config.close_m), np.tile([1.0, 0.0], (_SPOTS, 1))
         turns = np.arctan2(towards[:, 1], towards[:, 0]) - np.arctan2(faces[1], faces[0]) + noise
         short = np.maximum(self.config.close_m + 0.1 - nearest, 0.0)
-        order = np.argsort(20 * short + np.maximum(nearest - self.config.close_m, 0.0))[:_TRIED]
+        far = comparable(20 * short + np.maximum(nearest - self.config.close_m, 0.0))
+        order = np.argsort(far, kind="stable")[:_TRIED]
         placed = ([one.moved(spots[index], float(turns[index]))] for index in order)
         self._add(self._roomiest(placed)[0], clip.name)
 
@@ -180,7 +182,7 @@ class Room:
         for placed in options:
             reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)
             free = min((self._gap(one, other) for one in placed for other in self.performed), default=0.0)
-            free = min(free, _HALF_ROOM_M - float(reach))
+            free = float(comparable(min(free, _HALF_ROOM_M - float(reach))))
             if free > most:
                 best, most = placed, free
             if free >= 0.0:
@@ -207,9 +209,15 @@ def clearance_m(first: Array, second: Array) -> Array:
 
 
 def _long_axis(points: Array) -> float:
-    """Direction in which points (N, 2) spread most."""
-    _, vectors = np.linalg.eigh(np.cov(points.T) if len(points) > 1 else np.eye(2))
-    return float(np.arctan2(vectors[1, -1], vectors[0, -1]))
+    """Direction in which points (N, 2) spread most, from -1 to pi - 1 radians; 0 where they spread alike.
+
+    The range ends where no axis of a symmetrical motion is.
+    """
+    x, y = (points - points.mean(axis=0)).T
+    along, across, most = (x**2 - y**2).sum(), 2 * (x * y).sum(), (x**2 + y**2).sum()
+    if np.hypot(along, across) <= 1e-9 * most:
+        return 0.0
+    return float((np.arctan2(across, along) / 2 + 1) % np.pi - 1)
 
 
 Split = Literal["tune", "report"]

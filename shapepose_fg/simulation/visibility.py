@@ -11,7 +11,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.drawing import thinned
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
-from shapepose_fg.pipeline.workers import Workers
+from shapepose_fg.pipeline.workers import workers as worker_processes
 from shapepose_fg.viz.rendering import first_surface_at, scaled
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class VisibilityWorker:
         Frames are taken from `frames` as they are needed. Close the iterator (`contextlib.closing`) to end the
         processes early. RuntimeError where one of them dies.
         """
-        with Workers(workers, self, AHEAD) as pool:
+        with worker_processes(workers, self, AHEAD) as pool:
             yield from pool.map(VisibilityWorker.one, frames)
 
 

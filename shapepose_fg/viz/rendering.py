@@ -77,9 +77,8 @@ def first_surface_at(
     `rasterise` makes, in half the time. At most 2**20 points.
     """
     width, height = camera.image_size
-    cTw = camera.cTw.astype(np.float32)
-    points = cTw[:, :3] @ np.asarray(points_world, dtype=np.float32).T
-    points += cTw[:, 3:]
+    # In double precision: what a product in single precision rounds depends on the processor, and moves edges.
+    points = camera.cTw[:, :3] @ np.asarray(points_world, dtype=np.float64).T + camera.cTw[:, 3:]
     near = points[2] <= NEAR_M
     if near.any():  # OpenCV draws a face that reaches behind the camera all over the image
         faces = faces[~near[faces].any(axis=1)]
@@ -93,7 +92,7 @@ def first_surface_at(
     return np.where(met >= 0, depth[row, column], np.float32(np.inf)), vertex
 
 
-def _as_opengl(points: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+def _as_opengl(points: Array, camera: Camera) -> NDArray[np.float32]:
     """(N, 3) of points (3, N) in camera coordinates, where a camera of 1 radian, y up, z back, sees them alike."""
     (width, height), K = camera.image_size, camera.K
     focal = height / 2 / np.tan(0.5)

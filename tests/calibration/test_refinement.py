@@ -153,3 +153,31 @@ def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_pa
     for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
         code, _, error = run([*base, *more, "--output", tmp_path / "new.json"], capsys)
         assert code == 2 and said in " ".join(error.split())
+
+
+def pose2sim_project(rig, recording, folder):
+    """A project with our own rig file as its calibration."""
+    (folder / "calibration").mkdir(parents=True)
+    (folder / "Config.toml").write_text("[project]\nframe_rate = 25\nmulti_person = true\n")
+    write_rig(rig, folder / "calibration" / "rig.json")
+    write_openpose(recording, rig, folder / "pose")
+    return folder
+
+
+def test_places_and_names_are_looked_at_first(rig, recording, tmp_path, capsys):
+    project = pose2sim_project(rig, replace(recording, frames=recording.frames[:3]), tmp_path / "walk")
+    base = ["refine-calibration", "--project", project, "--output"]
+    code, _, error = run([*base, tmp_path / "new.qca.txt"], capsys)
+    assert code == 2 and "cameras that came as our own rig file are written so" in " ".join(error.split())
+    code, _, error = run(["refine-calibration", "--output", tmp_path / "new.json"], capsys)
+    assert code == 2 and "--calibration and --detections: missing" in " ".join(error.split())
+    assert not list(tmp_path.glob("new*"))
+
+
+@pytest.mark.slow
+def test_the_cameras_of_a_pose2sim_project(rig, recording, tmp_path, capsys):
+    project, new = pose2sim_project(disturbed(rig, 4), recording, tmp_path / "walk"), tmp_path / "new.json"
+    code, out, error = run(["refine-calibration", "--project", project, "--output", new], capsys)
+    assert code == 0 and "25 frames a second, as Config.toml says" in " ".join(error.split())
+    assert f"reconstruct --calibration {new} --project {project}" in " ".join(out.split())
+    assert off_by(read_rig(new), rig)[0].max() < 0.25

@@ -1,6 +1,8 @@
 """Who is next, who is tried again and who is given up, with leaders that only say so; and real ones that die."""
 
 import json
+import os
+import signal
 from multiprocessing import Pipe
 from pathlib import Path
 
@@ -205,6 +207,6 @@ def test_a_leader_that_fails_says_why_and_one_that_is_killed_is_noticed(tmp_path
     assert isinstance(told, str) and told.startswith(f"{tmp_path / 'no.json'}: there is no such file")
     assert "error: " in (tmp_path / "log.txt").read_text()
     leader = Leader(lost)
-    leader._process.kill()
-    assert leader.next() == "its process was killed by signal 9; there may be too little memory"
+    os.kill(leader._pid.result(), signal.SIGKILL)
+    assert leader.next() == "its process was ended from outside; there may be too little memory"
     leader.end()

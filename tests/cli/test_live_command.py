@@ -12,7 +12,7 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.ros.mcap_files import McapWriter
-from shapepose_fg.live.ends import _listening
+from shapepose_fg.live.sockets import listen
 
 
 @pytest.fixture
@@ -188,8 +188,8 @@ def test_people_can_be_looked_at_while_they_go_elsewhere(tmp_path, cameras, five
 
 
 def test_a_socket_listens_on_this_machine_only_unless_told_otherwise():
-    with _listening("tcp://:0") as own, _listening("tcp://0.0.0.0:0") as everybody:
+    with listen("tcp://:0") as own, listen("tcp://0.0.0.0:0") as everybody:
         assert own.getsockname()[0] == "127.0.0.1" and everybody.getsockname()[0] == "0.0.0.0"
     for wrong in ("tcp://", "tcp://:70000", "tcp://:5000/way", "tcp://no.such.host.invalid:5000"):
         with pytest.raises(InputError, match="cannot be listened on"):
-            _listening(wrong)
+            listen(wrong)

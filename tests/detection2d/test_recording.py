@@ -94,6 +94,7 @@ class Stopped(Exception):
     pass
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_to_the_same_end(rolled_rig, pictures, tmp_path, painted_network, monkeypatch):
     monkeypatch.setattr(recording, "BLOCK", 2)
     whole, parted = tmp_path / "whole", tmp_path / "parted"

@@ -267,6 +267,7 @@ def disc_file(path: Path, joints: int, size: tuple[int, int]) -> Path:
     return onnx_model(path, nodes, weights, ("n", 3, size[1], size[0]), gives)
 
 
+@pytest.mark.slow
 def test_detected_feet_are_reconstructed_feet(rolled_rig, tmp_path, capsys, monkeypatch):
     """A man of the built-in scene, painted for three cameras, one of them rolled: HALPE-26 in and out."""
     monkeypatch.chdir(tmp_path)

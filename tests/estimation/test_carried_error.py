@@ -63,7 +63,7 @@ def test_of_fixed_cameras_and_a_robot_it_is_what_poses_drawn_from_their_covarian
     rig, rng = on_robot(five_cameras, first), np.random.default_rng(0)
     observations, sigmas = seen(rig, two_people)
     time_s, ends = np.zeros((2, 5)), []
-    for error in rng.multivariate_normal(np.zeros(6), COVARIANCE, 400):
+    for error in rng.multivariate_normal(np.zeros(6), COVARIANCE, 400, method="cholesky"):
         moved = POSE.retract(error).matrix()
         wrong = replace(rig, trajectories=(replace(rig.trajectories[0], wTb=np.stack([moved] * 2)),))
         views, points = Views.of(wrong, time_s), two_people

@@ -122,7 +122,7 @@ def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
         view, joint = np.tile(seen.view, 4), np.tile(seen.joint, 4)
         frames.append(replace(seen, view=view, joint=joint, xy=xy, confidence=confidence, place=None))
     recording = Recording(BODY_25, frames)
-    thinned = ThinnedFrames(recording, len(scene.rig), config.candidates)
+    thinned = ThinnedFrames(recording, scene.rig, config.candidates)
     assert all(thinned.is_thinned(frame) for frame in range(3))
     found = estimate_offsets(recording, scene.rig, config)
     expected = estimate_offsets(Recording(BODY_25, [thinned[frame] for frame in range(3)]), scene.rig, config)

@@ -124,7 +124,7 @@ def test_the_kernel_makes_one_wrong_view_harmless(five_cameras, person):
         kernel: np.linalg.norm(graph_of(five_cameras, xy, sigmas, kernel=kernel).solve(truth) - truth, axis=1)
         for kernel in (None, "cauchy")
     }
-    assert np.median(off["cauchy"]) < 0.5 * np.median(off[None])
+    assert np.median(off["cauchy"]) < 0.65 * np.median(off[None])  # 0.37 +- 0.06 over cameras and noise
 
 
 def test_covariance_is_the_inverse_of_the_information(five_cameras, person):

@@ -17,7 +17,6 @@ from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.in_time import interpolated, near_in_time
-from shapepose_fg.estimation.linearisation import symmetric_roots
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.state_covariances import state_covariances
@@ -312,6 +311,7 @@ def test_a_foot_that_stands_still_stays_still(walk, five_cameras, two_people):
     assert np.isfinite(found.covariance).all()
 
 
+@pytest.mark.slow
 def test_velocities_take_factors_too(walk, five_cameras, two_people):
     """Wrists that stand still by decree; in a frame alone there are no velocities, and the factors rest."""
     observations, _ = walk
@@ -332,6 +332,7 @@ def box(window, keys):
         yield gtsam.RangeFactor3(right, left, 0.4, gtsam.noiseModel.Isotropic.Sigma(1, 0.01))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
 def test_joints_tied_to_each_other_get_the_body_without_any_of_their_targets(
     walk, five_cameras, two_people, temporal
@@ -458,17 +459,6 @@ def test_another_format_is_refused_whatever_it_holds(tmp_path):
     (tmp_path / "motion.json").write_text(json.dumps(data | {"format": "shapepose-fg motion model 2"}))
     with pytest.raises(InputError, match=r"motion\.json: is not a motion model"):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
-
-
-def test_symmetric_roots_multiply_to_what_they_are_of():
-    """A ray says nothing along itself: that direction stays nothing."""
-    rng = np.random.default_rng(0)
-    half = rng.normal(size=(20, 3, 3)) * rng.uniform(0, 30, (20, 3))[:, None]
-    half[:5, :, 2] = 0.0  # rank 2
-    information = half @ half.swapaxes(1, 2)
-    roots = symmetric_roots(information)
-    np.testing.assert_allclose(roots, roots.swapaxes(1, 2), atol=1e-9)
-    np.testing.assert_allclose(roots @ roots, information, atol=1e-9 * np.abs(information).max())
 
 
 def nothing(window, keys):

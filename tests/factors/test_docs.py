@@ -9,7 +9,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "factors.md"
 def test_the_documented_examples_run(tmp_path, monkeypatch):
     """All Python of docs/factors.md, one block after the other, as a reader would type it."""
     blocks = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), flags=re.DOTALL)
-    assert len(blocks) == 7
+    assert len(blocks) == 8
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     for block in blocks:

@@ -118,7 +118,7 @@ def _ended(process: subprocess.Popen[str]) -> str:
 
 
 def _descendants(pid: int) -> list[int]:
-    """Its workers, and the process that they are forked off; not Python's helper, which only clears up."""
+    """Its workers; not the helpers of Python and loky, which only clear up."""
     parents = dict[int, int]()
     for place in Path("/proc").glob("[0-9]*/stat"):
         try:

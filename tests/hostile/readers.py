@@ -225,8 +225,11 @@ def _settings_of(folder: Path) -> None:
 
 def _merged(folder: Path) -> None:
     with Reconstruction.open(folder) as opened:
-        one, other = (np.unique(opened.person).tolist() * 2)[:2]
-    correct(folder, Edit(Action.SWAP, one, other, frame=int(opened.frame[-1])))
+        found, frame = np.unique(opened.person).tolist(), int(opened.frame[-1])
+    if len(found) > 1:
+        correct(folder, Edit(Action.SWAP, found[0], found[1], frame=frame))
+    else:
+        correct(folder, Edit(Action.SPLIT, found[0], found[0] + 1, frame=frame))
     take_back(folder)
 
 

@@ -149,7 +149,7 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
         assert own.fitter is not None
         setup = Setup(own.rig, own.detections.skeleton, own.config, own.fitter)
         pictures = WithoutRepeats(own.detections, len(own.rig))
-        detections = ThinnedFrames(pictures, len(own.rig), own.config.candidates)
+        detections = ThinnedFrames(pictures, own.rig, own.config.candidates)
         windows = SolvedWindows(
             setup, detections, pictures, times, frames, cuts, np.arange(len(times)), Notebook()
         )

@@ -170,6 +170,7 @@ def test_a_pipe_or_a_link_among_the_parts_is_refused_at_once(parts, task, tmp_pa
     assert "a link that leads out of its folder" in refused(parts, task)
 
 
+@pytest.mark.slow
 def test_one_flipped_bit_is_the_same_bytes_or_one_sentence(stopped, task, whole, tmp_path):
     """And the result that is there already stays, whole, until a whole one takes its place."""
     rng, expected = random.Random(0), (whole / "people.npz").read_bytes()

@@ -325,6 +325,7 @@ def test_openpose_of_larger_pictures(openpose_folder, rig):
     )
 
 
+@pytest.mark.slow
 def test_shelf_against_a_plain_reading(shared_data):
     rig = read_rig(shared_data / "shelf" / "calibration.json")
     table = read_detections(shared_data / "shelf", rig)

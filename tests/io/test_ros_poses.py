@@ -107,7 +107,7 @@ def test_ros_covariances_are_of_the_parents_axes(tmp_path):
     file = write(tmp_path / "odom.mcap", [("/odom", t, odometry(t, ODOM[0], parents)) for t in (0.0, 0.1)])
     found = read_trajectory(file)
     assert found.covariance is not None
-    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(6), parents, 20_000)
+    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(6), parents, 20_000, method="cholesky")
     R, t = ODOM[0].rotation(), ODOM[0].translation()
     errors = [
         gtsam.Pose3.Logmap(ODOM[0].between(gtsam.Pose3(gtsam.Rot3.Expmap(e[3:]) * R, t + e[:3]))) for e in drawn

@@ -81,6 +81,7 @@ def test_a_camera_that_is_bumped_into_is_named_and_left_out_until_it_agrees(five
     assert apart.mean() < 0.01
 
 
+@pytest.mark.slow
 def test_who_leaves_and_comes_back_is_the_same_person(five_cameras, steps):
     frames = [steps(n, (0, 1) if n < 15 or n >= 30 else (0,)) for n in range(50)]
     there = []

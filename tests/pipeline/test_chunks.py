@@ -130,6 +130,7 @@ def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
         np.testing.assert_array_equal(getattr(thinned, name), getattr(expected, name), err_msg=name)
 
 
+@pytest.mark.slow
 def test_chunks_change_neither_people_nor_names(whole, in_chunks):
     assert np.array_equal(in_chunks.frame, whole.frame)
     pairs = set(zip(whole.person.tolist(), in_chunks.person.tolist(), strict=True))
@@ -218,7 +219,7 @@ class NobodyIsThere:
 
 @pytest.mark.parametrize("fps", [3.0, *slow(25.0), 50.0, *slow(60.0)])
 @pytest.mark.parametrize("views", [*slow(1), 3, *slow(6)])
-@pytest.mark.parametrize("batch", [1, 12])
+@pytest.mark.parametrize("batch", [*slow(1), 12])
 def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less then."""
     config = PipelineConfig(batch_frames=batch)

@@ -1,6 +1,7 @@
 """Joints that were spoiled on purpose: `explain` names what was done, and says nothing of those that were not."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -152,15 +153,13 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     at = people.joints[row]
     near = np.linalg.norm(found.joints - at, axis=-1).mean(axis=1) + 10 * (found.frame != 5)
     who = int(found.person[near.argmin()])
+    done = {(Cause.GATED, scene.rig.names[away]), (Cause.FOREIGN, scene.rig.names[taken])}
     told = explain(found, scene.rig, person=who, joint="LElbow", frame=5, detections=spoiled)
-    named = {(each.cause, each.cameras[0]) for each in told.findings if each.cameras}
-    assert {(Cause.GATED, scene.rig.names[away]), (Cause.FOREIGN, scene.rig.names[taken])} <= named
-    silent = asked(found, scene.rig, who)
-    assert all(each.cause == Cause.ONE_VIEW for each in silent.findings), (
-        "of what was given to them nothing is wrong"
-    )
+    assert done <= {(each.cause, *each.cameras[:1]) for each in told.findings}
+    # Of what was given to them neither is seen.
+    assert not done & {(each.cause, *each.cameras[:1]) for each in asked(found, scene.rig, who).findings}
     untouched = explain(people, scene.rig, person=person, joint="LElbow", frame=5, detections=recording)
-    assert untouched.findings == ()
+    assert not done & {(each.cause, *each.cameras[:1]) for each in untouched.findings}
 
 
 def test_views_that_the_body_contradicts(people, scene):
@@ -193,13 +192,20 @@ def with_turned(rig, view: int, degrees: float):
     return replace(rig, cameras=tuple(cameras))
 
 
+def turned_by(found: Explanation) -> tuple[float, float]:
+    """Degrees by which the finding says that a camera is off, and their sigma."""
+    turn, sigma = re.search(r"turned by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words).groups()
+    return float(turn), float(sigma)
+
+
 def test_a_camera_that_was_turned(people, scene):
     person, _, cameras = seen_by_many(people)
     view = int(cameras[0])
     spoiled = with_turned(scene.rig, view, 2.0)
     found = asked(solved(people, spoiled), spoiled, person)
     assert first(found) == (Cause.WRONG_CAMERA, (scene.rig.names[view],))
-    assert "turned by 2." in found.findings[0].words or "turned by 1.9" in found.findings[0].words
+    turn, sigma = turned_by(found)
+    assert abs(turn - 2.0) < 3 * sigma < 6.0
 
 
 def test_a_camera_of_which_hardly_anything_was_taken(scene):
@@ -209,11 +215,13 @@ def test_a_camera_of_which_hardly_anything_was_taken(scene):
     rig, recording = with_turned(scene.rig, 3, 4.0), simulate(scene, seed=3)
     found = reconstruct(recording, rig)
     assert found.observations is not None
-    assert found.observations.used[:, :, 3].mean() < 0.05
+    used = found.observations.used.mean(axis=(0, 1))
+    assert used[3] < used[:3].mean() / 3
     person, _, _ = seen_by_many(found)
     told = explain(found, rig, person=person, joint="LElbow", frame=5, detections=recording)
     assert first(told) == (Cause.WRONG_CAMERA, (rig.names[3],))
-    assert float(told.findings[0].words.split("turned by ")[1].split()[0]) == pytest.approx(4.0, abs=1.0)
+    turn, sigma = turned_by(told)
+    assert abs(turn - 4.0) < 3 * sigma < 6.0
     assert all(each.cause != Cause.WRONG_CAMERA for each in asked(found, rig, person).findings)
 
 

@@ -76,7 +76,7 @@ def crowd() -> tuple[Rig, tuple[Detections, ...]]:
 @cache
 def crowd_as_it_is() -> Reconstruction:
     people = solved(*crowd())
-    assert len(people) > 3 * FRAMES
+    assert len(people) >= 2 * FRAMES
     return people
 
 
@@ -93,6 +93,7 @@ def test_the_order_of_cameras_people_and_detections():
     assert farthest_m(crowd_as_it_is(), people, people.joints) < SAME_M
 
 
+@pytest.mark.slow
 def test_the_size_of_the_pictures():
     """Coordinates and intrinsics halved."""
     rig, frames = crowd()

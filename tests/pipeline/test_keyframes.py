@@ -120,6 +120,7 @@ def test_fast_finds_the_same_people_as_surely(scene, results):
     assert inside[0.5] < 0.8
 
 
+@pytest.mark.slow
 def test_fast_is_the_same_with_processes(scene, results):
     again = reconstruct(
         simulate(scene),
@@ -139,6 +140,6 @@ def test_fast_results_are_solved_anew(scene, results):
     np.testing.assert_array_equal(again.frame, fast.frame)
     np.testing.assert_array_equal(again.person, fast.person)
     assert (again.status == Status.OK).all()
-    assert np.nanmedian(np.linalg.norm(again.joints - fast.joints, axis=-1)) < 0.001
+    assert np.nanmedian(np.linalg.norm(again.joints - fast.joints, axis=-1)) < 0.003
     # A gate falls the other way where a joint is on its edge: 2 of 3,450 on one kind of processor, 0 on another.
     assert ((again.known == Known.MOTION) != (fast.known == Known.MOTION)).mean() < 0.002

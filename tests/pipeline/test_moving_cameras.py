@@ -131,6 +131,7 @@ def test_people_correct_the_odometry_and_say_how_surely(drifted, refined):
     assert (nees < 16.8).all() and np.sqrt(covariance[:, 3:, 3:].trace(axis1=1, axis2=2)).max() < 0.1
 
 
+@pytest.mark.slow
 def test_it_is_continuous_over_windows(drifted, refined):
     config = replace(PipelineConfig(), batch_frames=24)
     rig = refine_trajectories(drifted.recording, drifted.rig, config, times=TIMES)
@@ -239,6 +240,7 @@ def _moved(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[n
     return points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
 
 
+@pytest.mark.slow
 def test_factors_of_your_own_on_poses_count(drifted):
     def surveyed(graph, keys):
         """A landmark says to a millimetre where the robot is in frame 30."""

@@ -1,5 +1,8 @@
 """The whole way: what goes in as 2D candidates comes out as people."""
 
+import subprocess
+import sys
+import threading
 from dataclasses import replace
 
 import gtsam
@@ -125,8 +128,38 @@ def test_workers_change_no_byte(scene, recording, monkeypatch):
 
 
 def test_factors_that_cannot_be_sent_to_workers_are_refused(scene, recording):
-    with pytest.raises(ValueError, match="at the top of a module, or use workers=1"):
-        reconstruct(recording, scene.rig, extra_factors=lambda window, keys: (), execution=Execution(workers=2))
+    lock = threading.Lock()
+
+    def factors(window, keys):
+        with lock:
+            yield from ()
+
+    with pytest.raises(ValueError, match="cannot be sent to worker processes"):
+        reconstruct(recording, scene.rig, extra_factors=factors, execution=Execution(workers=2))
+
+
+_TYPED = """
+import gtsam
+from factors import isotropic
+from shapepose_fg import Execution, reconstruct
+from shapepose_fg.simulation import built_in_scene, simulate
+scene = built_in_scene(seed=0, people=1, cameras=3, frames=4)
+detections = simulate(scene, seed=0)
+def carries_a_box(window, keys):
+    for frame in keys.tolist():
+        right, left = (frame[detections.skeleton.index(name)] for name in ("RWrist", "LWrist"))
+        yield gtsam.RangeFactor3(right, left, 0.40, isotropic(1, 0.01))
+alone = reconstruct(detections, scene.rig, extra_factors=carries_a_box)
+helped = reconstruct(detections, scene.rig, extra_factors=carries_a_box, execution=Execution(workers=2))
+print(len(alone), alone.joints.tobytes() == helped.joints.tobytes())
+"""
+
+
+@pytest.mark.slow
+def test_factors_that_were_typed_somewhere_are_the_same_with_workers():
+    """README's own factor, in a script on standard input, which no other process can import."""
+    run = subprocess.run([sys.executable, "-"], input=_TYPED, capture_output=True, text=True, timeout=300)
+    assert run.stdout == "4 True\n", run.stderr
 
 
 def test_progress_counts_frames(scene, recording):

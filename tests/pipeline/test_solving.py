@@ -82,6 +82,7 @@ def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], 
         return frames, work()
 
 
+@pytest.mark.slow
 def test_rows_are_solved_anew_in_the_windows_of_the_recording():
     """22 frames cut before the tenth, windows of six that overlap by three; the last of each part is longer."""
     scene = built_in_scene(people=2, cameras=4, frames=22)

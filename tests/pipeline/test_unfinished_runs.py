@@ -146,6 +146,7 @@ def test_who_comes_when_a_run_goes_on_is_nobody_of_before(scene, recording, tmp_
     assert len(before) == len(after) == 2 and not before & after
 
 
+@pytest.mark.slow
 def test_people_are_followed_on_from_where_a_run_was_stopped(scene, recording, tmp_path):
     """Behind the first of several windows, in the middle of a segment."""
     config = replace(CONFIG, offsets=OffsetConfig(source="none"))

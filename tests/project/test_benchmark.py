@@ -29,6 +29,7 @@ def test_a_long_recording_goes_back_and_forth(benchmark):
     assert [id(long[t]) for t in range(12)] == [id(short[t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)]
 
 
+@pytest.mark.slow
 def test_a_command_that_fails_is_shown_with_what_it_said(benchmark, tmp_path):
     with pytest.raises(SystemExit, match=r"(?s)--detections here .*failed.*here"):
         benchmark.spend(benchmark.HERE, ["--calibration", "no.json", "--detections", "here"], tmp_path / "out")

@@ -124,6 +124,11 @@ def test_extending(tmp_path, monkeypatch):
     assert names["width"].shape == (24,)
     assert abs(np.median(names["width"]) - 0.40) < 0.03
     assert wrists_apart(names["people"]) > 0.6
+    # Between two people.
+    tied = [names["together"].rows(names["together"].person == who) for who in (0, 1)]
+    ends = tied[0].joints[:, names["RIGHT"]], tied[1].joints[:, names["LEFT"]]
+    assert abs(np.median(np.linalg.norm(ends[0] - ends[1], axis=1)) - 1.5) < 0.02
+    assert names["together"].run["extra_factors"] == {"carry_a_board": {"made": 6, "inactive": 0}}
     # Over time: standing feet hardly move, and those that step are where they were.
     before = np.quantile(steps(names["loose"], names["FEET"]), [0.2, 0.9])
     for each in ("standing", "people"):

@@ -49,7 +49,7 @@ def test_ordinary_frames_are_left_as_they_are(five_cameras, two_people, seen_exa
     assert thinned_points(points, config) is points
     candidates = vote(points, detections, 5, config)
     assert thinned_candidates(candidates, detections, config) is candidates
-    frames = ThinnedFrames(Recording(BODY_25, [detections]), 5, config)
+    frames = ThinnedFrames(Recording(BODY_25, [detections]), five_cameras, config)
     assert len(frames[0]) == len(detections) and not frames.is_thinned(0)
 
 
@@ -62,7 +62,7 @@ def test_the_most_confident_detections_stay(rig):
         group = (detections.view == view) & (detections.joint == joint)
         assert (group & keep).sum() == 10
         assert detections.confidence[group & keep].min() > detections.confidence[group & ~keep].max()
-    frames = ThinnedFrames(Recording(BODY_25, [detections]), len(rig), config)
+    frames = ThinnedFrames(Recording(BODY_25, [detections]), rig, config)
     assert frames.is_thinned(0)
     for view in range(len(rig)):  # what is left knows its place in the recording
         own = frames[0].view == view

@@ -15,6 +15,7 @@ from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
 from shapepose_fg.setup_check.hypotheses import Lag
 from shapepose_fg.setup_check.matching import Sightings, least_of_each
+from shapepose_fg.setup_check.report import check_setup
 from tests.marks import slow
 from tests.setup_check.spoiled_setups import (
     biased,
@@ -267,3 +268,23 @@ def test_groups_of_frames_below_zero_are_those_of_any_others():
     frame, worth = np.array([-3, 2, -3, 2, 7]), np.array([2.0, 1.0, 1.0, 3.0, 0.0])
     np.testing.assert_array_equal(least_of_each(frame, worth), [2, 1, 4])
     np.testing.assert_array_equal(least_of_each(frame + 3, worth), [2, 1, 4])
+
+
+@pytest.mark.parametrize("part", [0.4, 0.5, 0.6])
+def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part):
+    """Joints of 0.7 to 1 m tall people fit children, and adults in a rig that is too small: both are said."""
+    report = check_setup(look_at(room, people * part), room)
+    assert report.findings == () and report.stature_m == pytest.approx(1.7 * part, rel=0.12)
+    assert len(report.notes) == 1
+    assert (
+        "tall, as children are; if they are adults" in report.notes[0] and f"{part:.1f} times" in report.notes[0]
+    )
+
+
+def test_adults_are_not_taken_for_children(recording, room):
+    assert check_setup(recording, room).notes == ()
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.2, 2.0])
+def test_lengths_of_nobody_are_the_calibration_s(recording, room, factor):
+    assert only_finding(recording, scaled(room, factor)).kind == Kind.UNIT

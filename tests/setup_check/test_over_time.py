@@ -117,3 +117,39 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     crowd = Recording(recording.skeleton, crowd)
     (said,) = result_check(report, people, crowd, room, range(60)).warnings  # detections beside those of people
     assert "people explain 8" in said and "surer ones" in said
+
+
+def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, room):
+    """Turned by 25 degrees, it is left out by the check; without that nobody is given what it saw."""
+    turned = turning(recording, room, 2, lambda t: 25.0)
+    report = check_setup(turned, room)
+    name = room.names[2]
+    people = reconstruct(Trusted(turned, report.trust), room, frames=range(20))
+    checked = result_check(report, people, Trusted(turned, report.trust), room, range(20))
+    assert any(
+        each.startswith(f"{name}: 0 of ") and "left out with the camera" in each for each in checked.warnings
+    )
+    alone = reconstruct(turned, room, frames=range(20))
+    checked = result_check(
+        replace(report, findings=(), warnings=(), trust=Trust()), alone, turned, room, range(20)
+    )
+    (said,) = [each for each in checked.warnings if each.startswith(f"{name}: ")]
+    assert "belong to nobody who was found" in said and "check-calibration" in said
+    use = checked.cameras[2]
+    assert use.used + sum(use.unused.values()) == use.offered
+    others = [each for view, each in enumerate(checked.cameras) if view != 2]
+    assert not any(each.camera in warning.split(":")[0] for each in others for warning in checked.warnings)
+
+
+def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording, room):
+    """Somebody is left out of the result: the sentence is among the warnings, which run.json and stderr have."""
+    people = reconstruct(recording, room, frames=range(20), times=FrameTimes.from_fps(10, len(recording)))
+    first = np.unique(people.person)[0]
+    fewer = people.rows(people.person != first)
+    report = check_setup(recording, room)
+    warned = result_check(report, fewer, recording, room, range(20)).warnings
+    words = [each for each in warned if "two cameras" in each]
+    seen, found = len(np.unique(people.person)), len(np.unique(fewer.person))
+    assert len(words) == 1 and f"and {found:.1f} are found" in words[0] and found == seen - 1
+    everybody = result_check(report, people, recording, room, range(20))
+    assert not any("two cameras" in each for each in everybody.warnings)

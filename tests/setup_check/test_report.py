@@ -7,13 +7,14 @@ import pytest
 
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.frame_times import spans_of
+from shapepose_fg.core.frame_times import FrameTimes, spans_of
 from shapepose_fg.core.observation_table import Gate, ObservationTable
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.findings import Finding, Kind, sentence
-from shapepose_fg.setup_check.report import Distances, camera_use, check_setup
+from shapepose_fg.setup_check.report import Distances, camera_use, check_setup, result_check
 from tests.setup_check.spoiled_setups import turned, zoomed
 
 
@@ -150,3 +151,29 @@ def result_of(joints: np.ndarray, table: ObservationTable) -> Reconstruction:
 def test_frames_as_spans():
     assert spans_of([5, 3, 4, 9, 9]) == [range(3, 6), range(9, 10)]
     assert spans_of([]) == []
+
+
+@pytest.mark.parametrize("temporal", [True, False])
+def test_speeds_need_identities(recording, room, temporal):
+    """Frame by frame numbers of people are no identities: whoever is number 0 next may stand anywhere."""
+    N = 80
+    joints = np.zeros((N, 25, 3))
+    joints[::2, :, 0] = 1.3  # 1.3 m and back in a thirtieth of a second
+    people = Reconstruction(
+        frame=np.arange(N),
+        person=np.zeros(N, dtype=int),
+        joint_names=np.array(BODY_25.joints),
+        joints=joints,
+        covariance=np.tile(4e-4 * np.eye(3), (N, 25, 1, 1)),
+        confidence=np.ones((N, 25)),
+        known=np.full((N, 25), Known.SEEN),
+        betas=np.zeros((N, 10)),
+        global_orient=np.zeros((N, 3)),
+        body_pose=np.zeros((N, 23, 3)),
+        transl=np.zeros((N, 3)),
+        status=np.full(N, str(Status.OK)),
+        time_s=np.arange(N) / 30,
+        run={"configuration": {"temporal": temporal}, "time": FrameTimes.from_fps(30, N).as_dict()},
+    )
+    warnings = result_check(check_setup(recording, room), people, recording, room, range(len(recording))).warnings
+    assert any("people move at 39 m/s" in each for each in warnings) == temporal

@@ -57,11 +57,17 @@ def tiny_arrays() -> dict[str, NDArray]:
 
 
 @pytest.fixture(scope="session")
-def tiny_mocap(tiny_arrays: dict[str, NDArray], tmp_path_factory: pytest.TempPathFactory) -> Mocap:
-    """The tiny file, read."""
+def tiny_mocap_file(tiny_arrays: dict[str, NDArray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny file."""
     path = tmp_path_factory.mktemp("mocap") / "tiny.npz"
     np.savez(path, **tiny_arrays)
-    return Mocap.load(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny_mocap(tiny_mocap_file: Path) -> Mocap:
+    """The tiny file, read."""
+    return Mocap.load(tiny_mocap_file)
 
 
 def standing(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

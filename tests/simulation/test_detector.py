@@ -294,6 +294,7 @@ def test_near_candidates_of_one_joint_merge_into_one_that_belongs_to_both():
     assert len(found.affinity[(found.pairs[:, 1] == wrist) & (found.affinity > 0.5)]) == 2  # both elbows
 
 
+@pytest.mark.slow
 def test_false_candidates_are_as_many_as_measured_and_belong_to_nobody():
     rig, joints = crowd(1)
     config = replace(DetectorConfig.perfect(), false_candidates=3.0)

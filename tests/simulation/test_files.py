@@ -23,6 +23,7 @@ def run(*arguments: str) -> int:
     return int(caught.value.code or 0)
 
 
+@pytest.mark.slow
 def test_what_is_simulated_can_be_reconstructed_and_compared(tmp_path: Path, capsys):
     assert run("simulate", "demo", "--output", str(tmp_path), "--frames", "40:43", "--seed", "5") == 0
     printed = capsys.readouterr()

@@ -56,6 +56,7 @@ def test_scenes_with_nobody_and_without_frames_need_no_special_care():
     assert len(simulate(built_in_scene(0, people=2, cameras=2, frames=0), workers=2)) == 0
 
 
+@pytest.mark.slow
 def test_frames_are_taken_as_they_are_needed_and_closing_ends_the_processes(
     worker: VisibilityWorker, people: list[FramePeople]
 ):
@@ -74,6 +75,7 @@ def test_frames_are_taken_as_they_are_needed_and_closing_ends_the_processes(
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_an_error_in_a_worker_is_raised_here(worker: VisibilityWorker, people: list[FramePeople]):
     joints, surfaces = people[0]
     with pytest.raises(ValueError), closing(worker.all([(joints[:, :, :2], surfaces)], 2)) as seen:
@@ -84,7 +86,7 @@ def test_an_error_in_a_worker_is_raised_here(worker: VisibilityWorker, people: l
 def test_a_worker_that_dies_is_no_endless_wait(worker: VisibilityWorker, people: list[FramePeople]):
     with closing(worker.all(people * 9, 2)) as seen:
         next(seen)
-        multiprocessing.active_children()[0].kill()
+        os.kill(multiprocessing.active_children()[0].pid or 0, signal.SIGKILL)
         with pytest.raises(RuntimeError, match="worker process was killed"):
             list(seen)
 

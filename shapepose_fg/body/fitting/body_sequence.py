@@ -99,7 +99,7 @@ class SequenceFitter:
                 mine, theirs = np.flatnonzero(group == number), ok[group[ok] == number]
                 origin[mine] = middle = evidence.centre[theirs].mean(axis=0)
                 free[theirs, -3:] += evidence.centre[theirs] - middle
-                order = theirs[np.argsort(time_s[theirs])]
+                order = theirs[np.argsort(time_s[theirs], kind="stable")]
                 nearest = order[_nearest(time_s[order], time_s[mine])]
                 place = [np.interp(time_s[mine], time_s[order], free[order, axis]) for axis in (-3, -2, -1)]
                 free[mine] = free[nearest]

@@ -87,7 +87,9 @@ class Sight:
         rest = tuple(sorted(set(range(len(BODY_POINTS))) - set(slots)))
         if len(rest) != (0 if others is None else len(others.root)):
             raise ValueError(f"others must be the {len(rest)} points of the body that are not among the targets")
-        every = (points if others is None else points.joined(others)).part(np.argsort(slots + rest).tolist())
+        every = (points if others is None else points.joined(others)).part(
+            np.argsort(slots + rest, kind="stable").tolist()
+        )
         own = Own(np.full(len(BODY_POINTS), -1), np.zeros((50, 3)), np.zeros(50, dtype=np.intp))
         own.target[list(slots)] = np.arange(len(slots))
         if offsets is not None:  # the network knows the body's own points

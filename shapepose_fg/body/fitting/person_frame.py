@@ -7,6 +7,7 @@ import numpy as np
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Real
+from shapepose_fg.core.decompositions import nearest_rotation
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,5 @@ class PersonFrame:
         target_centre = (weight[:, None] @ xyz)[:, 0]
         rest = rest_xyz - rest_centre[:, None]
         moment = (weight[..., None] * (xyz - target_centre[:, None])).swapaxes(-1, -2) @ rest
-        U, _, Vt = np.linalg.svd(moment)
-        U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]  # a rotation, not a mirror image
-        rotation = U @ Vt
+        rotation = nearest_rotation(moment)
         return rotation, target_centre - (rotation @ rest_centre[..., None])[..., 0]

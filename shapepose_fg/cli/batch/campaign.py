@@ -8,11 +8,14 @@ import os
 import shutil
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from concurrent.futures import wait as wait_for
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -34,7 +37,7 @@ from shapepose_fg.io.detections.reading import find_places
 from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.runs.manifest import PARTS
-from shapepose_fg.pipeline.workers import end_with, processes, what_workers_inherit
+from shapepose_fg.pipeline.workers import Processes
 
 ATTEMPTS = 2
 """A recording that has failed so often is left, and the others go on."""
@@ -153,35 +156,27 @@ class Leader:
 
     def __init__(self, assignment: Assignment) -> None:
         """Start it."""
-        context = processes("shapepose_fg.cli.reconstruct.run")
         self.assignment = assignment
         self.began = time.monotonic()
         """When it was started, by the clock of `time.monotonic`."""
-        self.told, tell = context.Pipe(duplex=False)
+        self.told, tell = Pipe(duplex=False)
         """What it tells: (frames done, all frames), in the end `Ended`, or why it failed."""
-        held, self._lifeline = context.Pipe(duplex=False)
-        self._process = context.Process(target=_lead, args=(assignment, tell, held), name=assignment.name)
-        with what_workers_inherit():
-            self._process.start()
+        self._process = Processes(1, _tell_by, tell)
         tell.close()
-        held.close()
+        self._pid = self._process.submit(os.getpid)
+        self._end = self._process.submit(_lead, assignment)
 
     def next(self) -> tuple[int, int] | Ended | str:
         """What it tells next; where it has died, that."""
         try:
             return self.told.recv()
         except (EOFError, OSError):
-            self._process.join(_PATIENCE_S)
-            code = self._process.exitcode
-            how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
-            return f"its process {how}; there may be too little memory"
+            return "its process was ended from outside; there may be too little memory"
 
     def end(self) -> Ended | None:
         """Wait for its end, or bring it about where it does not come; what it `Ended` with after all."""
-        self._process.join(_PATIENCE_S)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        wait_for([self._end], _PATIENCE_S)
+        self._process.shutdown()
         found = None
         try:
             while self.told.poll():
@@ -190,19 +185,26 @@ class Leader:
         except (EOFError, OSError):
             pass
         self.told.close()
-        self._lifeline.close()
         return found
 
     def ask_to_stop(self) -> None:
         """Have it keep what is done and end; `end` waits for it."""
-        if self._process.is_alive():
-            self._process.terminate()
+        with suppress(BrokenProcessPool, ProcessLookupError):
+            if not self._end.done():
+                os.kill(self._pid.result(), signal.SIGTERM)
 
 
-def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> None:
+_tell: Connection
+"""In a leader: the way to the one that started it."""
+
+
+def _tell_by(tell: Connection) -> None:
+    global _tell
+    _tell = tell
+
+
+def _lead(assignment: Assignment) -> None:
     """All that the process does; what is said, by libraries too, is added to a log."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with, args=(lifeline,), daemon=True).start()
     use_any_streams()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
@@ -212,21 +214,23 @@ def _lead(assignment: Assignment, tell: Connection, lifeline: Connection) -> Non
     for stream in (sys.stdout, sys.stderr):
         reconfigure: Any = getattr(stream, "reconfigure", lambda **_: None)
         reconfigure(encoding="utf-8", line_buffering=True)
-    execution = Execution(None, assignment.cluster, assignment.sharing, progress=lambda *told: tell.send(told))
+    execution = Execution(None, assignment.cluster, assignment.sharing, progress=lambda *told: _tell.send(told))
     try:
         with stoppable():
             known = prepare(assignment.request, assignment.folder)
             again = {"resume": assignment.resume, "restart": assignment.restart, "overwrite": True}
-            tell.send(carry_out(known, execution, **again))
+            _tell.send(carry_out(known, execution, **again))
     except Stopped as stop:
         print(f"stopped: {stop.message}", flush=True)
     except InputError as error:
         print(f"error: {error}", flush=True)
-        tell.send(" ".join(str(error).split()))
+        _tell.send(" ".join(str(error).split()))
     except Exception as error:
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
-        tell.send(f"{type(error).__name__}: {words} (all of it in {log})")
+        _tell.send(f"{type(error).__name__}: {words} (all of it in {log})")
+    finally:
+        _tell.close()
 
 
 def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:

@@ -8,7 +8,6 @@ from rich.text import Text
 
 from shapepose_fg.cli.reconstruct.request import Prepared
 from shapepose_fg.cli.terminal import note, show, warn
-from shapepose_fg.core.arrays import Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -16,18 +15,12 @@ from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
-from shapepose_fg.setup_check.report import ResultCheck, SetupReport
+from shapepose_fg.setup_check.report import ResultCheck, SetupReport, unseen
 from shapepose_fg.setup_check.report import check_setup as check_detections
 from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Whoever is less probable is named."""
-_LOST, _LOST_SHARE = 0.5, 0.1
-"""So many people a frame, and such a share of them, are missing before it is said."""
-_LOOKED_AT = 200
-"""Frames, spread over the recording, in which detections are counted for that."""
-_SHORT_S = 1.0
-"""In a recording shorter than this people whom two cameras see may lack evidence."""
 _KNOWN_WORDS = {
     "seen": "seen by two views",
     "weak": "seen by one or weakly",
@@ -52,10 +45,13 @@ def check_setup(known: Prepared, task: Task) -> SetupReport:
     return check_detections(task.detections, task.rig, frames, sizes)
 
 
-def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds: float) -> Table:
+def summary_table(
+    result: Assembly, people: Reconstruction, task: Task, seconds: float, *, unchecked: bool
+) -> Table:
     """What was reconstructed, how well it went, and how long it took.
 
-    `people` are rows of the `result` of `task` that say how sure the joints are.
+    `people` are rows of the `result` of `task` that say how sure the joints are. Of an `unchecked` one it also
+    says whether cameras see more people.
     """
     run, counts, span, cameras = result.run, result.counts(), task.whole()[0], len(task.rig)
     per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
@@ -84,7 +80,9 @@ def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds:
         f"{count} rows dropped: {reason}{_frames_words(run.get('dropped_frames', {}).get(reason, []))}"
         for reason, count in run.get("people", {}).get("dropped", {}).items()
     ]
-    lost += unseen(task, per_frame)
+    if unchecked:  # else the check says it
+        lasts = float(np.ptp(task.whole()[1].frame_s[span.start : span.stop])) * len(span) / max(len(span) - 1, 1)
+        lost += unseen(task.detections, cameras, span, per_frame, lasts if task.config.temporal else None)
     if len(lost) > 0:
         table.add_row("lost", "; ".join(lost), style="yellow")
     for what, spans in run.get("thinned_frames", {}).items():
@@ -100,30 +98,6 @@ def summary_table(result: Assembly, people: Reconstruction, task: Task, seconds:
     words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
     table.add_row("", "  ".join(words), style="dim")
     return table
-
-
-def unseen(task: Task, per_frame: Whole) -> list[str]:
-    """A sentence where two cameras see more people than there are rows in a frame, `per_frame` (T,), and why.
-
-    A camera sees as many as it has detections of a core joint (median).
-    """
-    span, times, _ = task.whole()
-    core = list(task.detections.skeleton.core)
-    looked_at = np.unique(np.linspace(0, len(span) - 1, min(len(span), _LOOKED_AT)).astype(int))
-    seen = np.zeros((len(looked_at), len(task.rig)))
-    for row, frame in enumerate(looked_at.tolist()):
-        found = task.detections[span[frame]]
-        for view in range(len(task.rig)):
-            joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
-            seen[row, view] = np.median(joints[core])
-    by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
-    if by_two - here < max(_LOST, _LOST_SHARE * by_two):
-        return []
-    lasts = float(np.ptp(times.frame_s[span.start : span.stop])) * len(span) / max(len(span) - 1, 1)
-    why = "the others too little, or not as one"
-    if task.config.temporal and lasts < _SHORT_S:
-        why = f"{lasts:.2g} s are too little to be sure of everybody; give more frames, or --no-temporal"
-    return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why}"]
 
 
 def _doubtful(run: dict[str, Any]) -> str:

@@ -44,7 +44,6 @@ from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
-from shapepose_fg.pipeline.workers import get_ready
 from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
@@ -91,8 +90,6 @@ def carry_out(
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
-        if execution.workers != 1 and execution.cluster is None:
-            get_ready("shapepose_fg.pipeline.pipeline")
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
@@ -206,7 +203,7 @@ class _Run:
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
-            "cameras": _digest(asdict(task.rig)),
+            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "versions": versions(),
             "program": program_digest(),
         }
@@ -265,7 +262,8 @@ class _Run:
         rig = kept_rig(kept, rig) or rig
         people = result.reconstruction(every=every)
         report = self.report
-        checked = None if report is None else result_check(report, people, task.detections, rig, frames)
+        looked_at = [frame for frame in frames if frame % every == 0]
+        checked = None if report is None else result_check(report, people, task.detections, rig, looked_at)
         result = result if checked is None else result.with_run(**checked.as_run())
         people = people.with_run(**result.run)
         note(*set_aside(output))
@@ -285,7 +283,7 @@ class _Run:
             write_moments(output / MOMENTS, rig, self.recording.picture)
         else:
             (output / MOMENTS).unlink(missing_ok=True)
-        summary = summary_table(result, people, self.task, seconds)
+        summary = summary_table(result, people, self.task, seconds, unchecked=checked is None)
         for n, written in enumerate(self._written(result, people, rig, every)):
             summary.add_row("" if n > 0 else "written", written)
         if file is not None and known is not None and result.shapes is not None:

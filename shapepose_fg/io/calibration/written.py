@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.lens import Lens, padded_distortion
 from shapepose_fg.core.trajectory import Trajectory
@@ -206,8 +207,7 @@ def pose(
         cure = "use a right-handed world and OpenCV's camera axes: x right, y down, z forward"
         raise InputError(f"{place}: the rotation of {key} mirrors (determinant -1); {cure}")
     if off >= _EXACT:
-        U, _, Vt = np.linalg.svd(R)
-        R = U @ Vt
+        R = nearest_rotation(R)
     wTc = np.eye(4)
     wTc[:3, :3] = R if world_from_camera else R.T
     wTc[:3, 3] = t if world_from_camera or centre else -R.T @ t

@@ -25,22 +25,25 @@ _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 def write_glb(job: Job) -> Written:
     """`people.glb`."""
-    take, written = job.take, Written()
-    motions = dict(everybody(job, take, "glb", y_up(take.up), written))
+    written, turn = Written(), y_up(job.take.up)
+    take, origin = written.near_origin(job.take, turn, "glb", "extras.origin_m of its scene")
+    motions = dict(everybody(job, take, "glb", turn, written))
     if len(motions) == 0:
         return written
     if job.arrays.pose_blend is not None:
         written.notes.append("glb: the body's pose-dependent corrections of the skin are left out")
-    written.add(job.folder / "people.glb", glb_bytes(motions, job.arrays, take.times_s))
+    written.add(job.folder / "people.glb", glb_bytes(motions, job.arrays, take.times_s, origin))
     return written
 
 
-def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: Array) -> bytes:
+def glb_bytes(
+    motions: dict[int, Motion], arrays: SmplArrays, times_s: Array, origin_m: Array | None = None
+) -> bytes:
     """A GLB file of people by their numbers, in frames taken at `times_s` (T,); the file's time 0 is the first.
 
     A person is a node with a tree of 24 joints and a skinned mesh below it. Where a person is not there, its node
     is scaled to zero, glTF's way to hide things. Rotations are interpolated along the sphere, the pelvis on a
-    line.
+    line. `origin_m` (3,) is where the file's origin is in the world, in the file's axes.
     """
     file = _File()
     shared: dict[str, int] = {}
@@ -52,7 +55,8 @@ def glb_bytes(motions: dict[int, Motion], arrays: SmplArrays, times_s: Array) ->
     for who, motion in motions.items():
         roots.append(_add_person(file, who, motion, shared, triangles))
         _animate(file, roots[-1], motion, times_s - times_s[0])
-    return file.content(roots)
+    extras = {} if origin_m is None or not origin_m.any() else {"extras": {"origin_m": origin_m.tolist()}}
+    return file.content(roots, extras)
 
 
 class _File:
@@ -85,13 +89,13 @@ class _File:
             **(limits if bounds else {}),
         )
 
-    def content(self, roots: list[int]) -> bytes:
-        """The whole file, whose scene are the nodes `roots`."""
+    def content(self, roots: list[int], more: dict[str, Any]) -> bytes:
+        """The whole file, whose scene are the nodes `roots`, with what is said of it."""
         binary = bytes(self._binary) + bytes(-len(self._binary) % 4)
         tree = {
             "asset": {"version": "2.0", "generator": "shapepose-fg"},
             "scene": 0,
-            "scenes": [{"name": "people", "nodes": roots}],
+            "scenes": [{"name": "people", "nodes": roots, **more}],
             "animations": [{"name": "motion", "samplers": self.samplers, "channels": self.channels}],
             "buffers": [{"byteLength": len(binary)}],
             **self.lists,

@@ -87,15 +87,22 @@ def write_trc(job: Job) -> Written:
 def write_c3d(job: Job) -> Written:
     """A file per person, or several of 65,535 frames, from the first to the last with a marker, at one rate."""
     optional("ezc3d", "export")
+    written = Written()
+    even, origin = _c3d_take(written, job.take)
 
     def write(who: int, markers: Markers, take: Take, written: Written) -> None:
         def name(span: tuple[int, int] | None) -> str:
             return f"person_{who}" + ("" if span is None else f"_frames_{span[0]}-{span[1]}")
 
-        _write_c3d(markers, take, job.folder, name, written)
+        _write_c3d(markers, take, job.folder, name, written, origin)
 
-    written = Written()
-    return _each(job, written.at_one_rate(job.take), "c3d", written, write)
+    return _each(job, even, "c3d", written, write)
+
+
+def _c3d_take(written: Written, take: Take) -> tuple[Take, Array]:
+    """The take as C3D can hold it, at one rate and near its origin (3,), metres in the axes of the file."""
+    even = written.at_one_rate(take)
+    return written.near_origin(even, opensim_axes(take.up), "c3d", "its parameter POINT:ORIGIN_M")
 
 
 def _each(
@@ -135,7 +142,12 @@ def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: 
 
 
 def _write_c3d(
-    markers: Markers, take: Take, folder: Path, name: Callable[[tuple[int, int] | None], str], written: Written
+    markers: Markers,
+    take: Take,
+    folder: Path,
+    name: Callable[[tuple[int, int] | None], str],
+    written: Written,
+    origin_m: Array,
 ) -> None:
     """One person's file from the first to the last frame with a marker; several of 65,535 frames.
 
@@ -151,16 +163,19 @@ def _write_c3d(
         if not fits:
             counts = f"{path.name} counts its frames from 1, not {span[0] + 1}"
             written.notes.append(f"{counts}: numbers in C3D end at {_MOST}")
-        written.add(path, c3d_bytes(markers, span[0] if fits else 0, take.fps, part))
+        written.add(path, c3d_bytes(markers, span[0] if fits else 0, take.fps, part, origin_m))
 
 
-def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slice(None)) -> bytes:
+def c3d_bytes(
+    markers: Markers, first_frame: int, fps: float, part: slice = slice(None), origin_m: Array | None = None
+) -> bytes:
     """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where frames count from 1.
     `part` has at most 65,535 frames, and the last is number 65,535 at most.
 
     A point's residual is the standard deviation of its place in whole millimetres, which the format keeps in a
     byte: 1 to 255, where 255 is more, too. It is 0 where it is not known (C3D's word for a point that was
-    computed), and -1 where the point is missing.
+    computed), and -1 where the point is missing. `origin_m` (3,) is where the points' origin is in the world,
+    metres, in the axes of the file.
     """
     ezc3d = optional("ezc3d", "export")
     xyz, sigma, there = markers.xyz[part], markers.sigma_m[part], markers.there[part]
@@ -173,6 +188,8 @@ def c3d_bytes(markers: Markers, first_frame: int, fps: float, part: slice = slic
     # The axes as Pose2Sim's files have them: up on the screen is y.
     file.add_parameter("POINT", "X_SCREEN", "+Z")
     file.add_parameter("POINT", "Y_SCREEN", "+Y")
+    if origin_m is not None and origin_m.any():
+        file.add_parameter("POINT", "ORIGIN_M", origin_m.tolist())
     points = np.ones((4, xyz.shape[1], len(xyz)))
     points[:3] = 1e3 * np.where(there[..., None], xyz, 0).transpose(2, 1, 0)
     residuals = np.nan_to_num(np.clip(np.rint(1e3 * sigma), 1, 255), nan=0.0)
@@ -200,10 +217,10 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
         return written
     first = project.first_number
     take = replace(take, frames=take.frames + first, times_s=take.times_s + first / take.fps)
-    even = None
+    even, origin = None, np.zeros(3)
     try:
         optional("ezc3d", "export")
-        even = written.at_one_rate(take)
+        even, origin = _c3d_take(written, take)
     except InputError as error:
         written.notes.append(f"no C3D: {error}")
     before = {each.name for each in folder.glob("*.trc")} if folder.is_dir() else set()
@@ -227,7 +244,7 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
         if holes > 0:
             written.notes.append(f"{path.name} leaves out {holes} frames in which nothing is known of the person")
         if even is not None:
-            _write_c3d(markers_of(even, person, MarkerSet.OPENSIM), even, folder, name, written)
+            _write_c3d(markers_of(even, person, MarkerSet.OPENSIM), even, folder, name, written, origin)
     left = sorted(before - {each.name for each in written.files})
     if len(left) > 0:
         written.notes.append(

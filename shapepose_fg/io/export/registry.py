@@ -11,7 +11,7 @@ from typing import Any, get_args
 import numpy as np
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
-from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
@@ -74,6 +74,20 @@ class Written:
         """Write a file, whole or not at all."""
         write_content(path, content)
         self.files.append(path)
+
+    def near_origin(self, take: Take, turn: Array, kind: str, where: str) -> tuple[Take, Array]:
+        """The take for formats of seven digits, and (3,) its origin in the axes that `turn` (3, 3) makes of the
+        world's, metres; one that is not the world's is noted, with the place in the file that says it, `where`.
+        """
+        local, origin = take.near_origin()
+        origin = turn @ origin
+        if origin.any():
+            listed = " ".join(f"{each:.0f}" for each in origin)
+            self.notes.append(
+                f"{kind}: coordinates are from {listed} m of the world, in the axes of the file ({where}), because"
+                " the format keeps seven digits"
+            )
+        return local, origin
 
     def at_one_rate(self, take: Take) -> Take:
         """The take for formats that know one rate only; frames that have no place at it are noted."""

@@ -100,12 +100,16 @@ def written(path: Path, first: Any) -> Iterator[Any]:
 
 def write_rrd(job: Job) -> Written:
     """`people.rrd`; without bodies where the body model is not there any more."""
-    take, path = job.take, job.folder / "people.rrd"
+    found, path = Written(), job.folder / "people.rrd"
+    take, origin = found.near_origin(job.take, np.eye(3), "rrd", "origin_m of the entity world/origin")
     arrays, notes = body_if_there(job)
     notes += ["no cameras, for there is no cameras.json"] if take.rig is None else []
     with written(path, layout_of(take)) as stream:
         log_take(stream, take, arrays)
-    return Written([path], [f"rrd: {note}" for note in notes])
+        if origin.any():
+            rr = optional("rerun", "view")
+            stream.log("world/origin", rr.AnyValues(origin_m=origin), static=True)
+    return Written([path], [*found.notes, *(f"rrd: {note}" for note in notes)])
 
 
 def layout_of(take: Take) -> Any:

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Camera, Rig
+from shapepose_fg.core.decompositions import principal_axes
 from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_normals
 from shapepose_fg.core.errors import optional
 from shapepose_fg.core.observation_table import Gate
@@ -184,8 +185,7 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
 def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array) -> Any:
     """The 95 % regions of joints."""
     fine = np.isfinite(covariance).all(axis=(1, 2))
-    variance, axes = np.linalg.eigh(covariance[fine])
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a mirror
+    variance, axes = principal_axes(covariance[fine])
     return rr.Ellipsoids3D(
         centers=centres[fine],
         half_sizes=_REGION * np.sqrt(np.maximum(variance, 0)),

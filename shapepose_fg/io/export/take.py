@@ -34,6 +34,8 @@ _BODY_BYTES = 2_000
 """What one person's body takes in a frame while it is written, about."""
 _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
 """Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
+_FAR_M = 1000.0
+"""Largest coordinate that a float of 32 bits keeps to a tenth of a millimetre, metres."""
 _SHORTEST_S, _LONGEST_S = 1e-6, 1e5
 """From frame to frame: outside of this times are in another unit."""
 
@@ -112,6 +114,21 @@ class Take:
         column[rows >= 0] = values[rows[rows >= 0]]
         return column
 
+    def near_origin(self) -> tuple["Take", Array]:
+        """The same people and cameras from a local origin, and (3,) where that is, whole metres of the world.
+
+        For formats of seven digits: 400 km from the world's origin these are centimetres. It is the
+        world's own origin where nobody is farther than a kilometre from that.
+        """
+        every = self.people.joints.reshape(-1, 3)
+        every = np.concatenate([every[np.isfinite(every).all(axis=1)], self.people.transl])
+        every = every[np.isfinite(every).all(axis=1)]
+        if len(every) == 0 or np.abs(every).max() <= _FAR_M:
+            return self, np.zeros(3)
+        origin = np.rint(np.median(every, axis=0))
+        people = replace(self.people, joints=self.people.joints - origin, transl=self.people.transl - origin)
+        return replace(self, people=people, rig=None if self.rig is None else _moved(self.rig, origin)), origin
+
     def at_one_rate(self) -> tuple["Take", int]:
         """The same people at exactly `fps` frames a second, for formats that know no other; and what was lost.
 
@@ -135,6 +152,19 @@ class Take:
         numbers, start = np.arange(count), self.times_s[0]
         even = replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=start + numbers / self.fps)
         return even, len(place) - len(kept)
+
+
+def _moved(rig: Rig, origin: Array) -> Rig:
+    """The cameras and their trajectories in a world whose origin is `origin` (3,) of theirs."""
+
+    def local(pose: Array) -> Array:
+        shifted = pose.copy()
+        shifted[..., :3, 3] -= origin
+        return shifted
+
+    cameras = tuple(replace(camera, wTc=local(camera.wTc)) for camera in rig.cameras)
+    trajectories = tuple(replace(each, wTb=local(each.wTb)) for each in rig.trajectories)
+    return replace(rig, cameras=cameras, trajectories=trajectories)
 
 
 def _check_memory(persons: int, frames: int) -> None:

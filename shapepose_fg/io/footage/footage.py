@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_bytes
 from shapepose_fg.io.camera_names import in_order
 from shapepose_fg.io.footage.places import PICTURES
 
@@ -27,6 +28,8 @@ _SAFE_READING = (
     "|format_whitelist;mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,mpeg,mpegts,mpegvideo,asf,h264,hevc,m4v"
 )
 """A video is read by these rules: its file alone, and no playlist, which could name other files and addresses."""
+_MOST_BYTES = 2**29
+"""Bytes of a picture's file."""
 _LARGEST = 16384
 """No camera has pictures with a longer side, pixels: a file that says so is damaged, or meant to do harm."""
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
@@ -152,8 +155,10 @@ class PictureFiles:
 
     def at(self, place: int) -> Picture | None:
         """The picture of frame `place`; None where the file cannot be read, or is of another size."""
-        picture = cv2.imread(str(self.files[place]), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        return _fitting(picture, self.size)
+        try:
+            return _fitting(_decoded(self.files[place]), self.size)
+        except InputError:
+            return None
 
 
 Footage = Video | PictureFiles
@@ -207,7 +212,16 @@ def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
 
 def _size(file: Path) -> tuple[int, int]:
     """(width, height) of a picture."""
-    picture = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    picture = _decoded(file)
     if picture is None:
         raise InputError(f"{file}: not a picture that can be read; give an undamaged one")
     return picture.shape[1], picture.shape[0]
+
+
+def _decoded(file: Path) -> Any:
+    """The picture in a file; None where it cannot be read. InputError for a pipe, or a file that is too large."""
+    content = np.frombuffer(read_bytes(file, _MOST_BYTES), dtype=np.uint8)
+    try:
+        return cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None

@@ -1,7 +1,10 @@
 """The fields of the ROS 2 messages that are written and read: those of ROS, and three of our own.
 
-ROS's are as in the distributions from Humble on; constants and comments do not change what is written.
+ROS's are as in the distributions from Humble on; constants and comments do not change what is written. Of
+nav_msgs/Odometry and the two with it only what is read is here.
 """
+
+import re
 
 _FIELDS = {
     "builtin_interfaces/Time": "int32 sec; uint32 nanosec",
@@ -16,6 +19,10 @@ _FIELDS = {
     "geometry_msgs/TransformStamped": (
         "std_msgs/Header header; string child_frame_id; geometry_msgs/Transform transform"
     ),
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose; float64[36] covariance",
+    "geometry_msgs/PoseStamped": "std_msgs/Header header; geometry_msgs/Pose pose",
+    "geometry_msgs/PoseWithCovarianceStamped": ("std_msgs/Header header; geometry_msgs/PoseWithCovariance pose"),
+    "nav_msgs/Odometry": ("std_msgs/Header header; string child_frame_id; geometry_msgs/PoseWithCovariance pose"),
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "sensor_msgs/RegionOfInterest": (
         "uint32 x_offset; uint32 y_offset; uint32 height; uint32 width; bool do_rectify"
@@ -65,3 +72,67 @@ def type_name(name: str) -> str:
     """package/msg/Message, as ROS 2 calls it."""
     package, message = name.split("/")
     return f"{package}/msg/{message}"
+
+
+def check_definition(name: str, text: str) -> None:
+    """Whether a message that is laid out as `text` says has all fields of `name` (package/Message) that are read.
+
+    Messages may have others besides. ValueError that names the message and the field. Arrays whose items take no
+    bytes, or of very many items, are refused, too: a short message could hold any number of them.
+    """
+    parts = re.split(r"^=+\s*MSG: *(\S+) *$", "\n".join(text.splitlines()), flags=re.MULTILINE)
+    theirs = {
+        _plain(each): _fields(each, part) for each, part in zip([name, *parts[1::2]], parts[::2], strict=True)
+    }
+    for each, fields in theirs.items():
+        size = max((int(n) for kind in fields.values() for n in re.findall(r"\[(?:<=)?(\d+)\]", kind)), default=0)
+        if len(fields) == 0 or size > _MOST_ITEMS:
+            raise ValueError(f"{each} has {f'an array of {size}' if size else 'no field'}")
+    waiting = [(name, name)]
+    while len(waiting) > 0:
+        mine, other = waiting.pop()
+        if other not in _TIME and other not in theirs:
+            raise ValueError(f"{other} is not defined")
+        found = theirs.get(other, _TIME.get(other, {}))
+        for kind, field in (each.split() for each in _FIELDS[mine].split(";")):
+            inner, _, array = kind.partition("[")
+            has, _, has_array = found.get(field, "").partition("[")
+            alike = _FAMILY.get(inner, "message") == _FAMILY.get(has, "message") and has != ""
+            if not alike or array != has_array:
+                raise ValueError(f"{other} has no {field} of {kind}")
+            if inner in _FIELDS:
+                waiting.append((inner, has))
+
+
+def _fields(message: str, text: str) -> dict[str, str]:
+    """The types of a message's fields by their names, of a text with comments, constants and defaults."""
+    found = dict[str, str]()
+    for line in text.splitlines():
+        kind, _, rest = line.partition("#")[0].strip().partition(" ")
+        field = rest.split()[0] if rest.split() else ""
+        if field == "" or "=" in rest.partition('"')[0].partition("'")[0]:
+            continue
+        inner, bracket, array = kind.partition("[")
+        inner = re.sub(r"<=\d+$", "", inner)
+        if inner not in _FAMILY and "/" not in inner:
+            inner = f"{'std_msgs' if inner == 'Header' else _plain(message).partition('/')[0]}/{inner}"
+        found[field] = f"{_plain(inner)}{bracket}{array}"
+    return found
+
+
+def _plain(name: str) -> str:
+    """package/Message of package/msg/Message."""
+    return name.replace("/msg/", "/")
+
+
+_FAMILY = {each: "whole" for n in (8, 16, 32, 64) for each in (f"int{n}", f"uint{n}")}
+_FAMILY |= {"byte": "whole", "char": "whole", "bool": "bool", "string": "string", "wstring": "wstring"}
+_FAMILY |= {"float32": "real", "float64": "real"}
+"""What kind of value a type of ROS has; any other is a message."""
+_MOST_ITEMS = 2**16
+"""Items of an array of fixed size."""
+_TIME = {
+    each: {"sec": "int32", "nanosec": "uint32"}
+    for each in ("builtin_interfaces/Time", "builtin_interfaces/Duration")
+}
+"""Messages that need no definition in the file."""

@@ -3,6 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -19,7 +20,7 @@ from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.lines import view_of
-from shapepose_fg.io.ros.definitions import definition, type_name
+from shapepose_fg.io.ros.definitions import check_definition, definition, type_name
 from shapepose_fg.io.ros.messages import (
     NS,
     Message,
@@ -41,6 +42,9 @@ _LASTS_S = 0.2
 """Markers of who is seen no more stay so long."""
 _CHUNK = 2**26
 """Bytes that a chunk may unpack to; those of ROS 2 have one million."""
+_WINDOW, _MOST_RECORDS = 2**27, 2**19
+"""Bytes of zstd's window, as its own program takes without being asked; and records of a chunk, which are all in
+memory: 64 MiB of records of 128 bytes."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
 _POSES_KEPT_S = 3.0
@@ -161,13 +165,18 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
 
 def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
     """Topic, kind, time of the log, and content of messages; what is wrong with the file as an InputError."""
-    factory = optional("mcap_ros2.decoder", "ros").DecoderFactory()
+    factory, decoders = optional("mcap_ros2.decoder", "ros").DecoderFactory(), dict[int, Any]()
     try:
         for schema, channel, message in _messages(stream):
             if schema is not None and schema.name in wanted:
-                decode = factory.decoder_for(channel.message_encoding, schema)
+                if id(schema) not in decoders:
+                    check_definition(schema.name.replace("/msg/", "/"), schema.data.decode())
+                    # A schema is kept with its decoder: by another of its number neither is replaced.
+                    own = replace(schema, id=len(decoders) + 1)
+                    decoders[id(schema)] = schema, factory.decoder_for(channel.message_encoding, own)
+                decode = decoders[id(schema)][1]
                 if decode is None:
-                    raise ValueError(f"its encoding is {channel.message_encoding}")
+                    raise ValueError(f"its encoding is {channel.message_encoding}, {schema.encoding}")
                 yield channel.topic, schema.name, message.log_time / NS, decode(message.data)
     except Exception as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
         said = f"{type(error).__name__}: {str(error).strip()[:80]}"
@@ -176,21 +185,17 @@ def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iter
 
 def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
     """Schema, channel and record of each message: chunk by chunk, so that one is in memory at a time, and in each
-    by the time of the log. ValueError for a chunk that claims more than `_CHUNK` bytes, before it is unpacked.
+    by the time of the log. ValueError for a chunk of more than `_CHUNK` bytes, of which no more are unpacked.
     """
-    reading, lz4, zstd = (optional(name, "ros") for name in ("mcap.stream_reader", "lz4.frame", "zstandard"))
+    reading = optional("mcap.stream_reader", "ros")
     schemas, channels = {}, {}
-    # What a frame says of its size is taken before what the chunk says.
-    claims = {"zstd": zstd.frame_content_size, "lz4": lambda data: lz4.get_frame_info(data)["content_size"]}
     most = stream.seek(0, 2)
     stream.seek(0)
     for record in reading.StreamReader(stream, emit_chunks=True, record_size_limit=most).records:
         inside = [record]
         if isinstance(record, reading.Chunk):
-            claim = claims.get(record.compression, len)(record.data)
-            if max(claim, record.uncompressed_size) > _CHUNK:
-                raise ValueError(f"a chunk claims {max(claim, record.uncompressed_size)} bytes, over {_CHUNK}")
-            inside = sorted(reading.breakup_chunk(record), key=lambda each: getattr(each, "log_time", -1))
+            plain = replace(record, compression="", data=_unpacked(record))
+            inside = sorted(reading.breakup_chunk(plain), key=lambda each: getattr(each, "log_time", -1))
         for each in inside:
             if isinstance(each, reading.Schema):
                 schemas[each.id] = each
@@ -199,3 +204,31 @@ def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
             elif isinstance(each, reading.Message):
                 channel = channels[each.channel_id]
                 yield schemas.get(channel.schema_id), channel, each
+
+
+def _unpacked(chunk: Any) -> bytes:
+    """The records of a chunk. ValueError for more than `_CHUNK` bytes, which are not unpacked, or than
+    `_MOST_RECORDS`, and for records that end behind it.
+    """
+    lz4, zstd = optional("lz4.frame", "ros"), optional("zstandard", "ros")
+    claims = {"zstd": zstd.frame_content_size, "lz4": lambda packed: lz4.get_frame_info(packed)["content_size"]}
+    claim = max(claims.get(chunk.compression, len)(chunk.data), chunk.uncompressed_size)
+    if claim > _CHUNK:
+        raise ValueError(f"a chunk claims {claim} bytes, over {_CHUNK}")
+    # What is packed, and the chunk beside it, may say another size, or none.
+    if chunk.compression == "lz4":
+        data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=_CHUNK + 1)
+    elif chunk.compression == "zstd":
+        data = zstd.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(chunk.data).read(_CHUNK + 1)
+    else:
+        data = chunk.data
+    if len(data) > _CHUNK:
+        raise ValueError(f"a chunk has over {_CHUNK} bytes")
+    at = count = 0
+    while at < len(data):
+        at, count = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little"), count + 1
+        if at > len(data) or count > _MOST_RECORDS:
+            raise ValueError(
+                "a record ends behind its chunk" if at > len(data) else "a chunk has too many records"
+            )
+    return data

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.core.trajectory import MOST_VARIANCE, Trajectory
 from shapepose_fg.io.ros.definitions import type_name
 from shapepose_fg.io.ros.messages import NS, WORLD, ros_name
 
@@ -168,6 +168,8 @@ def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
         return None
     if not np.isfinite(parents).all() or np.linalg.eigvalsh(parents)[0] < -1e-9 * max(1.0, parents.max()):
         raise InputError(f"{place}: a covariance must be finite, without negative eigenvalues; write zeros")
+    # Some write the largest double for what is not known.
+    parents = np.minimum(parents, MOST_VARIANCE / 10)
     turn = np.kron(np.eye(2), _matrix(pose, place)[:3, :3])
     return np.asarray(turn.T @ (parents + parents.T) / 2 @ turn)
 

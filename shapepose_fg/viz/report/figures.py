@@ -95,11 +95,15 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     sigma = sigma[np.isfinite(sigma)]
     spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
     gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
+    told = [number(objects(each).get("offered")) for each in lists(people.run.get("cameras"))]
+    offered = sum(each or 0.0 for each in told) if len(told) > 0 and None not in told else None
+    count = sum(number(objects(each).get("used")) or 0.0 for each in lists(people.run.get("cameras")))
     return {
         "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),
         "seen": _share(known == Known.SEEN),
         "error": Residual.of(np.zeros(0) if table is None else np.linalg.norm(table.residual_px, axis=-1)),
-        "used": _share(gate == Gate.USED),
+        "used": _share(gate == Gate.USED) if offered is None else min(count / max(offered, 1), 1.0),
+        "used_of_given": None if offered is None else _share(gate == Gate.USED),
         "sigma_mm": 1e3 * float(np.median(sigma)) if len(sigma) > 0 else None,
         "solved": _share(people.status == "ok"),
         "rows": len(people),

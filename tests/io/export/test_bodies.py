@@ -247,6 +247,20 @@ def test_glb_drawn_by_the_specification_is_the_body(glb, true_bodies, person, fr
     np.testing.assert_allclose(glb.skin(f"person_{person}", time), vertices @ y_up("z").T, atol=0.01 * MM)
 
 
+def test_glb_keeps_millimetres_far_from_the_origin(job, true_bodies, tmp_path):
+    place = np.array([400_000.0, -150_000.25, 1200.5])
+    people = job.take.people
+    away = replace(people, joints=people.joints + place, transl=people.transl + place)
+    written = write_glb(replace(job, take=replace(job.take, people=away), folder=tmp_path))
+    (note,) = [each for each in written.notes if "coordinates are from" in each]
+    far = Glb(written.files[0])
+    origin = np.array(far.file.scenes[0].extras["origin_m"])
+    assert " ".join(f"{each:.0f}" for each in origin) in note
+    _, vertices = true_bodies(3, FIRST + 4)
+    truth = (vertices + place) @ y_up("z").T
+    np.testing.assert_allclose(far.skin("person_3", 4 / FPS) + origin, truth, atol=0.1 * MM)
+
+
 def test_programs_that_read_four_bones_a_vertex_draw_nearly_the_same(glb, true_bodies):
     """What README of the format says: 1 in 100 vertices is off by more than 1 mm, none by more than 2 cm."""
     _, vertices = true_bodies(3, 111)

@@ -104,6 +104,7 @@ def test_help_names_every_format(capsys):
     assert all(name in words for name in FORMATS)
 
 
+@pytest.mark.slow
 def test_a_recording_for_rerun_read_back(copied, result, capfd):
     rerun = pytest.importorskip("rerun")
     assert run("export", copied, "rrd", "--frames", f"{FIRST}:{FIRST + FRAMES}") == 0
@@ -192,6 +193,7 @@ def test_view_without_rerun_names_the_command(copied, capsys, monkeypatch):
     assert 'rerun is not installed; pip install "shapepose-fg[view]"' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_commands_load_no_torch(copied):
     call = f"main(['export', {str(copied)!r}, 'trc', 'bvh', 'glb'])"
     code = f"import sys; from shapepose_fg.cli.main import main\ntry:\n    {call}\n"

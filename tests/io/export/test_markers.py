@@ -95,6 +95,26 @@ def test_c3d_keeps_sigmas_that_a_byte_cannot_hold(tmp_path):
     assert residuals.ravel().tolist() == [1, 1, 200, 255, 0, -1]
 
 
+def test_c3d_keeps_millimetres_far_from_the_origin(job, result, tmp_path):
+    """Of 400 km a float of 32 bits keeps centimetres: points are from an origin that the file and a note give."""
+    ezc3d = pytest.importorskip("ezc3d")
+    place = np.array([400_000.0, -150_000.25, 1200.5])
+    away = replace(job.take.people, joints=job.take.people.joints + place, transl=job.take.people.transl + place)
+    written = write_c3d(Job(replace(job.take, people=away), tmp_path))
+    file = ezc3d.c3d(str(tmp_path / "person_3.c3d"))
+    origin = np.array(file["parameters"]["POINT"]["ORIGIN_M"]["value"])
+    points = np.moveaxis(file["data"]["points"][:3], 0, 2) / 1e3
+    frames, joints = of_person(result, 3)
+    names = file["parameters"]["POINT"]["LABELS"]["value"]
+    assert len(names) == joints.shape[1] and len(frames) == points.shape[1]
+    np.testing.assert_array_equal(origin, np.rint(origin))
+    truth = joints + place[[1, 2, 0]]
+    np.testing.assert_allclose(np.swapaxes(points, 0, 1) + origin, truth, atol=1e-4)
+    listed = " ".join(f"{each:.0f}" for each in origin)
+    assert [note for note in written.notes if f"c3d: coordinates are from {listed} m of the world" in note]
+    assert write_c3d(job).notes == [] or not any("coordinates" in note for note in write_c3d(job).notes)
+
+
 def moving(count: int, first: int, person: int = 3) -> Take:
     """A person in `count` frames from `first` on, of whom one joint is known: its x is the frame's place, mm."""
     joints = np.zeros((count, 1, 3))

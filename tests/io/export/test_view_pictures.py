@@ -45,6 +45,7 @@ def centres(picture: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PlacementKind.SAME, PlacementKind.SCALE])
 def test_points_lie_where_the_camera_without_its_lens_sees_them(scene, kind):
     camera = replace(scene.rig.cameras[0], distortion=BENT)

@@ -78,6 +78,7 @@ def test_walking_is_capped_in_each_part_by_itself():
     assert total[3] == 200  # nothing but walking in its part: nothing to be drowned
 
 
+@pytest.mark.slow
 def test_poses_of_cmu_are_the_recorded_ones_with_collars_that_follow_the_arms(cmu, shared_data):
     with np.load(shared_data / "cmu_mocap" / "cmu_smpl24.npz", allow_pickle=False) as data:
         recorded = data["poses"][:500].astype(np.float64)
@@ -147,6 +148,7 @@ def test_what_is_no_npz_is_refused(tmp_path):
         load_motions(tmp_path / "nothing.npz")
 
 
+@pytest.mark.slow
 def test_shapes_are_checked_and_frames_must_be_finite(cmu):
     some = cmu.rows(np.arange(5))
     fields = vars(some)

@@ -105,6 +105,7 @@ def test_a_few_iterations_lower_the_error(frame):
     assert error_mm(trainer, trainer.averaged) < 0.9 * before
 
 
+@pytest.mark.slow
 def test_training_is_the_same_each_time_and_another_with_another_seed(frame):
     one, again, other = (make_trainer(frame, replace(SMALL, seed=seed)) for seed in (0, 0, 1))
     first = [list(trainer.run(3)) for trainer in (one, again, other)]

@@ -1,0 +1,52 @@
+"""What is unique in decompositions of matrices: the same numbers on every processor, up to rounding.
+
+LAPACK returns eigenvectors and singular vectors with signs, and bases of repeated values, that depend on the
+processor's kernels. They must not reach a result or a random draw, so that only this module and `factors` call
+`eigh`, `svd` and `qr`.
+"""
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+
+_SIDE = np.sqrt([2.0, 3.0, 5.0])
+"""Axes point to the side of this vector: no axis of a symmetrical arrangement is at right angles to it."""
+
+
+def symmetric_root(matrix: Array) -> Array:
+    """Symmetric square roots (..., n, n) of positive semi-definite matrices; negative rounding counts as zero."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.einsum("...ik,...k,...jk->...ij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
+
+
+def raise_eigenvalues(matrix: Array, least: float) -> Array:
+    """Matrices (..., n, n) whose symmetric parts have had eigenvalues below `least` raised to it."""
+    values, vectors = np.linalg.eigh((matrix + matrix.mT) / 2)
+    return (vectors * np.maximum(values, least)[..., None, :]) @ vectors.mT
+
+
+def principal_axes(covariance: Array) -> tuple[Array, Array]:
+    """Variances (..., 3) along the principal axes, ascending, and the axes as columns of rotations (..., 3, 3).
+
+    The second and third axis point to the side of (√2, √3, √5), the first makes the matrix a rotation. Axes of
+    equal variances are not unique: use them only for what is the same for each choice.
+    """
+    variances, axes = np.linalg.eigh(covariance)
+    axes = axes * np.where(np.einsum("i,...ia->...a", _SIDE, axes) < 0, -1.0, 1.0)[..., None, :]
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]
+    return variances, axes
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """Rotations (..., 3, 3) nearest to matrices: those with the largest trace(Rᵀ M) (Kabsch)."""
+    U, _, Vt = np.linalg.svd(matrix)
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return U @ Vt
+
+
+def basis_across(axis: Array) -> Array:
+    """(2, 3) orthonormal directions at right angles to a unit vector `axis` (3,) (Duff et al. 2017)."""
+    x, y, z = axis
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    return np.array([[1.0 + sign * x * x * a, sign * x * y * a, -sign * x], [x * y * a, sign + y * y * a, -y]])

@@ -1,0 +1,67 @@
+"""The clock that cameras share: a camera whose time is elsewhere does not move it, most of them together do."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+Given = TypeVar("Given")
+
+JUMP_S = 2.0
+"""A time farther than this from the newest frame's is a jump, seconds; no lag is longer."""
+_AGREE_S = 1.0
+"""Cameras that jump to times within this of each other agree, seconds."""
+_ALIVE = 4
+"""A camera counts as alive if it gave one of the last views, so many for each camera."""
+_PATIENCE = 2
+"""Cameras that are alive and do not confirm a jump are waited for during so many views for each camera."""
+
+
+@dataclass
+class CommonClock(Generic[Given]):
+    """Views whose times jump wait until other cameras confirm the jump.
+
+    One camera, or one line, with a wrong time changes nothing for the others. After a pause of all cameras, or
+    when their clock is set, the first views wait for those of the others, and are taken in with them.
+    """
+
+    cameras: int
+    """V."""
+    off: dict[int, int] = field(default_factory=dict)
+    """By camera: how many views in a row were kept back."""
+    _held: dict[int, tuple[float, Given]] = field(default_factory=dict)
+    """By camera: the time and content of its newest view, where that is a jump."""
+    _stay: set[int] = field(default_factory=set)
+    """Cameras that gave a view without a jump since the first one that is held."""
+    _passed: int = 0
+    """Views since the first one that is held."""
+    _recent: deque[int] = field(default_factory=deque)
+    """The cameras of the last views."""
+
+    def admit(self, camera: int, time_s: float, now_s: float, given: Given) -> tuple[list[Given], bool]:
+        """The views to take in, in order of time, and whether the clock jumps with them.
+
+        `given` is what a camera saw at `time_s`, and `now_s` the time of the newest frame, -inf before the first.
+        The view is kept back, and the list empty, if it jumps and the others have not confirmed that.
+        """
+        self._recent.append(camera)
+        if len(self._recent) > _ALIVE * self.cameras:
+            self._recent.popleft()
+        if len(self._held) == 0:
+            self._stay, self._passed = set(), 0
+        self._passed += 1
+        if not JUMP_S < abs(time_s - now_s) < float("inf"):
+            self._held.pop(camera, None)
+            self.off.pop(camera, None)
+            self._stay.add(camera)
+            return [given], False
+        self._stay.discard(camera)
+        self._held[camera] = time_s, given
+        self.off[camera] = self.off.get(camera, 0) + 1
+        agree = [each for each, (at_s, _) in self._held.items() if abs(at_s - time_s) <= _AGREE_S]
+        waited = self._passed >= _PATIENCE * self.cameras or set(self._recent) <= set(agree)
+        if len(agree) < 2 or len(agree) <= len(self._stay) or not waited:
+            return [], False
+        taken = [given for _, given in sorted((self._held[each] for each in agree), key=lambda each: each[0])]
+        self._held.clear()
+        self.off.clear()
+        return taken, True

@@ -1,0 +1,250 @@
+"""Where detections come from while they come: lines of JSON from a file, a pipe or clients of a socket; MCAP.
+
+One line does not end the service. A line that cannot be used is left out with a note. Who begins with a line that
+cannot be read, or sends ten in a row, is given up: a client is cut off and the others go on, a file is an
+`InputError`.
+"""
+
+import selectors
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.io.detections.lines import read_view_line
+from shapepose_fg.io.ros.mcap_files import read_views
+from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
+
+Push = Callable[..., None]
+"""Takes what `OnlineReconstructor.push_view` takes; raises ValueError where that is refused."""
+Note = Callable[[str], None]
+_LONGEST_LINE = 2**20
+"""Bytes of a line of detections: 600 people."""
+_PIECE = 2**16
+"""Bytes that are read at a time."""
+_MOST_BAD = 10
+"""Lines in a row that cannot be used, after which their sender is given up."""
+_RECONNECT_S = 2.0
+"""A socket is served for so long after the last client who sent something has left, seconds: it may come back."""
+_SILENT_S = 60.0
+"""Clients that were silent for so long make room for new ones where there are too many."""
+
+
+def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push) -> None:
+    """Give `push` what cameras saw, as it comes, to the end of the input.
+
+    `where` is a file or a pipe of lines, `-` or None for standard input, `FILE.mcap`, or `tcp://HOST:PORT`, which
+    ends when everybody who sent something has left. `note` is told of what is left out.
+    InputError where the input cannot be used.
+    """
+    given = _Given(rig, skeleton, note, push)
+    if where is not None and where.startswith("tcp:"):
+        _from_socket(where, given)
+    elif where is not None and where.endswith(".mcap"):
+        sender = _Sender(where, given)
+        for view in read_views(Path(where), rig, skeleton, note):
+            sender.take(lambda place, view=view: view)
+        sender.end()
+    elif where in (None, "-"):
+        if sys.stdin is None:
+            raise InputError("standard input is closed; name a file or a socket with --detections")
+        _from_file(sys.stdin.buffer, _Sender("standard input", given))
+    else:
+        with Path(str(where)).open("rb") as stream:
+            _from_file(stream, _Sender(str(where), given))
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What all senders of an input have in common: see `feed`."""
+
+    rig: Rig
+    skeleton: Skeleton
+    note: Note
+    push: Push
+
+
+@dataclass
+class _Sender:
+    """Who sends lines, one after the other."""
+
+    name: str
+    """A file, or a client of a socket, for messages."""
+    given: _Given
+    good: int = 0
+    """Lines that were taken."""
+    refused: InputError | None = None
+    """Why the first of those lines was not taken that say what lines should say."""
+    _number: int = 0
+    _bad: int = 0
+    """Lines in a row that could not be read."""
+
+    def line(self, line: bytes | None) -> None:
+        """Take the next line, None for one that is too long. InputError where the sender is to be given up."""
+        if line is not None and self._number == 0:
+            line = line.removeprefix(b"\xef\xbb\xbf")
+        if line is None or line.strip():
+            self.take(lambda place: self._read(line, place))
+        else:
+            self._number += 1
+
+    def take(self, read: Callable[[str], tuple[Any, ...]]) -> None:
+        """Push what `read` makes of the name of the next line. InputError as in `line`."""
+        self._number += 1
+        place = f"{self.name}, line {self._number}"
+        try:
+            view = read(place)
+        except InputError as error:
+            self._bad += 1
+            if self.good == 0 or self._bad >= _MOST_BAD:
+                raise
+            self.given.note(f"{error}; the line is left out")
+            return
+        self._bad = 0
+        try:
+            with naming(place):
+                self.given.push(*view)
+        except InputError as error:  # which may be another client's doing
+            self.refused = self.refused or error
+            self.given.note(f"{error}; the line is left out")
+        else:
+            self.good += 1
+
+    def end(self) -> None:
+        """InputError where lines came and none was taken."""
+        if self.good == 0 and self.refused is not None:
+            raise self.refused
+
+    def _read(self, line: bytes | None, place: str) -> tuple[Any, ...]:
+        if line is None:
+            raise InputError(f"{place}: it is longer than {_LONGEST_LINE} bytes; write a line for each picture")
+        try:
+            text = line.decode()
+        except UnicodeDecodeError as error:
+            raise InputError(f"{place}: byte {error.start} is not UTF-8 text; write JSON in UTF-8") from None
+        return read_view_line(text, place, self.given.rig, self.given.skeleton)
+
+
+@dataclass
+class _Lines:
+    """Cuts bytes into lines as they come, in bounded memory."""
+
+    _begun: bytearray = field(default_factory=bytearray)
+    _too_long: bool = False
+    """Whether the line that has begun has been refused."""
+
+    def split(self, piece: bytes) -> Iterator[bytes | None]:
+        """Lines that end in the next bytes, the last one where there are none; None for one that is too long."""
+        *ended, begun = piece.split(b"\n") if piece else (b"", b"")
+        for part in ended:
+            self._begun += part
+            if len(self._begun) > _LONGEST_LINE and not self._too_long:
+                yield None
+            elif not self._too_long:
+                yield bytes(self._begun)
+            self._begun.clear()
+            self._too_long = False
+        self._begun += begun
+        if len(self._begun) > _LONGEST_LINE:
+            if not self._too_long:
+                yield None
+            self._begun.clear()
+            self._too_long = True
+
+
+def _from_file(stream: IO[bytes], sender: _Sender) -> None:
+    lines, piece = _Lines(), b"-"
+    while piece:
+        piece = stream.read1(_PIECE) if hasattr(stream, "read1") else stream.read(_PIECE)  # pyright: ignore
+        for line in lines.split(piece):
+            sender.line(line)
+    sender.end()
+
+
+@dataclass(eq=False)
+class _Client:
+    """A connection that sends lines."""
+
+    connection: socket.socket
+    sender: _Sender
+    lines: _Lines
+    heard_s: float
+    """When it sent something last, or came, on the monotonic clock."""
+
+
+def _from_socket(where: str, given: _Given) -> None:
+    with ExitStack() as ending, listen(where) as listening, selectors.DefaultSelector() as ready:
+        clients = list[_Client]()
+        ending.callback(lambda: [each.connection.close() for each in clients])
+        ready.register(listening, selectors.EVENT_READ)
+        served, served_s, full_s = False, time.monotonic(), -1.0
+
+        def cut_off(client: _Client, why: object = "") -> None:
+            if why:
+                given.note(f"{client.sender.name}: {why}; it is cut off")
+            ready.unregister(client.connection)
+            client.connection.close()
+            clients.remove(client)
+
+        def come() -> None:
+            found = accept(listening)
+            if found is None:
+                return
+            connection, name = found
+            client = _Client(connection, _Sender(f"{where}, {name}", given), _Lines(), time.monotonic())
+            if len(clients) >= MOST_CLIENTS:
+                # Who has sent nothing that can be used goes first, then who is silent for longest.
+                first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
+                if first.sender.good > 0 and client.heard_s - first.heard_s < _SILENT_S:
+                    connection.close()
+                    given.note(f"{where}: {name} is sent away, as {MOST_CLIENTS} clients are served already")
+                    return
+                cut_off(first, f"{MOST_CLIENTS} clients are served at most, and it was silent for longest")
+            clients.append(client)
+            ready.register(connection, selectors.EVENT_READ, client)
+
+        def hear(client: _Client) -> None:
+            try:
+                piece = client.connection.recv(_PIECE)
+                client.heard_s = time.monotonic()
+                for line in client.lines.split(piece):
+                    client.sender.line(line)
+            except BlockingIOError:
+                return
+            except InputError as error:
+                cut_off(client, str(error).removeprefix(f"{client.sender.name}, "))
+            except OSError as error:
+                cut_off(client, error.strerror or error)
+            else:
+                if not piece:
+                    cut_off(client)
+
+        while True:
+            for key, _ in ready.select(timeout=_RECONNECT_S / 4):
+                if key.data is not None:
+                    served |= key.data.sender.good > 0
+                    if key.data in clients:
+                        hear(key.data)
+                    served |= key.data.sender.good > 0
+                    continue
+                try:
+                    come()
+                except OSError as error:
+                    given.note(f"{where}: nobody else can be served ({error.strerror})")
+                    ready.unregister(listening)
+                    full_s = time.monotonic()
+            now_s = time.monotonic()
+            if 0 <= full_s < now_s - 1.0:
+                ready.register(listening, selectors.EVENT_READ)
+                full_s = -1.0
+            if not served or any(each.sender.good > 0 for each in clients):
+                served_s = now_s
+            if now_s - served_s > _RECONNECT_S:
+                return

@@ -1,0 +1,43 @@
+"""Notes of a service that goes on: however often something happens, they do not flood the terminal."""
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+_BETWEEN_S = 1.0
+"""Shortest time between two notes, seconds: others are counted."""
+_AT_ONCE = 10
+"""Notes that are passed on at once before."""
+
+
+class SparingNotes:
+    """Passes notes on: the first ten, then one a second, with how many were left out. A context, which ends with
+    that number.
+    """
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        self._note, self._said_s, self._more, self._left = note, time.monotonic(), 0, float(_AT_ONCE)
+
+    def __call__(self, text: str) -> None:
+        now_s = time.monotonic()
+        self._left = min(self._left + (now_s - self._said_s) / _BETWEEN_S, float(_AT_ONCE))
+        self._said_s = now_s
+        if self._left < 1:
+            self._more += 1
+            return
+        self._left -= 1
+        self._count()
+        self._note(text)
+
+    def __enter__(self) -> "SparingNotes":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._count()
+
+    def _count(self) -> None:
+        if self._more > 0:
+            self._note(f"{self._more} more notes were left out here")
+        self._more = 0

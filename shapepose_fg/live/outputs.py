@@ -1,0 +1,167 @@
+"""Where people go to, as they come: lines of JSON, a socket, MCAP; rerun, to look.
+
+`-` or nothing is standard output; `tcp://:5000` listens on this machine only, `tcp://0.0.0.0:5000` for everybody;
+a name that ends in `.mcap` or `.rrd` is that, `rerun` a viewer that is started, `rerun+http://...` one that runs;
+any other is a file or a pipe of lines.
+"""
+
+import json
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.io.ros.mcap_files import McapWriter
+from shapepose_fg.io.solved_setup import body_of
+from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
+
+Publish = Callable[[str, Reconstruction], None]
+"""Of a kind, `now` or `settled`, and its rows."""
+_MOST_WAITING = 2**23
+"""Bytes that a client may be behind with."""
+_LAST_S = 2.0
+"""So long all clients together are waited for at the end, seconds."""
+
+
+@contextmanager
+def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
+    """What takes people out, frame by frame, to all those places; standard output where there is none."""
+    with ExitStack() as files:
+        targets = [files.enter_context(_target(each, rig, note)) for each in where or ["-"]]
+
+        def publish(kind: str, people: Reconstruction) -> None:
+            for target in targets:
+                target(kind, people)
+
+        yield publish
+
+
+@contextmanager
+def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
+    with ExitStack() as files:
+        if where.endswith(".mcap"):
+            written = files.enter_context(McapWriter(files.enter_context(Path(where).open("wb")), rig))
+            yield lambda kind, people: _by_time(people, lambda rows, time_s: written.frame(rows, time_s, kind))
+            return
+        if where == "rerun" or where.startswith("rerun+") or where.endswith(".rrd"):
+            from shapepose_fg.io.export import rerun_app, rerun_log  # with scipy.stats: half a second
+
+            first = rerun_app.layout(rig.up, rig, rig.centres, ["world/people/**"])
+            if where.endswith(".rrd"):
+                stream = files.enter_context(rerun_app.written(Path(where), first))
+            else:
+                if where == "rerun":
+                    note(*rerun_app.quiet_viewer())
+                stream = files.enter_context(rerun_app.shown(first, None if where == "rerun" else where))
+            log = rerun_log.LiveLog(stream, rig, body_of({}, None))
+            yield lambda kind, people: log.moment(people) if kind == "now" else None
+            return
+        if where.startswith("tcp:"):
+            send = files.enter_context(_Listeners(listen(where), note)).send
+        else:
+            sink = sys.stdout if where == "-" else files.enter_context(Path(where).open("w", encoding="utf-8"))
+
+            def send(line: str) -> None:
+                sink.write(line)
+                sink.flush()
+
+        yield lambda kind, people: _by_time(people, lambda rows, time_s: send(line_of(kind, rows, time_s)))
+
+
+def line_of(kind: str, people: Reconstruction, time_s: float) -> str:
+    """A moment's people as a line of JSON: metres, m², m/s; null where unknown."""
+    rows = [
+        {
+            "person": int(people.person[n]),
+            "joints": _plain(people.joints[n]),
+            "covariance": _plain(people.covariance[n]),
+            "velocity": _plain(people.velocity[n]),
+            "known": people.known[n].tolist(),
+            "status": str(people.status[n]),
+            "body": {name: _plain(getattr(people, name)[n]) for name in BODY},
+        }
+        for n in range(len(people))
+    ]
+    return json.dumps({"kind": kind, "time_s": time_s, "people": rows}, allow_nan=False) + "\n"
+
+
+def _by_time(people: Reconstruction, take: Callable[[Reconstruction, float], None]) -> None:
+    for time_s in np.unique(people.time_s).tolist():
+        take(people.rows(people.time_s == time_s), time_s)
+
+
+def _plain(values: np.ndarray) -> Any:
+    """Nested lists of numbers of 6 digits, null where one of an innermost list is unknown."""
+    if values.ndim > 1:
+        return [_plain(each) for each in values]
+    return [float(f"{value:.6g}") for value in values] if np.isfinite(values).all() else None
+
+
+class _Listeners:
+    """Sends lines to whoever is there; who reads too slowly is cut off, and nobody is waited for."""
+
+    def __init__(self, listening: socket.socket, note: Callable[[str], None]) -> None:
+        self._listening, self._note = listening, note
+        self._waiting: dict[socket.socket, deque[memoryview]] = {}
+        """By client: what it has still to get. Lines are in memory once, whoever they wait for."""
+
+    def __enter__(self) -> "_Listeners":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        until_s = time.monotonic() + _LAST_S
+        for client, waiting in self._waiting.items():
+            with client:
+                try:
+                    for each in waiting:
+                        client.settimeout(max(until_s - time.monotonic(), 0.01))
+                        client.sendall(each)
+                except OSError:
+                    continue
+        self._listening.close()
+
+    def send(self, line: str) -> None:
+        """Send a line, and what waits before it, as far as each client takes it now."""
+        self._welcome()
+        data = memoryview(line.encode())
+        for client, waiting in list(self._waiting.items()):
+            waiting.append(data)
+            try:
+                while waiting:
+                    sent = client.send(waiting[0])
+                    rest = waiting.popleft()[sent:]
+                    if len(rest) > 0:
+                        waiting.appendleft(rest)
+            except BlockingIOError:
+                pass
+            except OSError:
+                self._part(client, "a reader left")
+                continue
+            if sum(map(len, waiting)) > _MOST_WAITING:
+                self._part(client, "a reader is too slow, and cut off")
+
+    def _welcome(self) -> None:
+        """Take in who came since."""
+        try:
+            while (found := accept(self._listening)) is not None:
+                client, name = found
+                if len(self._waiting) < MOST_CLIENTS:
+                    self._waiting[client] = deque()
+                else:
+                    client.close()
+                    self._note(f"{name} is sent away, as {MOST_CLIENTS} read already")
+        except OSError as error:
+            self._note(f"nobody else can read ({error.strerror})")
+
+    def _part(self, client: socket.socket, why: str) -> None:
+        self._note(why)
+        client.close()
+        del self._waiting[client]

@@ -1,0 +1,39 @@
+"""Sockets on which `live` waits for others, and how many of these it serves."""
+
+import socket
+from urllib.parse import urlsplit
+
+from shapepose_fg.core.errors import InputError
+
+MOST_CLIENTS = 64
+"""Connections served at a time, of each socket: fewer than the files that a process may have open."""
+_OWN_MACHINE = "127.0.0.1"
+
+
+def listen(where: str) -> socket.socket:
+    """A socket for `tcp://HOST:PORT` that nothing waits for; without a host, on this machine only. InputError."""
+    try:
+        parts = urlsplit(where)
+        host, port = parts.hostname or _OWN_MACHINE, parts.port
+        if port is None or parts.path.strip("/") or parts.username:
+            raise ValueError("no port")
+        listening = socket.create_server((host, port))
+    except (ValueError, OSError) as error:
+        raise InputError(
+            f"{where}: cannot be listened on ({error}); give tcp://:PORT or tcp://HOST:PORT"
+        ) from None
+    listening.setblocking(False)
+    return listening
+
+
+def accept(listening: socket.socket) -> tuple[socket.socket, str] | None:
+    """The next connection, which does not block, and who it is; None where there is none. OSError where the system
+    has no room for it.
+    """
+    try:
+        client, address = listening.accept()
+    except (BlockingIOError, ConnectionError):  # or it has gone again
+        return None
+    client.setblocking(False)
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    return client, f"{address[0]}:{address[1]}"

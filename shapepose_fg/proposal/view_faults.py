@@ -1,0 +1,87 @@
+"""Detections that their own view shows to be wrong: people found twice, joints moved onto the picture's border."""
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import Detections
+from shapepose_fg.proposal.people_2d import group_people
+
+_LEAST_JOINTS = 3
+"""Number of common joints from which on two 2D people are compared."""
+_SAME = 0.03
+"""Median distance of the common joints of two detections of one person, as a share of the person's size in the
+picture: two boxes around one person differ by one or two hundredths, people in line with the camera by more."""
+_BORDER_PX = 1.0
+"""Distance from the edge of the picture up to which a joint is on the edge, px."""
+_LINE_PX = 0.01
+"""Difference up to which coordinates are the same number, px: the inverse of a lens is exact to less."""
+_DISTINCT = 0.9
+"""Share of different numbers among coordinates from which on the detector does not round to a grid."""
+
+
+def without_faults(found: Detections, rig: Rig) -> Detections:
+    """The detections of a frame without joints on the border and without second detections of a person."""
+    for wrong in (clipped, doubled):
+        faulty = wrong(found, rig)
+        found = found.only(~faulty) if faulty.any() else found
+    return found
+
+
+def clipped(found: Detections, rig: Rig) -> Mask:
+    """(D,) detections of joints that lie beyond the border of the picture, and were moved onto it.
+
+    The border is the edge of the calibrated picture; or, where the detector was given a part of it, a line that
+    limits all joints of a view, and on which two or more are to the last digit while no others agree so.
+    """
+    wrong = np.zeros(len(found), dtype=bool)
+    for view, camera in enumerate(rig.cameras):
+        here = np.flatnonzero(found.view == view)
+        if len(here) == 0:
+            continue
+        measured = camera.distort(found.xy[here]) if np.any(camera.distortion) else found.xy[here]
+        for along in measured.T:
+            wrong[here] |= _at_the_end(along) | _at_the_end(-along)
+        edge = np.array(camera.image_size) - 1 - _BORDER_PX
+        wrong[here] |= ((measured <= _BORDER_PX) | (measured >= edge)).any(axis=1)
+    return wrong
+
+
+def _at_the_end(along: Array) -> Mask:
+    """(D,) coordinates (D,) that are the highest, where that is the border: several are, and all others differ."""
+    end = along > along.max() - _LINE_PX
+    if end.sum() > 1:
+        rest = np.round(along[~end] / _LINE_PX)
+        end &= len(np.unique(rest)) >= max(1, _DISTINCT * len(rest))
+    return end & (end.sum() > 1)
+
+
+def doubled(found: Detections, rig: Rig) -> Mask:
+    """(D,) detections of the less certain of two 2D people in the same place of a view: it is one person."""
+    again = np.zeros(len(found), dtype=bool)
+    groups = [group for group in group_people(found) if len(group) >= _LEAST_JOINTS]
+    # The most certain first; of equals whichever the order of the detections puts first.
+    groups.sort(key=lambda group: -float(found.confidence[group].sum()))
+    view = found.view[[group[0] for group in groups]]
+    if len(groups) == len(np.unique(view)):
+        return again
+    xy = np.full((len(groups), int(found.joint.max()) + 1, 2), np.nan)
+    for number, group in enumerate(groups):
+        xy[number, found.joint[group]] = found.xy[group]
+    lowest, highest = np.nanmin(xy, axis=1), np.nanmax(xy, axis=1)
+    size = np.linalg.norm(highest - lowest, axis=1)
+    one, other = np.triu_indices(len(groups), 1)
+    near = np.abs(lowest[one] - lowest[other]).max(axis=1) < size[one]
+    one, other = (each[near & (view[one] == view[other])] for each in (one, other))
+    apart = np.sort(np.linalg.norm(xy[one] - xy[other], axis=2), axis=1)
+    common = np.isfinite(apart).sum(axis=1)
+    has = np.isfinite(xy[..., 0]).sum(axis=1)
+    enough = common >= np.maximum(_LEAST_JOINTS, np.minimum(has[one], has[other]) / 2)
+    median = apart[np.arange(len(one)), np.maximum(common - 1, 0) // 2]
+    same = enough & (median < _SAME * np.minimum(size[one], size[other]))
+    gone = np.zeros(len(groups), dtype=bool)
+    for kept, twin in zip(one[same].tolist(), other[same].tolist(), strict=True):
+        gone[twin] |= not gone[kept]
+    for number in np.flatnonzero(gone).tolist():
+        again[groups[number]] = True
+    return again
