@@ -202,7 +202,7 @@ def _joint_order(finding: Finding, side_px: int) -> str:
     if finding.joints == ("left and right",):
         what = "left and right of everybody look exchanged: knees and faces point backwards"
         return f"{what}; exchange them in a --skeleton file, or see whether all pictures were mirrored"
-    if finding.joints[0]:
+    if any(finding.joints):
         return f"{finding.joints[0]} look exchanged in all detections; give their order in a --skeleton file"
     return (
         "joints do not lie as a body's do: they are in another order than they are read in; name the detector's"
