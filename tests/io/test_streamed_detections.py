@@ -74,6 +74,7 @@ def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_pat
     assert backwards[::-1] == [whole[frame].xy.sum() for frame in range(FRAMES)]
 
 
+@pytest.mark.slow
 def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_path):
     """A JSON file per frame and per camera; scores of the last block alone say that they are per cent."""
     rng = np.random.default_rng(0)

@@ -84,7 +84,12 @@ def assemble(
         stop = min((n + 1) * BLOCK_FRAMES, count)
         keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
     notes = tuple(note for each in ideal for reason in each.reasons for note in reason.note())
-    return DetectionTable(skeleton, kept, count, tuple(view.source for view in views), (*said, *notes))
+    table = DetectionTable(skeleton, kept, count, tuple(view.source for view in views), (*said, *notes))
+    if all(view.frame_count == count for view in views):
+        return table
+    frame = np.arange(count)
+    has = [np.where(frame < view.frame_count, frame, -1) for view in views]
+    return replace(table, picture=np.column_stack(has))
 
 
 def _any_frame(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
