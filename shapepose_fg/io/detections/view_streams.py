@@ -137,8 +137,8 @@ def _span_words(view: ViewStream) -> str:
 
 
 def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
-    """The `count` frames of a view that follow its first `lead`; before the first there are `-lead` empty ones where
-    that is negative. All blocks of the view are read.
+    """The `count` frames of a view that follow its first `lead`, or of `-lead` empty frames and its own where that
+    is negative. All blocks of the view are read.
     """
 
     def blocks() -> Iterator[ViewCandidates]:
