@@ -20,6 +20,7 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
+from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
@@ -100,7 +101,7 @@ def detect(
     if pictures.videos is None or output is None:
         missing = "--videos, the cameras' videos or pictures" if pictures.videos is None else "--output, a folder"
         raise InputError(f"what to read or where to write is missing; give {missing}")
-    from shapepose_fg.core.moments import align
+    from shapepose_fg.core.moments import align, own_frames
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
     from shapepose_fg.io.footage.placement import placements_of
@@ -113,7 +114,10 @@ def detect(
     rig = known or pictures_only(list(sizes), list(sizes.values()))
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     note(*concluded)
-    moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
+    clocks = clocks_of(footage, clock.fps or [], clock.start or [], rig.names)
+    # Pictures of one number belong together; when videos began is known only where somebody says it.
+    timed = clock.start is not None or all(each.path.is_dir() for each in footage)
+    moments = align(*clocks) if timed else own_frames(*clocks)
     span = frame_range(clock.frames, len(moments))
     time_s = None if moments.time_s is None else moments.time_s[span]
     moments = replace(moments, picture=moments.picture[span], time_s=time_s)
@@ -127,9 +131,8 @@ def detect(
     with progress("detecting", "pictures") as done:
         try:
             joints, unreadable = run_detection(run, done)
-        except KeyboardInterrupt:
-            note("stopped; the same command goes on from here")
-            raise
+        except Stopped as stop:
+            raise Stopped(stop.number, "the same command goes on from here") from None
     for name, failed in zip(rig.names, unreadable, strict=True):
         if failed > 0:
             note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; nothing is detected there")

@@ -11,6 +11,7 @@ import typer
 
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.calibrate import calibrate
+from shapepose_fg.cli.compile import compile_kernels
 from shapepose_fg.cli.detect import detect
 from shapepose_fg.cli.explain import explain
 from shapepose_fg.cli.export import export
@@ -59,6 +60,7 @@ for _panel, _commands in {
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
+app.command("compile", rich_help_panel=_TRY)(compile_kernels)
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 

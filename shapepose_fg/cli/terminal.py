@@ -4,6 +4,7 @@ import logging
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,8 @@ def use_any_streams() -> None:
 class _Stripped:
     """A stream that takes whatever is said, without what a terminal would obey: names of files and keys are in it.
 
-    Rich gets the stream beneath, which its colours go to; what it prints is stripped by `console`.
+    Only plain text goes through it. Rich's consoles strip what they are given and write colours and bars to the
+    stream beneath, which is not ours to look at: they ask for it by this attribute, `console` below hands it over.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -51,6 +53,13 @@ class _Stripped:
         return getattr(self.rich_proxied_file, name)
 
 
+def _beneath(stream: Any) -> Any:
+    """The stream that streams of ours and of Rich's write to."""
+    while hasattr(stream, "rich_proxied_file"):
+        stream = stream.rich_proxied_file
+    return stream
+
+
 _OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
@@ -59,8 +68,8 @@ def printable(text: str) -> str:
     return _OBEYED.sub("", text)
 
 
-def console(**options: Any) -> "Console":
-    """A console that strips what is printed on it; text is no markup."""
+def console(*, stderr: bool = False) -> "Console":
+    """A console on stdout or stderr that strips what is printed on it; text is no markup."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -69,7 +78,7 @@ def console(**options: Any) -> "Console":
             for each in super().render(*arguments, **options):
                 yield each if each.control else each._replace(text=printable(each.text))
 
-    return Stripping(markup=False, emoji=False, **options)
+    return Stripping(file=_beneath(sys.stderr if stderr else sys.stdout), markup=False, emoji=False)
 
 
 def show(content: "RenderableType") -> None:
@@ -97,7 +106,8 @@ def say(what: str, message: str, style: str) -> None:
     """Say on stderr, in one paragraph that begins with `what`."""
     from rich.text import Text
 
-    console(stderr=True).print(Text.assemble((f"{what}: ", style), message), soft_wrap=True)
+    on = console(stderr=True) if _shown is None else _shown.console  # above the bars
+    on.print(Text.assemble((f"{what}: ", style), message), soft_wrap=True)
 
 
 def note(*messages: str) -> None:
@@ -112,35 +122,77 @@ def warn(message: str) -> None:
 
 
 class _Noted(logging.Handler):
-    """Says what is logged as notes, where stderr is a terminal."""
+    """Says what is logged as notes."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        if console(stderr=True).is_terminal:
-            note(record.getMessage())
+        note(record.getMessage())
 
 
 def note_log() -> None:
-    """Say on a terminal what the package logs: what takes long once."""
+    """Say what the package logs: what takes long once."""
     logger = logging.getLogger("shapepose_fg")
     if len(logger.handlers) == 0:
         logger.addHandler(_Noted(logging.INFO))
         logger.setLevel(logging.INFO)
 
 
+_shown: "Progress | None" = None
+"""Bars that are on the terminal."""
+
+
 @contextmanager
 def bars(unit: str = "") -> Iterator["Progress"]:
-    """Progress bars on stderr while the block runs; nothing is shown where that is not a terminal."""
+    """Progress bars on stderr while the block runs; nothing is shown where that is not a terminal.
+
+    Whatever ends the block, the bars are taken away and the cursor is back.
+    """
+    global _shown
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    shown_on, left = console(stderr=True), TimeRemainingColumn(compact=True)
+    on, left = console(stderr=True), TimeRemainingColumn(compact=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
-    with Progress(*columns, left, console=shown_on, transient=True, disable=not shown_on.is_terminal) as shown:
-        yield shown
+    is_shown = _is_terminal(on) and _shown is None
+    made = Progress(
+        *columns,
+        left,
+        console=on,
+        transient=True,
+        disable=not is_shown,
+        redirect_stdout=False,
+        redirect_stderr=True,
+    )
+    if not is_shown:
+        yield made
+        return
+    try:
+        _shown = made
+        with made:
+            yield made
+    finally:
+        _shown = None
+        on.show_cursor(True)
+
+
+def _is_terminal(on: "Console") -> bool:
+    return on.file.isatty() and not on.is_dumb_terminal
+
+
+_EVERY_S = 15.0
+"""Interval between lines of progress where stderr is no terminal, s."""
 
 
 @contextmanager
 def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """One of them: a function of how many are done, and how many there are."""
+    """A function of how many are done, and how many there are: a bar on a terminal, else a line now and then."""
+    begin = last = time.monotonic()
+
+    def line(done: int, total: int) -> None:
+        nonlocal last
+        if total and done > 0 and (now := time.monotonic()) - last >= _EVERY_S:
+            last = now
+            left = (now - begin) * (total - done) / done
+            say(what, f"{done} of {total} {unit}, {left / 60:.0f} min left", "bold")
+
     with bars(unit) as shown:
         task = shown.add_task(what, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
+        yield line if shown.disable else lambda done, total: shown.update(task, completed=done, total=total)

@@ -9,24 +9,40 @@ from shapepose_fg.core.errors import InputError
 
 MOST_FRAME = 10**12
 """No frame has a higher number."""
+_WORDS = re.compile(r"[^\W\d_]+|\d{1,18}", re.ASCII)
 _NUMBERS = re.compile(r"\d+")
 
 
 def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
     """For each camera the place of its name among `names`, which are longer or written differently.
 
-    A camera is told by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), or by the
-    only number in both (`cam01` is camera `int_cam1`). None where it is not so for every camera, or something else
-    could be meant too: then nothing is guessed.
+    A camera is told by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), by the
+    only number in both (`cam01` is camera `int_cam1`), or by what is left of both without the words with which all
+    cameras, or all names, begin and end (`2022-09-19_synced_Cam1` is `view_01_json`). None where it is not so for
+    every camera, or something else could be meant too: then nothing is guessed.
     """
     words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras]
     found = [[index for index, name in enumerate(names) if word.search(name) is not None] for word in words]
     if all(len(each) == 1 for each in found) and len({each[0] for each in found}) == len(found):
         return [each[0] for each in found]
-    wanted, there = _one_number_each(cameras), _one_number_each(names)
-    if wanted is None or there is None or not set(wanted) <= set(there):
-        return None
-    return [there.index(number) for number in wanted]
+    for part in (_one_number_each, _own_words):
+        wanted, there = part(cameras), part(names)
+        if wanted is not None and there is not None and set(wanted) <= set(there):
+            return [there.index(each) for each in wanted]
+    return None
+
+
+def _own_words(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
+    """Words and numbers of each name, in small letters, without those with which all begin or end; None where one
+    has none left, or two have the same.
+    """
+    words = [[int(word) if word.isdigit() else word for word in _WORDS.findall(name.lower())] for name in names]
+    for _ in range(2):  # from the beginning, and from the end
+        while all(each and each[0] == words[0][0] for each in words) and len(words) > 1:
+            words = [each[1:] for each in words]
+        words = [each[::-1] for each in words]
+    found = [tuple(each) for each in words]
+    return found if all(found) and len(set(found)) == len(found) else None
 
 
 def _one_number_each(names: Sequence[str]) -> list[int] | None:

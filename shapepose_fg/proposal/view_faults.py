@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.people_2d import group_people
@@ -11,7 +11,9 @@ _LEAST_JOINTS = 3
 """Number of common joints from which on two 2D people are compared."""
 _SAME = 0.03
 """Median distance of the common joints of two detections of one person, as a share of the person's size in the
-picture: two boxes around one person differ by one or two hundredths, people in line with the camera by more."""
+picture: two boxes around one person differ by a hundredth or two, people in line with the camera by more."""
+_SAME_OF_PICTURE = 0.005
+"""Such a distance as a share of the picture's width: small people differ by a few pixels."""
 _BORDER_PX = 1.0
 """Distance from the edge of the picture up to which a joint is on the edge, px."""
 _LINE_PX = 0.01
@@ -34,26 +36,22 @@ def clipped(found: Detections, rig: Rig) -> Mask:
     The border is the edge of the calibrated picture; or, where the detector was given a part of it, a line that
     limits all joints of a view, and on which two or more are to the last digit while no others agree so.
     """
-    wrong = np.zeros(len(found), dtype=bool)
+    measured = found.xy.copy()
     for view, camera in enumerate(rig.cameras):
-        here = np.flatnonzero(found.view == view)
-        if len(here) == 0:
-            continue
-        measured = camera.distort(found.xy[here]) if np.any(camera.distortion) else found.xy[here]
-        for along in measured.T:
-            wrong[here] |= _at_the_end(along) | _at_the_end(-along)
-        edge = np.array(camera.image_size) - 1 - _BORDER_PX
-        wrong[here] |= ((measured <= _BORDER_PX) | (measured >= edge)).any(axis=1)
+        if np.any(camera.distortion):
+            here = found.view == view
+            measured[here] = camera.distort(measured[here])
+    edge = np.array([camera.image_size for camera in rig.cameras]) - 1 - _BORDER_PX
+    wrong = ((measured <= _BORDER_PX) | (measured >= edge[found.view])).any(axis=1)
+    for along in (*measured.T, *-measured.T):
+        highest = np.full(len(rig), -np.inf)
+        np.maximum.at(highest, found.view, along)
+        end = along > highest[found.view] - _LINE_PX
+        for view in np.flatnonzero(np.bincount(found.view[end], minlength=len(rig)) > 1).tolist():
+            rest = np.round(along[(found.view == view) & ~end] / _LINE_PX)
+            if len(np.unique(rest)) >= max(1, _DISTINCT * len(rest)):
+                wrong |= end & (found.view == view)
     return wrong
-
-
-def _at_the_end(along: Array) -> Mask:
-    """(D,) coordinates (D,) that are the highest, where that is the border: several are, and all others differ."""
-    end = along > along.max() - _LINE_PX
-    if end.sum() > 1:
-        rest = np.round(along[~end] / _LINE_PX)
-        end &= len(np.unique(rest)) >= max(1, _DISTINCT * len(rest))
-    return end & (end.sum() > 1)
 
 
 def doubled(found: Detections, rig: Rig) -> Mask:
@@ -70,6 +68,7 @@ def doubled(found: Detections, rig: Rig) -> Mask:
         xy[number, found.joint[group]] = found.xy[group]
     lowest, highest = np.nanmin(xy, axis=1), np.nanmax(xy, axis=1)
     size = np.linalg.norm(highest - lowest, axis=1)
+    least = _SAME_OF_PICTURE * np.array([camera.image_size[0] for camera in rig.cameras])
     one, other = np.triu_indices(len(groups), 1)
     near = np.abs(lowest[one] - lowest[other]).max(axis=1) < size[one]
     one, other = (each[near & (view[one] == view[other])] for each in (one, other))
@@ -78,7 +77,7 @@ def doubled(found: Detections, rig: Rig) -> Mask:
     has = np.isfinite(xy[..., 0]).sum(axis=1)
     enough = common >= np.maximum(_LEAST_JOINTS, np.minimum(has[one], has[other]) / 2)
     median = apart[np.arange(len(one)), np.maximum(common - 1, 0) // 2]
-    same = enough & (median < _SAME * np.minimum(size[one], size[other]))
+    same = enough & (median < np.maximum(_SAME * np.minimum(size[one], size[other]), least[view[one]]))
     gone = np.zeros(len(groups), dtype=bool)
     for kept, twin in zip(one[same].tolist(), other[same].tolist(), strict=True):
         gone[twin] |= not gone[kept]

@@ -28,7 +28,7 @@ def test_a_name_is_no_markup(capsys, name):
 
 def test_a_bar_s_words_are_no_markup(monkeypatch):
     shown = []
-    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    monkeypatch.setattr("shapepose_fg.cli.terminal._is_terminal", lambda _: True)
     monkeypatch.setattr("rich.progress.Progress.start", lambda bar: shown.extend(bar.columns))
     with progress("looking through a[/b]"):
         (words, *_) = (each for each in shown if isinstance(each, TextColumn))

@@ -11,6 +11,7 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.camera_names import match_names
 from shapepose_fg.io.detections import read_detections
 
 LIMBS = BODY_25.limbs
@@ -238,14 +239,11 @@ def test_openpose_first_numbers_that_differ(openpose_folder, rig):
     assert len(whole) == 2 and "(left has 3, 7 to 9, right has 3, 8 to 10); the 2 that all have" in whole.notes[-1]
     # Frame 8 is the second of the left camera and the first of the right one.
     assert np.bincount(whole[0].view).tolist() == [0, 8] and np.bincount(whole[1].view).tolist() == [25]
-    refuses(
-        openpose_folder,
-        rig,
-        openpose_folder / "right",
-        "starts at frame 8, but",
-        "starts at frame 7; number the files",
-        own_frames=True,
+    every = read_detections(openpose_folder, rig, own_frames=True)
+    assert (
+        len(every) == 4 and "frame 0 is number 7 of the files (left has 3, 7 to 9, right has 3" in every.notes[-1]
     )
+    assert [np.bincount(frame.view, minlength=2).tolist() for frame in every] == [[8, 0], [0, 8], [25, 0], [0, 25]]
 
 
 def test_openpose_numbers_without_a_frame_in_common(openpose_folder, rig):
@@ -355,10 +353,10 @@ def test_shelf_against_a_plain_reading(shared_data):
         assert candidates == np.count_nonzero(detections.view == 3)
 
 
-def refuses(path: Path, rig, place: Path, *parts: str, **how) -> None:
+def refuses(path: Path, rig, place: Path, *parts: str) -> None:
     """Reading `path` gives one line that names `place` and holds `parts`."""
     with pytest.raises(InputError) as caught:
-        read_detections(path, rig, **how)
+        read_detections(path, rig)
     message = str(caught.value)
     assert message.startswith(f"{place}")
     assert "\n" not in message
@@ -387,3 +385,20 @@ def test_folders_of_unequal_length(shared_cases):
     rig = read_rig(shared_cases / "unequal" / "calibration.json")
     table = read_detections(shared_cases / "unequal" / "det", rig)
     assert len(table) == 11 and "the 11 that all have, 0 to 10, are used" in table.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "names", "expected"),
+    [
+        (["23087", "23088"], ["walk_Miqus_2_23088", "walk_Miqus_1_23087"], [1, 0]),
+        (["int_cam1", "int_cam2"], ["cam02", "cam01"], [1, 0]),
+        (["2022-09-19_synced_Cam1", "2022-09-19_synced_Cam2"], ["view_02", "view_01"], [1, 0]),
+        (["2025-04-23_camera_0", "2025-04-23_camera_1"], ["camera_0", "camera_1", "camera_2"], [0, 1]),
+        (["Left", "Right"], ["right_cam", "left_cam"], [1, 0]),
+        (["a1", "a2"], ["walk_3_x", "walk_4_x"], None),
+        (["left", "right"], ["front", "back"], None),
+        (["cam1", "cam2"], ["trial1", "trial2", "trial_1"], None),
+    ],
+)
+def test_cameras_are_told_by_parts_of_names(cameras, names, expected):
+    assert match_names(cameras, names) == expected

@@ -12,7 +12,9 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.compiled core.errors",
+    "factors core.arrays core.kept_kernels core.errors",
+    "core.compiling",
+    "core.compiled",
     "core.decompositions core.skeleton core.pieces core.assignment core.lens core.trajectory",
     "core.joint_names",
     "core.camera",
@@ -60,6 +62,7 @@ LEVELS = (
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
     " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live cli.calibrate cli.explain",
+    "cli.compile",
     "cli.main",
     "__main__",
 )

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -59,7 +60,8 @@ class FitterWeights:
         """Those that `shapepose-fg train-fitter` keeps for this body; where it has not run, the shipped ones."""
         shipped = FitterWeights.default()
         kept = adapted_file(model)
-        own = fingerprint(model) != shipped.body and kept.is_file()
+        # The user's cache may be closed to us: then `Path.is_file` raises.
+        own = fingerprint(model) != shipped.body and os.path.isfile(kept)  # noqa: PTH113
         return FitterWeights.load(kept) if own else shipped
 
     def spread_of(self, names: tuple[str, ...]) -> Array:

@@ -255,9 +255,13 @@ def write_together(
 
 
 def user_cache(what: str) -> Path:
-    """The folder of the user's cache for `what` this program keeps; below XDG_CACHE_HOME where that is set."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "shapepose-fg" / what
+    """The folder of the user's cache for `what` this program keeps; below XDG_CACHE_HOME where that is set.
+
+    It need not be there, nor writable: a container's user of any number has no home.
+    """
+    home = os.path.expanduser("~")  # noqa: PTH111
+    base = os.environ.get("XDG_CACHE_HOME") or f"{home if home != '~' else ''}/.cache"
+    return Path(base) / "shapepose-fg" / what
 
 
 def sweep(folder: Path, name: str | None = None) -> None:

@@ -1,0 +1,33 @@
+"""The command `compile`: everything that the first run would compile, ahead of it."""
+
+import time
+from importlib import import_module
+from pathlib import Path
+
+from shapepose_fg.cli.terminal import show
+from shapepose_fg.core.errors import InputError
+
+
+def compile_kernels() -> None:
+    """Compile for this machine what the first run would, for images of containers and for services.
+
+    It is kept below NUMBA_CACHE_DIR, or in the user's cache; with NUMBA_CPU_NAME=generic it fits other processors.
+    """
+    from shapepose_fg.core.compiled import KERNELS
+    from shapepose_fg.core.compiling import compile_beside
+    from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
+
+    start, package = time.perf_counter(), Path(__file__).parents[1]
+    if kept_folder() != wanted_folder():
+        raise InputError(f"{wanted_folder()}: cannot be written; set NUMBA_CACHE_DIR to a folder that can be")
+    for path in sorted(package.rglob("*.py")):
+        if "\nfrom shapepose_fg.core.compiled import" in path.read_text(encoding="utf-8"):
+            import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
+    missing = [each for each in KERNELS.values() if not each.is_kept]
+    compile_beside(missing)
+    for each in missing:  # what no other process could compile
+        each.load()
+    if lost := sum(not each.is_kept for each in KERNELS.values()):
+        raise InputError(f"{wanted_folder()}: {lost} functions could not be kept; check the space left there")
+    took = f"{len(missing)} functions compiled in {time.perf_counter() - start:.0f} s"
+    show(f"{took}, {len(KERNELS)} kept in {wanted_folder()}")

@@ -1,0 +1,141 @@
+"""Kernels compiled side by side by several processes, and what is said meanwhile."""
+
+import gc
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from pathlib import Path
+from threading import Timer
+from typing import Any
+
+from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
+
+_BYTES_S = 3000
+"""Bytes of Python's code that are compiled in a second, on a machine that is neither fast nor slow."""
+_WORTH_S = 3.0
+"""Less than this is compiled here, one after the other: a process takes a second to start."""
+_MOST = 8
+"""Number of processes: the longest kernel takes an eighth of all."""
+
+_tried = False
+"""Whether this process has compiled what was missing; what is missing then is compiled where it is called."""
+
+
+def compile_beside(kernels: Sequence[Any]) -> None:
+    """Compile these kernels, those that are not kept, by as many processes as there are cores; once a process.
+
+    Another process that does so is waited for.
+    """
+    global _tried
+    if _tried:
+        return
+    _tried = True
+    place = kept_folder()
+    with _alone():
+        missing = [each for each in kernels if not each.is_kept]
+        lasts_s = _work(missing) / _BYTES_S
+        count = min(_cores(), _MOST, len(missing)) if lasts_s > _WORTH_S and place is not None else 1
+        what = f"compiling {len(missing)} functions for this machine, about {max(lasts_s / count, 1):.0f} s"
+        if place != wanted_folder():
+            cure = "set NUMBA_CACHE_DIR to a folder that can be written"
+            what += f", at each start: {wanted_folder()} cannot be written; {cure}"
+        with saying(what):
+            if count > 1:
+                _share_out(missing, count)
+            else:
+                for each in missing:
+                    each.load()
+
+
+def _share_out(kernels: Sequence[Any], count: int) -> None:
+    """Compile by `count` processes: a module's kernels, which have parts in common, in one, unless it is large."""
+    modules: dict[str, list[Any]] = {}
+    for each in kernels:
+        modules.setdefault(each.py_func.__module__, []).append(each)
+    bound = _work(kernels) / count
+    shares: list[list[Any]] = [[] for _ in range(count)]
+    groups = [p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])]
+    for group in sorted(groups, key=_work, reverse=True):
+        min(shares, key=_work).extend(group)
+    # The same packages as here, whatever lies in the working folder.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)}
+    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()"]
+    started = list[subprocess.Popen[bytes]]()
+    try:
+        for share in shares:
+            words = command + [each.name for each in share]
+            quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+            started.append(subprocess.Popen(words, env=environment, **quiet))
+        for each in started:
+            each.wait()
+    except OSError as error:  # without processes kernels are compiled where they are called
+        logging.getLogger(__name__).debug("%r", error)
+    finally:
+        for each in started:
+            each.kill()
+            each.wait()
+
+
+def main() -> None:
+    """Compile the kernels that the command line names, as a process of `compile_beside`."""
+    global _tried
+    _tried = True
+    gc.disable()
+    for name in sys.argv[1:]:
+        module, _, function = name.partition(":")
+        getattr(import_module(module), function).load()
+
+
+@contextmanager
+def saying(what: str) -> Iterator[None]:
+    """Log `what` if the block takes a second: as a warning, which Python shows where no logs are set up."""
+    timer = Timer(1.0, logging.getLogger(__name__).warning, [what])
+    timer.daemon = True
+    if what:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Wait until no other process compiles."""
+    from filelock import FileLock
+
+    place = kept_folder()
+    lock = None if place is None else FileLock(place / "compiling.lock")
+    waiting = saying("waiting for another process that compiles functions for this machine")
+    with waiting, suppress(OSError, NotImplementedError):  # file systems that have no locks, or are full
+        if lock is not None:
+            lock.acquire()
+    try:
+        yield
+    finally:
+        if lock is not None:
+            lock.release()
+
+
+def _work(kernels: Sequence[Any]) -> int:
+    """Bytes of Python's code that are compiled for kernels: how long that takes."""
+    return sum(len(each.__code__.co_code) for kernel in kernels for each in _pieces(kernel.py_func))
+
+
+def _pieces(function: Any) -> set[Any]:
+    """A function and all kernels and parts that it calls, or these do."""
+    known, waiting = {function}, [function]
+    while waiting:
+        one = waiting.pop()
+        called = (getattr(one.__globals__.get(name), "py_func", None) for name in one.__code__.co_names)
+        waiting += (new := [each for each in called if each is not None and each not in known])
+        known.update(new)
+    return known
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,136 @@
+"""Where compiled functions are kept between runs.
+
+Numba keeps compiled functions beside their source, as long as that file is the same. Here each module with kernels
+has a folder, named by a digest of its source and of all sources that its kernels call into, and Numba is shown the
+copy of the source in there. What is kept is therefore never stale, and all installations of a user share it.
+"""
+
+import atexit
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+import uuid
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import numba
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+
+_GIVEN = "SHAPEPOSE_FG_KERNELS"
+"""Environment variable that names a process's temporary folder to the processes that it starts."""
+_SPACE = 50_000_000
+"""Free bytes that are needed: ten times what all kernels take."""
+_VERSIONS = 16
+"""Number of folders that are kept of a module: for several checkouts, Python versions, processors."""
+
+
+def wanted_folder() -> Path:
+    """Where compiled functions belong: below NUMBA_CACHE_DIR, or in the user's cache."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(given).absolute() / "shapepose-fg"
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    return Path(base).absolute() / "shapepose-fg" / "kernels"
+
+
+@cache
+def kept_folder() -> Path | None:
+    """Where compiled functions are kept: where they belong; where that cannot be written, in a temporary folder of
+    this process and of those that it starts; None where nothing can be written.
+    """
+    wanted = wanted_folder()
+    if given := os.environ.get(_GIVEN):
+        return Path(given)
+    if _can_keep(wanted):
+        return wanted
+    try:
+        temporary, owner = Path(tempfile.mkdtemp(prefix="shapepose-fg-kernels-")), os.getpid()
+        atexit.register(lambda: os.getpid() != owner or shutil.rmtree(temporary, ignore_errors=True))
+        if _can_keep(temporary):
+            os.environ[_GIVEN] = str(temporary)
+            return temporary
+    except OSError:
+        pass
+    return wanted if os.path.isdir(wanted) else None  # noqa: PTH112
+
+
+def _can_keep(place: Path) -> bool:
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=place).close()
+        return shutil.disk_usage(place).free > _SPACE
+    except OSError:
+        return False
+
+
+@cache
+def module_folder(module: str) -> Path | None:
+    """The folder of a module's kernels, with a copy of its source; None where nothing can be written."""
+    place, source = kept_folder(), Path(sys.modules[module].__file__ or "")
+    if place is None:
+        return None
+    folder = place / f"{module}-{_digest(module)}"
+    if folder.exists():
+        return folder
+    fresh, elsewhere = place / f"{uuid.uuid4()}", wanted_folder() / folder.name
+    try:
+        if elsewhere.exists():  # it can be read, but not written
+            shutil.copytree(elsewhere, fresh, copy_function=os.symlink)
+        else:
+            fresh.mkdir()
+            (fresh / source.name).write_bytes(source.read_bytes())
+            os.utime(fresh / source.name, (0, 0))  # older versions of Numba look at the time, not at the content
+        if not folder.exists():
+            fresh.rename(folder)
+        _remove_old(place, module)
+    except OSError:
+        return folder if folder.exists() else None
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+def _remove_old(place: Path, module: str) -> None:
+    by_age = sorted(place.glob(f"{module}-*"), key=lambda each: each.stat().st_mtime, reverse=True)
+    for each in by_age[_VERSIONS:]:
+        shutil.rmtree(each, ignore_errors=True)
+
+
+def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
+    """`njit(function)` for a function whose source is the copy in `folder`, which Numba's cache is then beside."""
+    code = function.__code__.replace(co_filename=str(folder / Path(function.__code__.co_filename).name))
+    copy = FunctionType(code, function.__globals__, function.__name__, function.__defaults__)
+    copy.__qualname__ = function.__qualname__
+    given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, ""
+    try:
+        return njit(copy)
+    finally:
+        numba.config.CACHE_DIR = given
+
+
+@cache
+def _digest(module: str) -> str:
+    """Of the sources that a module's kernels are compiled from, of Numba, Python and the processor."""
+    config = numba.config
+    features = config.CPU_FEATURES if config.CPU_FEATURES is not None else get_host_cpu_features().flatten()
+    host = (numba.__version__, sys.implementation.cache_tag, config.CPU_NAME or get_host_cpu_name(), features)
+    state = hashlib.sha256(repr(host).encode())
+    for content in sorted(Path(each).read_bytes() for each in {_OPTIONS, *_sources(module)}):
+        state.update(content)
+    return state.hexdigest()[:16]
+
+
+_OPTIONS = str(Path(__file__).with_name("compiled.py"))
+"""File that has the options of all kernels."""
+
+
+@cache
+def _sources(module: str) -> frozenset[str]:
+    """Files of a module and of all modules that its kernels and parts are from."""
+    inside = (getattr(each, "py_func", None) for each in vars(sys.modules[module]).values())
+    others = {each.__module__ for each in inside if each is not None} - {module}
+    return frozenset({str(sys.modules[module].__file__)}).union(*map(_sources, others))
