@@ -76,6 +76,8 @@ def test_cameras_without_a_pose_are_named(tmp_path):
     file.write_text("\n".join(lines) + "\n" + file.read_text())
     rig = read_rig(file)
     assert rig.names == ("cam_0", "cam_1") and rig.notes == (f"{file}: camera cam_2 is left out: it has no pose",)
+    form, there = write_like(file, rig, tmp_path / "new.toml")
+    assert form == "Pose2Sim's TOML" and read_rig(there).names == rig.names and "[cam_2]" in there.read_text()
 
 
 def test_freemocap_and_caliscope_of_several_versions(shared_cases):
