@@ -18,6 +18,8 @@ _FREEMOCAP, _SLEAP = "FreeMoCap's 2D points", "SLEAP's analysis HDF5"
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
+_SMALL_BYTES, _MOST_PACKED = 2**27, 50
+"""Bytes of an array of a packed file, small or at the most so many times the file: columns of NaN pack well."""
 _MOST_NAMES = 1000
 _BLAZEPOSE = 33
 """MediaPipe's points of the body come first; hands and face follow."""
@@ -154,7 +156,7 @@ def _text(value: Any) -> str:
 
 def _ordered(path: Path, dataset: Any, wanted: tuple[str, ...], usual: tuple[str, ...]) -> Array:
     """All of a dataset, with its axes in the order that is wanted; they are as it says, or as `usual`."""
-    if dataset.size > _MOST_VALUES:
+    if 8 * dataset.size > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size):
         raise InputError(f"{path}: {dataset.shape} are too many numbers; export a part of the recording")
     axes = usual
     if "dims" in dataset.attrs:
