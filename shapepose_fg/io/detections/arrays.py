@@ -1,6 +1,5 @@
 """People in arrays: FreeMoCap's NumPy file of all cameras, SLEAP's analysis HDF5 of each; never a pickle."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,9 @@ _MOST_VALUES = 2**29
 """Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
 _SMALL_BYTES, _MOST_PACKED = 2**27, 50
 """Bytes of an array of a packed file, small or at the most so many times the file: columns of NaN pack well."""
-_MOST_NAMES = 1000
+_MOST_NAMES, _LONGEST_NAME = 1000, 1000
+_RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
+"""How HDF5 keeps a text of any length: how long it is, and where."""
 _BLAZEPOSE = 33
 """MediaPipe's points of the body come first; hands and face follow."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -112,13 +113,14 @@ def read_sleap(path: Path) -> CameraPeople:
             names = _dataset(h5py, file, "node_names")
             if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
                 raise InputError(f"{path}: {what_it_is(path)}")
-            joints = tuple(_text(each) for each in names[:])
-            xy = _ordered(path, tracks, ("frame", "track", "node", "xy"), ("track", "xy", "node", "frame"))
-            scores = _dataset(h5py, file, "point_scores")
-            if scores is not None and scores.ndim == 3:
-                score = _ordered(path, scores, ("frame", "track", "node"), ("track", "node", "frame"))
-            else:
-                score = np.ones(xy.shape[:3])
+            joints = _names(path, names)
+            xy, score = _numbers(path, tracks), None
+            if (scores := _dataset(h5py, file, "point_scores")) is not None and scores.ndim == 3:
+                score = _numbers(path, scores)
+            occupancy = _dataset(h5py, file, "track_occupancy")
+            if not _frames_first(xy.shape, len(joints), None if occupancy is None else occupancy.shape):
+                xy, score = xy.transpose(3, 0, 2, 1), None if score is None else score.transpose(2, 0, 1)
+            score = np.ones(xy.shape[:3]) if score is None else score
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeError) as error:
         if isinstance(error, InputError):
             raise
@@ -150,19 +152,31 @@ def _dataset(h5py: Any, file: Any, name: str) -> Any:
     return found
 
 
-def _text(value: Any) -> str:
-    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+def _names(path: Path, names: Any) -> tuple[str, ...]:
+    """The texts of a dataset (N,). They are short: a damaged length of one would take all memory."""
+    short = names.dtype.kind == "S" and names.dtype.itemsize <= _LONGEST_NAME
+    if names.dtype.kind == "O" and names.chunks is None and (begin := names.id.get_offset()) is not None:
+        with open_regular(path) as stream:
+            stream.seek(begin)
+            records = np.frombuffer(stream.read(len(names) * _RECORD.itemsize), dtype=_RECORD)
+        short = len(records) == len(names) and bool((records["length"] <= _LONGEST_NAME).all())
+    if not short:
+        raise InputError(f"{path}: node_names are no short texts; export it again with SLEAP")
+    return tuple(each.decode("utf-8") for each in names[:])
 
 
-def _ordered(path: Path, dataset: Any, wanted: tuple[str, ...], usual: tuple[str, ...]) -> Array:
-    """All of a dataset, with its axes in the order that is wanted; they are as it says, or as `usual`."""
-    if 8 * dataset.size > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size):
+def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...] | None) -> bool:
+    """Whether `tracks` are (frames, tracks, nodes, 2), sleap-io's standard, and not as MATLAB reads them:
+    (tracks, 2, nodes, frames). `occupancy` are (frames, tracks) in both.
+    """
+    standard, matlab = tracks[2:] == (nodes, 2), tracks[1:3] == (2, nodes)
+    if standard and matlab and occupancy is not None:
+        return occupancy != (tracks[3], tracks[0])
+    return standard and not matlab
+
+
+def _numbers(path: Path, dataset: Any) -> Array:
+    """All of a dataset."""
+    if 8 * dataset.size > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size) or dataset.dtype.kind not in "fiu":
         raise InputError(f"{path}: {dataset.shape} are too many numbers; export a part of the recording")
-    axes = usual
-    if "dims" in dataset.attrs:
-        said = json.loads(_text(dataset.attrs["dims"])[:1000])
-        if not isinstance(said, list) or sorted(map(str, said)) != sorted(usual):
-            raise InputError(f"{path}: its dims are {str(said)[:80]}, not {' '.join(usual)}; export it again")
-        axes = tuple(said)
-    values = np.asarray(dataset[:], dtype=np.float64)
-    return values.transpose([axes.index(axis) for axis in wanted])
+    return np.asarray(dataset[:], dtype=np.float64)
