@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -19,7 +19,7 @@ _MOST_VALUES = 2**29
 """Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
 _SMALL_BYTES, _MOST_PACKED = 2**27, 50
 """Bytes of an array of a packed file, small or at the most so many times the file: columns of NaN pack well."""
-_MOST_NAMES, _LONGEST_NAME = 1000, 1000
+_MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
 """How HDF5 keeps a text of any length: how long it is, and where."""
 _BLAZEPOSE = 33
@@ -121,7 +121,7 @@ def read_sleap(path: Path) -> CameraPeople:
             if not _frames_first(xy.shape, len(joints), None if occupancy is None else occupancy.shape):
                 xy, score = xy.transpose(3, 0, 2, 1), None if score is None else score.transpose(2, 0, 1)
             score = np.ones(xy.shape[:3]) if score is None else score
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again") from None
@@ -153,16 +153,32 @@ def _dataset(h5py: Any, file: Any, name: str) -> Any:
 
 
 def _names(path: Path, names: Any) -> tuple[str, ...]:
-    """The texts of a dataset (N,). They are short: a damaged length of one would take all memory."""
-    short = names.dtype.kind == "S" and names.dtype.itemsize <= _LONGEST_NAME
-    if names.dtype.kind == "O" and names.chunks is None and (begin := names.id.get_offset()) is not None:
-        with open_regular(path) as stream:
-            stream.seek(begin)
-            records = np.frombuffer(stream.read(len(names) * _RECORD.itemsize), dtype=_RECORD)
-        short = len(records) == len(names) and bool((records["length"] <= _LONGEST_NAME).all())
-    if not short:
-        raise InputError(f"{path}: node_names are no short texts; export it again with SLEAP")
-    return tuple(each.decode("utf-8") for each in names[:])
+    """The texts of a dataset (N,). Those of any length are read here: libhdf5 trusts damaged lengths."""
+    if names.dtype.kind == "S" and names.dtype.itemsize <= _LONGEST_NAME:
+        return tuple(each.decode("utf-8") for each in names[:])
+    begin = names.id.get_offset() if names.dtype.kind == "O" and names.chunks is None else None
+    if begin is None:
+        raise InputError(f"{path}: node_names are no plain texts; export it again with SLEAP")
+    with open_regular(path) as stream:
+        stream.seek(begin)
+        records = np.frombuffer(stream.read(len(names) * _RECORD.itemsize), dtype=_RECORD)
+        return tuple(_from_heap(stream, *map(int, record)).decode("utf-8") for record in records.tolist())
+
+
+def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes:
+    """A text from one of HDF5's global heaps; ValueError where it is not there."""
+    stream.seek(address)
+    head = stream.read(16)
+    size = int.from_bytes(head[8:], "little")
+    if head[:4] != b"GCOL" or not 16 <= size <= _LARGEST_HEAP or length > _LONGEST_NAME:
+        raise ValueError("a text is not where it should be")
+    heap, at = stream.read(size - 16), 0
+    while at + 16 <= len(heap):
+        number, begin = int.from_bytes(heap[at : at + 2], "little"), at + 16
+        if number == index:
+            return heap[begin : begin + length]
+        at = begin + -(-int.from_bytes(heap[at + 8 : begin], "little") // 8) * 8
+    raise ValueError("a text is not in its heap")
 
 
 def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...] | None) -> bool:
