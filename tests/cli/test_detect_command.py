@@ -132,6 +132,7 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     assert "there are detections already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_project_is_detected_in_and_goes_on_as_a_project(kitchen, capsys, monkeypatch):
     """Cameras, videos and places come from it; the next line is the project's, quoted, from any folder."""
     rig, project = read_rig("calibration.json"), kitchen / "my walk"
@@ -231,6 +232,7 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     assert ((nose - np.minimum(right, left) > 1.1) & (nose - np.minimum(right, left) < 1.8)).all()
 
 
+@pytest.mark.slow
 def test_four_people_around_a_pizza(shared_data, network, tmp_path):
     """CMU Panoptic's demo: five letterboxed pictures of one moment. At least three of four, and nobody else."""
     data = shared_data / "panoptic_pizza"
