@@ -215,3 +215,10 @@ def test_files_of_which_some_frames_are_common(scene, once, tmp_path, lead, end)
     for frame in range(len(table)):
         for name in COLUMNS:
             np.testing.assert_array_equal(getattr(table[frame], name), getattr(everything[lead + frame], name))
+    every = read_detections(tmp_path / "whole", scene.rig, own_frames=True)
+    assert len(every) == FRAMES
+    for frame in range(FRAMES):
+        one = everything[frame]
+        there = one if lead <= frame < FRAMES - end else one.only(one.view == 0)
+        for name in COLUMNS:
+            np.testing.assert_array_equal(getattr(every[frame], name), getattr(there, name))
