@@ -9,12 +9,15 @@ import pytest
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.joint_names import keypoint_names
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, SKELETONS
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+from shapepose_fg.pipeline.pipeline import reconstruct
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
 
@@ -322,3 +325,37 @@ def test_openpose_s_body_25b_is_recognised(shared_cases):
 def test_real_recordings_are_what_they_are(shared_data, folder, name):
     rig = read_rig(shared_data / folder.split("/")[0] / "rig.json")
     assert read_detections(shared_data / folder, rig).skeleton.name == name
+
+
+def test_names_are_text_of_strangers(tmp_path, rig):
+    """Names do not reach the terminal as they are, nor take long."""
+    names = [*keypoint_names(COCO_17), "\x1b[31mred\nline", "(" * 200_000, "left_" * 50_000]
+    table = read_detections(written(tmp_path, data_set(names, 20)), rig)
+    said = " ".join(table.notes)
+    assert said.isprintable() and len(said) < 2000 and table.skeleton.joints == COCO_17.joints
+    table = read_detections(written(tmp_path, video({"dataset_name": "\x1b" * 5000}, 17)), rig)
+    assert " ".join(table.notes).isprintable()
+
+
+def median_error_m(people, joints: np.ndarray, names: list[str]) -> float:
+    """Median over joints and frames of the distance to one person's (T, K, 3) joints, of who is nearest."""
+    shared = [name for name in people.joint_names.tolist() if name in names and name not in ("Neck", "Head")]
+    found = people.joints[:, [people.joint_names.tolist().index(name) for name in shared]]
+    wanted = joints[people.frame][:, [names.index(name) for name in shared]]
+    apart = np.linalg.norm(found - wanted, axis=2)
+    return min(float(np.nanmedian(apart[people.person == each])) for each in np.unique(people.person))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["body25b/detections", "h36m_coco/detections_end_to_end"])
+def test_real_people_are_where_pose2sim_has_them(shared_cases, folder):
+    """Pose2Sim's own result of the same detections: 24 mm away, 500 mm with joints of other names."""
+    rows = (shared_cases / "body25b" / "demo_0-100.trc").read_text().split("\n")
+    names = [name for name in rows[3].split("\t")[2:] if name.strip()]
+    values = [[float(value or "nan") for value in row.split("\t")[2:]] for row in rows[5:] if row.strip()]
+    truth = np.array([row[: 3 * len(names)] for row in values]).reshape(len(values), -1, 3)[..., [2, 0, 1]]
+    rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
+    detections = read_detections(shared_cases / folder, rig)
+    frames = Recording(detections.skeleton, [detections[t] for t in range(40)])
+    people = reconstruct(frames, rig, times=FrameTimes.from_fps(60, 40))
+    assert median_error_m(people, truth, names) < 0.06

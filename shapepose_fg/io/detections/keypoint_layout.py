@@ -41,7 +41,11 @@ def skeleton_of_people(
         return wanted, []
     if named is not None:
         skeleton, who, passed = named
-        over = [f"joints that the body does not have are passed over: {listing(passed)}"] if passed else []
+        over = (
+            [f"joints that the body does not have are passed over: {listing([_shown(each) for each in passed])}"]
+            if passed
+            else []
+        )
         return skeleton, [f"joints are those of {skeleton.name}: {who}", *over]
     if declared is not None:
         found, what = _declared(declared, count)
@@ -176,11 +180,11 @@ def _called(
         layouts = layouts_called(joints)
         fit = [each for each in layouts if each.keypoint_count == count]
         if fit:
-            return (fit[0], []), f"{source} says {joints[:40]}"
+            return (fit[0], []), f"{source} says {_shown(joints)}"
         has = f"have {layouts[0].keypoint_count} keypoints, not {count}" if layouts else "are not known here"
-        return None, f"{source} says {joints[:40]}, which {has}"
+        return None, f"{source} says {_shown(joints)}, which {has}"
     if not any(body_points(joints)):
-        return None, f"{source} names joints that are not known here, such as {joints[0][:40]!r}"
+        return None, f"{source} names joints that are not known here, such as {_shown(joints[0])}"
     if len(joints) != count:
         raise InputError(
             f"{source} names {len(joints)} joints, and its people have {count} keypoints; correct the names, or"
@@ -190,3 +194,8 @@ def _called(
         return skeleton_of_names(joints), f"{source} names its joints"
     except ValueError as error:
         raise InputError(f"{source} names joints, but {str(error).partition(': ')[2]}; {_CURE}") from None
+
+
+def _shown(name: str) -> str:
+    """A name of another program, for a line of text."""
+    return name[:40] if name.isprintable() and name else repr(name[:40])
