@@ -155,7 +155,7 @@ class Tracker:
         step_s = float(given.time_s.mean()) - tracks.time_s
         joints, _ = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)
         held = with_sides_held(given.detections, joints.position, joints.sigma_m, given.rig, self.skeleton)
-        return replace(given, detections=held)
+        return given if held is given.detections else replace(given, detections=held)
 
     @cached_property
     def _bones(self) -> Bones:
