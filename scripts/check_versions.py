@@ -54,7 +54,8 @@ def tried(python: str, which: str, place: Path, tests: list[str]) -> str:
     def run(*command: object, cwd: Path = place) -> str:
         words = [str(each) for each in command]
         done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
-        last = (done.stdout + done.stderr).strip().splitlines()[-25:]
+        lines = (done.stdout + done.stderr).strip().splitlines()
+        last = [each for each in lines if not each.startswith("WARNING")][-25:]
         if done.returncode != 0:
             raise RuntimeError("\n".join([f"failed: {' '.join(words[:8])}", *last]))
         return last[-1] if last else ""

@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("detect", "export", "view", "archive", "photos", "cluster", "ros", "train")
+EXTRAS = ("detect", "export", "view", "archive", "photos", "cluster", "ros", "hdf5", "train")
 HEAD = """# Licences of what is installed with it
 
 `pip install shapepose-fg` brings the first list, its extras the second, named as each package's own metadata do.

@@ -60,8 +60,11 @@ class Synchronised:
 
     def at(self, time_s: Array | float) -> Array:
         """(..., V) the times on the common clock of times (...,) on each camera's own."""
-        time = np.asarray(time_s)[..., None]
-        return np.asarray(time + self.offset_s + self.drift * (time - self.middle_s))
+        return self.of_views(np.asarray(time_s)[..., None])
+
+    def of_views(self, time_s: Array) -> Array:
+        """(..., V) the times on the common clock of times (..., V), each on its camera's own."""
+        return np.asarray(time_s + self.offset_s + self.drift * (time_s - self.middle_s))
 
     def as_dict(self, rig: Rig) -> dict[str, Any]:
         """All figures, as plain values; null for a sigma that is not known."""

@@ -105,6 +105,7 @@ def calibrate(
     from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
     from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.calibration import write_rig
+    from shapepose_fg.io.recording import own_times
     from shapepose_fg.io.timestamps import write_timestamps
 
     if stature is not None and not 0.5 <= stature <= 2.5:
@@ -131,7 +132,7 @@ def calibrate(
     note(*found.notes)
     write_rig(found.rig, output)
     if times is not None and clocks is not None:
-        write_timestamps(times, rig.names, known.of_views(len(rig)) + clocks.offset_s)
+        write_timestamps(times, rig.names, clocks.of_views(own_times(recording, known, len(rig))))
     heads, rows = _figures(found, focal)
     lines = [_CAPTION, *_world(found, stature, distance or [])]
     if report is not None:

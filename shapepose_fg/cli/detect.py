@@ -101,7 +101,7 @@ def detect(
     if pictures.videos is None or output is None:
         missing = "--videos, the cameras' videos or pictures" if pictures.videos is None else "--output, a folder"
         raise InputError(f"what to read or where to write is missing; give {missing}")
-    from shapepose_fg.core.moments import align
+    from shapepose_fg.core.moments import align, own_frames
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
     from shapepose_fg.io.footage.placement import placements_of
@@ -114,7 +114,10 @@ def detect(
     rig = known or pictures_only(list(sizes), list(sizes.values()))
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     note(*concluded)
-    moments = align(*clocks_of(footage, clock.fps or [], clock.start or [], rig.names))
+    clocks = clocks_of(footage, clock.fps or [], clock.start or [], rig.names)
+    # Pictures of one number belong together; when videos began is known only where somebody says it.
+    timed = clock.start is not None or all(each.path.is_dir() for each in footage)
+    moments = align(*clocks) if timed else own_frames(*clocks)
     span = frame_range(clock.frames, len(moments))
     time_s = None if moments.time_s is None else moments.time_s[span]
     moments = replace(moments, picture=moments.picture[span], time_s=time_s)

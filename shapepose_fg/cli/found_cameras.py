@@ -11,6 +11,7 @@ from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.synchronisation import Synchronised
+    from shapepose_fg.core.arrays import Array
     from shapepose_fg.core.camera import Rig
     from shapepose_fg.io.detections.people import DeclaredJoints
 
@@ -27,21 +28,28 @@ def found_clocks(
     detections: Path,
     rig: "Rig",
     skeleton: "str | Path | DeclaredJoints | None",
-    fps: float,
+    fps: float | None,
     most: float,
     frames: str | None = None,
-) -> "tuple[Synchronised, int]":
-    """When cameras at known poses began, up to `most` seconds apart, and how many frames the longest has."""
+) -> "tuple[Synchronised, Array]":
+    """When cameras at known poses began, up to `most` seconds apart, and (T, V) when each took its frames, seconds
+    on a common clock; NaN for frames that it does not have.
+
+    Their rate is `fps`, without it that of times.csv beside; InputError where nothing says it.
+    """
     from shapepose_fg.calibration.synchronisation import synchronise
-    from shapepose_fg.core.storage.kept_arrays import InFolder
-    from shapepose_fg.io.detections import read_detections
+    from shapepose_fg.core.frame_times import rate_of
+    from shapepose_fg.io.recording import own_times, read_recording
 
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording = read_detections(detections, rig, skeleton, InFolder(Path(folder)), True)
+        recording, times = read_recording(detections, rig, skeleton, Path(folder), fps, own_frames=True)
         note(*recording.notes)
+        if times is None or len(times) < 2:
+            raise InputError("--fps: missing; say how many frames a second the cameras took")
         span = frame_range(frames, len(recording), recording.first)
         with progress("comparing", "pairs") as done:
-            return synchronise(recording, rig, fps, span, most, progress=done), len(recording)
+            found = synchronise(recording, rig, fps or rate_of(times.frame_s), span, most, progress=done)
+        return found, found.of_views(own_times(recording, times, len(rig)))
 
 
 def check_most(most: float) -> None:

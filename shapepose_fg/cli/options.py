@@ -219,8 +219,9 @@ class Located(DetectionOptions):
 
     def given(self) -> dict[str, object]:
         """The same for the next command, but for the calibration and what is said of it."""
-        place = {"--detections": self.detections} if self.source is None else {"--project": self.source.folder}
-        return place | {"--skeleton": self.skeleton}
+        if self.source is None:
+            return {"--detections": self.detections, "--skeleton": self.skeleton}
+        return {"--project": self.source.folder, "--skeleton": self.skeleton}
 
 
 @dataclass(frozen=True, kw_only=True)

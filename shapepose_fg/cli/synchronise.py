@@ -4,7 +4,6 @@ import json
 import shlex
 from pathlib import Path
 
-import numpy as np
 import typer
 
 from shapepose_fg.cli.found_cameras import MOST_S, check_most, found_clocks, show_clocks
@@ -20,13 +19,12 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import InputError
 
 
 @grouped
 def synchronise(
     given: ProjectOptions,
-    fps: float | None = option(TIME, "Frames a second of all cameras; needed."),
+    fps: float | None = option(TIME, "Frames a second of all cameras; needed where no times.csv says it."),
     most: float = option(TIME, "Largest offset that is looked for, seconds.", MOST_S),
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "File for the times of all frames, as --timestamps takes it."),
@@ -40,15 +38,13 @@ def synchronise(
 
     seen = given.located()
     fps = seen.source.fps if fps is None and seen.source is not None else fps
-    if fps is None:
-        raise InputError("--fps: missing; say how many frames a second the cameras took")
     check_fps(fps)
     check_most(most)
     rig = seen.still_rig("synchronise")
-    found, count = found_clocks(seen.detections, rig, seen.joints, fps, most, frames)
+    found, taken_s = found_clocks(seen.detections, rig, seen.joints, fps, most, frames)
     problems = found.undetermined(rig)
     if output is not None and not problems:
-        write_timestamps(output, rig.names, found.at(np.arange(count) / fps))
+        write_timestamps(output, rig.names, taken_s)
     if as_json:
         print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
     else:
@@ -67,5 +63,5 @@ def synchronise(
             options = seen.given() | seen.said() | {"--timestamps": output}
             calibration = {"--calibration": seen.calibration, "--output": "results"}
             options = options if given.project is not None else calibration | options
-            print(f"{output}: times of {count} frames")
+            print(f"{output}: times of {len(taken_s)} frames")
             print(next_reconstruct(options))

@@ -41,6 +41,8 @@ def layouts_called(name: str) -> list[Skeleton]:
     ]
 
 
+_LONGEST = 64
+"""Characters of a name that are looked at; no joint has a longer one."""
 _SIDED = {
     "Shoulder": "shoulder sho",
     "Elbow": "elbow elb",
@@ -101,7 +103,8 @@ def body_points(names: Sequence[str]) -> list[str]:
     and another alone, the others tell: a foot is the ankle where no ankle is named, and a head the top of the head
     where no top is.
     """
-    every = [_words(re.sub(r"\(.*?\)", "", name) or name) for name in names]
+    short = (name[:_LONGEST] for name in names)
+    every = [_words(re.sub(r"\(.*?\)", "", name) or name) for name in short]
     while len(every) > 1 and min(map(len, every)) > 1 and len({words[0] for words in every}) == 1:
         if every[0][0] in _SIDES:
             break

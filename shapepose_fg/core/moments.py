@@ -33,7 +33,8 @@ class Moments:
     picture: Index
     """(T, V) place of each camera's frame; -1 where it has none within half a frame."""
     time_s: Array | None
-    """(T, V) when those frames were taken, seconds; the moment where there is none. None without a clock."""
+    """(T, V) when those frames were taken, seconds; where there is none, the moment, or NaN where it is not known
+    when cameras began. None without a clock."""
     notes: tuple[str, ...]
     """What was left out, and how far pictures of one moment are apart."""
 
@@ -91,6 +92,34 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
         taken = [np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment) for v, each in enumerate(clocks)]
         time_s = np.column_stack(taken)
     return Moments(picture, time_s, tuple(notes))
+
+
+def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
+    """Every camera's pictures under numbers of its own, because it is not known when cameras began.
+
+    Only pictures between those of the slowest camera are left out: frame t of a camera is the picture nearest to t
+    of its periods after the camera's own first.
+    """
+    slowest = max(each.period for each in clocks)
+    places = []
+    for each in clocks:
+        place = np.arange(len(each.time))
+        if each.period < slowest * (1 - _SAME_RATE):
+            grid = np.arange(each.time[0], each.time[-1] + each.period / 2, slowest)
+            place = _nearest(each, grid)[0]
+        places.append(place)
+    count = max(map(len, places))
+    picture = np.column_stack([np.pad(place, (0, count - len(place)), constant_values=-1) for place in places])
+    time_s = None
+    if has_clock:
+        taken = [np.where(own >= 0, each.time[own], np.nan) for own, each in zip(picture.T, clocks, strict=True)]
+        time_s = np.column_stack(taken)
+    least = min(map(len, places))
+    notes = (
+        f"cameras have {least} to {count} frames; all are detected, under each camera's own numbers. When cameras"
+        " began is said by --start, or found by `calibrate --times`, or of known poses by `synchronise`",
+    )
+    return Moments(picture, time_s, notes if least < count else ())
 
 
 def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:

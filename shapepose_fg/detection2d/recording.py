@@ -164,7 +164,7 @@ def _write_times(run: DetectionRun) -> None:
         return
     names = [each.camera.name for each in run.cameras]
     apart = not run.moments.synchronised and nameable(names)
-    write_timestamps(file, names, time_s if apart else time_s.mean(axis=1))
+    write_timestamps(file, names, time_s if apart else np.nanmean(time_s, axis=1))
 
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:

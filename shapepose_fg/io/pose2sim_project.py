@@ -161,7 +161,7 @@ def _joints_of_tree(tree: Any) -> dict[int, str]:
             continue
         children, place, name = each.get("children"), each.get("id"), each.get("name")
         waiting += children if isinstance(children, list) else []
-        place = int(place) if isinstance(place, str) and place.isdecimal() else place
+        place = int(place) if isinstance(place, str) and place.isdecimal() and len(place) < 6 else place
         if type(place) is int and 0 <= place < _MOST_KEYPOINTS and isinstance(name, str):
             names[place] = name
     return names

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -17,7 +17,7 @@ from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.detections.view_streams import in_moments
-from shapepose_fg.io.timestamps import read_timestamps
+from shapepose_fg.io.timestamps import read_own_times, read_timestamps
 
 _MOST_BYTES = 2**28
 TIMES = "times.csv"
@@ -44,8 +44,8 @@ def read_recording(
     """What the cameras saw, in the empty folder `kept`, and the times of its frames; None where nothing says them.
 
     `timestamps` is a file that `read_timestamps` reads, times.csv beside the detections by default. Cameras that
-    began at other times, or run at other rates, are put together by it: frames are moments then. Cameras may have
-    taken different numbers of frames if `own_frames`.
+    began at other times, or run at other rates, are put together by it: frames are moments then. With `own_frames`
+    it is not known when cameras began: frames are each camera's own, and all are kept.
     InputError, one sentence that names file, place and cure.
     """
     file = times_beside(detections, fps, timestamps)
@@ -55,12 +55,26 @@ def read_recording(
     count = len(recording)
     if file is None:
         return recording, None if fps is None else FrameTimes.from_fps(fps, count)
+    if own_frames:
+        times, there = read_own_times(file, rig, count)
+        return recording if there.all() else replace(recording, picture=_own(there)), times
     times, moments = read_timestamps(file, rig, count)
     if moments is None:
         return recording, times
     together = in_moments(recording, moments.picture, InFolder(kept / "moments"))
     what = f"{file}: pictures of the same times are put together: {len(moments)} frames"
     return replace(together, notes=(*recording.notes, what, *moments.notes)), times
+
+
+def own_times(recording: DetectionTable, times: FrameTimes, views: int) -> Array:
+    """(T, V) when each camera took its own frames, on its own clock; NaN for frames that it does not have."""
+    own = times.of_views(views)
+    return own if recording.picture is None else np.where(recording.picture >= 0, own, np.nan)
+
+
+def _own(there: Mask) -> Index:
+    """(T, V) the frame itself where a camera has it, else -1."""
+    return np.where(there, np.arange(len(there))[:, None], -1)
 
 
 def write_moments(file: Path, rig: Rig, picture: Index) -> None:

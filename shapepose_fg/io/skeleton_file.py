@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.skeleton import MID_HIP, SKELETONS, Skeleton
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.validation import validated
@@ -33,16 +34,19 @@ class _File(BaseModel):
 
 
 def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
-    """A skeleton, by itself, its name in `SKELETONS`, or the file that describes it."""
+    """A skeleton, by itself, its name (`joint_names.layouts_called`), or the file that describes it."""
     if wanted is None or isinstance(wanted, Skeleton):
         return wanted
     name = str(wanted)
     if name in SKELETONS:
         return SKELETONS[name]
     if not Path(name).is_file():
-        raise InputError(
-            f"{name}: neither a file nor a known skeleton; give a TOML file, or one of {' '.join(SKELETONS)}"
-        )
+        called = layouts_called(name)
+        if len(called) == 1:
+            return called[0]
+        names = " ".join(each.name for each in called) or " ".join(SKELETONS)
+        what = "several skeletons are called so; give" if called else "neither a file nor a known skeleton; give"
+        raise InputError(f"{name}: {what} {'one of' if called else 'a TOML file, or one of'} {names}")
     return read_skeleton(name)
 
 

@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -36,6 +36,49 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
     that names file, line and cure.
     """
     path = Path(path)
+    time_s, clocks = _times(path, rig, frames)
+    if len(clocks) == 1:
+        return FrameTimes(time_s[:, 0], source=str(path)), None
+    slowest = max(clock.period for clock in clocks)
+    if np.isfinite(time_s).all() and (np.ptp(time_s, axis=1) <= slowest).all():
+        return FrameTimes(time_s, source=str(path)), None
+    try:
+        found = align(clocks, True, "give times of one clock")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    # Pictures that a camera lacks are counted by its own frames, as the detections are.
+    number = [np.append(np.flatnonzero(np.isfinite(each)), -1) for each in time_s.T]
+    picture = np.column_stack([own[place] for own, place in zip(number, found.picture.T, strict=True)])
+    notes = tuple(f"{path}: {each}" for each in found.notes)
+    return FrameTimes(cast(Array, found.time_s), source=str(path)), Moments(picture, found.time_s, notes)
+
+
+def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]:
+    """The times of each camera's own frames, where it is not known how cameras lie in time to each other.
+
+    And (T, V) whether the camera has such a frame; times of those that it lacks go on at its rate. InputError as
+    `read_timestamps`, and where cameras have different rates.
+    """
+    time_s, clocks = _times(path, rig, frames)
+    periods = [clock.period for clock in clocks]
+    if max(periods) > 1.01 * min(periods):
+        slow, fast = (clocks[periods.index(end(periods))].name for end in (max, min))
+        what = f"cameras {slow} and {fast} took {1 / max(periods):.3g} and {1 / min(periods):.3g} frames a second"
+        raise InputError(f"{path}: {what}, and one rate is needed to find when they began; give detections of one")
+    there = np.isfinite(time_s)
+    filled = time_s.copy()
+    for own, has, clock in zip(filled.T, there.T, clocks, strict=True):
+        frame, step = np.arange(frames), clock.period
+        own[~has] = np.interp(frame[~has], frame[has], own[has])
+        last, first = int(frame[has][-1]), int(frame[has][0])
+        own[last + 1 :] = own[last] + step * (frame[last + 1 :] - last)
+        own[:first] = own[first] + step * (frame[:first] - first)
+    every = np.broadcast_to(there, (frames, len(rig))) if there.shape[1] == 1 else there
+    return FrameTimes(filled[:, 0] if filled.shape[1] == 1 else filled, source=str(path)), every
+
+
+def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]:
+    """The times (T, C) of frames, of all cameras or of each, NaN for those that a camera lacks; and the clocks."""
     names, numbers, lines = _table(path, rig)
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
@@ -53,20 +96,7 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
         raise InputError(f"{path}: {problem}; add a column frame where it is of more frames than the recording")
     time_s = numbers[picked][:, [names.index(name) for name in wanted]]
     clocks = [_clock(path, name, each, lines[picked]) for name, each in zip(wanted, time_s.T, strict=True)]
-    if len(wanted) == 1:
-        return FrameTimes(time_s[:, 0], source=str(path)), None
-    slowest = max(clock.period for clock in clocks)
-    if np.isfinite(time_s).all() and (np.ptp(time_s, axis=1) <= slowest).all():
-        return FrameTimes(time_s, source=str(path)), None
-    try:
-        found = align(clocks, True, "give times of one clock")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    # Pictures that a camera lacks are counted by its own frames, as the detections are.
-    number = [np.append(np.flatnonzero(np.isfinite(each)), -1) for each in time_s.T]
-    picture = np.column_stack([own[place] for own, place in zip(number, found.picture.T, strict=True)])
-    notes = tuple(f"{path}: {each}" for each in found.notes)
-    return FrameTimes(cast(Array, found.time_s), source=str(path)), Moments(picture, found.time_s, notes)
+    return time_s, clocks
 
 
 def nameable(names: Sequence[str]) -> bool:
@@ -75,13 +105,15 @@ def nameable(names: Sequence[str]) -> bool:
 
 
 def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
-    """Write when frames were taken, from 0 on, as `read_timestamps` reads it: (T,), or (T, V) for each camera."""
+    """Write when frames were taken, from 0 on, as `read_timestamps` reads it: (T,), or (T, V) for each camera, NaN
+    for frames that it does not have.
+    """
     if times.ndim == 2 and not nameable(names):
         raise InputError(f"{path}: a camera's name has a blank, a comma or #; rename it in the calibration")
     columns = [_TIME] if times.ndim == 1 else names
     rows = [", ".join([_FRAME, *columns])]
-    for frame, row in enumerate((times - times.min()).reshape(len(times), -1).tolist()):
-        rows.append(", ".join([str(frame), *(f"{each:.6f}" for each in row)]))
+    for frame, row in enumerate((times - np.nanmin(times)).reshape(len(times), -1).tolist()):
+        rows.append(", ".join([str(frame), *(f"{each:.6f}" if each == each else _NO_PICTURE for each in row)]))
     write_content(path, "\n".join(rows) + "\n")
 
 

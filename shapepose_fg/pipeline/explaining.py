@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index
@@ -20,6 +22,7 @@ from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
+from shapepose_fg.io.validation import validated
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, FactorReason, Finding, ViewReason
 from shapepose_fg.pipeline.solving import Solver, solved_around
@@ -36,6 +39,51 @@ _NEAR_M = 0.5
 """A detection that nobody was given is named so far from a joint that its camera has none of."""
 _APART = 0.5
 """A detection is somebody else's where it lies in less than this share of the distance from theirs."""
+
+
+class _Problem(BaseModel):
+    """An entry of run.json's `people.problems`."""
+
+    person: int
+    frame: int
+    joint: str
+    reason: str
+
+
+class _Spell(BaseModel):
+    """An entry of run.json's `setup.left_out` or `setup.doubted`."""
+
+    camera: str
+    frames: tuple[int, int]
+
+
+class _Said(BaseModel):
+    """An entry of run.json's `setup.findings`."""
+
+    cameras: list[str]
+    says: str
+
+
+class _Setup(BaseModel):
+    """Of run.json's `setup` what is read here."""
+
+    left_out: list[_Spell] = []
+    doubted: list[_Spell] = []
+    findings: list[_Said] = []
+
+
+class _People(BaseModel):
+    """Of run.json's `people` what is read here."""
+
+    problems: list[_Problem] = []
+
+
+class _Run(BaseModel):
+    """Of run.json what is read here."""
+
+    setup: _Setup = _Setup()
+    people: _People = _People()
+    extra_factors: dict[str, Any] = {}
 
 
 def explain(
@@ -60,6 +108,11 @@ def explain(
     table = people.observations
     if table is None:
         raise InputError("the result does not say what it was solved from (observations.npz): reconstruct again")
+    if tuple(table.view_names.tolist()) != rig.names:
+        raise InputError(
+            "the cameras are not those of observations.npz; give those that it was reconstructed with"
+        )
+    told = validated(_Run, people.run, "run.json", "restore it or reconstruct the recording again")
     row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
@@ -75,10 +128,9 @@ def explain(
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
     wrong = wrong_view(around.seen, around.people.joints, around.views, solver.config.estimator.observations)
     refused = _refused(around, at, number, detections)
-    findings = _findings(people, row, number, views, factors, shares, wrong, refused)
+    findings = _findings(people, told, row, number, views, factors, shares, wrong, refused)
     given = {name_of(function) for function in functions_of(extra_factors)}
-    used = people.run.get("extra_factors", {})
-    missing = tuple(name for name in used if isinstance(used, dict) and name not in given)
+    missing = tuple(name for name in told.extra_factors if name not in given)
     return Explanation(
         person, joint, frame, when if np.isfinite(when) else None,
         tuple(here.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
@@ -323,6 +375,7 @@ def _refused(all_of_it: _Detections, row: int, joint: int, detections: Detection
 
 def _findings(
     people: Reconstruction,
+    run: _Run,
     row: int,
     joint: int,
     views: Sequence[ViewReason],
@@ -333,10 +386,10 @@ def _findings(
 ) -> tuple[Finding, ...]:
     """What is the matter with a joint, the gravest first."""
     found, used = list[Finding](), [view for view in views if view.gate == GATES[Gate.USED]]
-    problem = _problem(people, row, joint)
+    problem = _problem(people, run, row, joint)
     if problem:
         found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
-    told = _checked(people, row)
+    told = _checked(people, run, row)
     found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
     if wrong is not None and all(views[wrong.view].camera not in each.cameras for each in found):
         name = views[wrong.view].camera
@@ -390,26 +443,22 @@ def _findings(
     return tuple(found)
 
 
-def _problem(people: Reconstruction, row: int, joint: int) -> str:
+def _problem(people: Reconstruction, told: _Run, row: int, joint: int) -> str:
     """What run.json says went wrong with a joint; empty where nothing did."""
-    told = people.run.get("people", {})
-    for each in told.get("problems", ()) if isinstance(told, dict) else ():
-        same = each.get("person") == people.person[row] and each.get("frame") == people.frame[row]
-        if same and each.get("joint") == people.joint_names[joint]:
-            return str(each.get("reason"))
-    return ""
+    here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
+    problems = told.people.problems
+    return next((each.reason for each in problems if (each.person, each.frame, each.joint) == here), "")
 
 
-def _checked(people: Reconstruction, row: int) -> list[Finding]:
+def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
     """Cameras that the set-up check left out of a row's frame, or doubted in it, as run.json has it."""
-    told, found = people.run.get("setup", {}), list[Finding]()
-    for key, cause, fate in (
-        ("left_out", Cause.WRONG_CAMERA, "left out"),
-        ("doubted", Cause.CONTRADICTION, "not believed"),
+    found, frame = list[Finding](), people.frame[row]
+    for spells, cause, fate in (
+        (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
+        (told.setup.doubted, Cause.CONTRADICTION, "not believed"),
     ):
-        spells = [(each["camera"], *each["frames"]) for each in told.get(key, ())]
-        cameras = tuple(name for name, first, last in spells if first <= people.frame[row] < last)
-        says = "; ".join(each["says"] for each in told.get("findings", ()) if {*each["cameras"]} & {*cameras})
+        cameras = tuple(each.camera for each in spells if each.frames[0] <= frame < each.frames[1])
+        says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*cameras})
         if cameras:
             words = (
                 f"By the set-up check {_cameras(cameras)} {'were' if len(cameras) > 1 else 'was'} {fate}: {says}."

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from factors.keys import MAX_FRAME, MAX_PERSON
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.body_model import BodyModel
@@ -125,6 +126,7 @@ def _solved(
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
     config, rig = solver.config, solver.rig
+    _check_rows(rows, over_time=config.temporal)
     settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
     for own, segment in _windows(rows, config):
         if frame is not None and frame not in own:
@@ -138,6 +140,25 @@ def _solved(
         views = Views.of(rig, observations.time_s)
         found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
         yield own, part, found
+
+
+def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
+    """InputError where rows are not those of people over time: files may have been changed by hand."""
+    order = np.lexsort((rows.frame, rows.person))
+    person, frame, time_s = (each[order] for each in (rows.person, rows.frame, rows.time_s))
+    same = np.diff(person) == 0
+    twice = np.flatnonzero(same & (np.diff(frame) == 0))
+    problem = f"person {person[twice[0]]} is twice in frame {frame[twice[0]]}" if len(twice) > 0 else ""
+    if len(rows) > 0 and (person.max() > MAX_PERSON or frame.max() > MAX_FRAME):
+        problem = f"persons must be at most {MAX_PERSON} and frames {MAX_FRAME}"
+    if over_time and not problem:
+        wrong = ~np.isfinite(time_s)
+        wrong[1:] |= same & ~(np.diff(time_s) > 0)
+        if wrong.any():
+            at = int(wrong.argmax())
+            problem = f"time_s must rise with the frames, and does not at person {person[at]}, frame {frame[at]}"
+    if problem:
+        raise InputError(f"people.npz: {problem}; restore the file or reconstruct the recording again")
 
 
 def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> Index:

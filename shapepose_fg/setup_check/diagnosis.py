@@ -32,6 +32,7 @@ from shapepose_fg.setup_check.hypotheses import (
     lags,
     mistake_of_cameras,
 )
+from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted
 from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
@@ -250,7 +251,8 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     findings += _small_findings(look, problem, small, known)
     findings += _unfit(look, known)
     build = build_of(refined.structure()[1].points, detections.skeleton)
-    findings += _of_people(build, rig)
+    order = order_of_joints(detections, refined)
+    findings += order or _of_people(build, rig)  # joints that are others say nothing of unit and up
     trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
     return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 

@@ -26,6 +26,7 @@ class Kind(StrEnum):
     DUPLICATE = "duplicate"
     UNIT = "unit"
     UP = "up axis"
+    JOINT_ORDER = "joint order"
     NOBODY = "nobody"
     STOPPED = "stopped"
     UNFIT = "does not fit"
@@ -56,6 +57,9 @@ class Finding:
     """The first frame in which it is so, and the one after the last; None where the recording begins or ends."""
     sure: float = 1.0
     """The probability that it is this, and not another mistake or none, as far as the detections tell."""
+    joints: tuple[str, ...] = ()
+    """The layout that people fit, and the one that they were read as; or only which joints are exchanged, "" where
+    it is no single exchange."""
     same: str = ""
     """In what alone two cameras are one, if not in both: "pose" or "detections"."""
     instead: "tuple[Finding, ...]" = ()
@@ -190,6 +194,22 @@ def _unit(finding: Finding, side_px: int) -> str:
     )
 
 
+def _joint_order(finding: Finding, side_px: int) -> str:
+    if len(finding.joints) == 2:
+        fits, read_as = finding.joints
+        order = f"joints do not lie as a body's do in the order of {read_as}, and do in that of {fits}"
+        return f"{order}; give --skeleton {fits}"
+    if finding.joints == ("left and right",):
+        what = "left and right of everybody look exchanged: knees and faces point backwards"
+        return f"{what}; exchange them in a --skeleton file, or see whether all pictures were mirrored"
+    if any(finding.joints):
+        return f"{finding.joints[0]} look exchanged in all detections; give their order in a --skeleton file"
+    return (
+        "joints do not lie as a body's do: they are in another order than they are read in; name the detector's"
+        " joints, or its layout, with --skeleton"
+    )
+
+
 def _nobody(finding: Finding, side_px: int) -> str:
     if len(finding.cameras) > 0:
         return "{who} {sees} nobody in the frames that were looked at; check the detections"
@@ -234,6 +254,7 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.UNIT: _unit,
     Kind.UP: "people stand along {axis}, and the calibration says that {up} is up; give --up {axis}"
     " unless they lie",
+    Kind.JOINT_ORDER: _joint_order,
     Kind.NOBODY: _nobody,
     Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
     " what it sees there is left out: look at its recording",

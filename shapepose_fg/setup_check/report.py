@@ -465,11 +465,15 @@ def _unseen(people: Reconstruction, detections: DetectionSequence, rig: Rig, fra
     alone = not people.run.get("configuration", {}).get("temporal", True)
     rows = np.searchsorted(frames, people.frame[np.isin(people.frame, frames)])
     per_frame = np.bincount(rows, minlength=len(frames))
-    return unseen(detections, len(rig), frames, per_frame, None if alone or not fps else len(frames) / fps)
+    return unseen(detections, rig.names, frames, per_frame, None if alone or not fps else len(frames) / fps)
 
 
 def unseen(
-    detections: DetectionSequence, views: int, frames: Sequence[int], per_frame: Whole, lasts_s: float | None
+    detections: DetectionSequence,
+    names: Sequence[str],
+    frames: Sequence[int],
+    per_frame: Whole,
+    lasts_s: float | None,
 ) -> list[str]:
     """A sentence where two cameras see more people than there are rows in a frame, `per_frame` (F,), and why.
 
@@ -478,10 +482,10 @@ def unseen(
     """
     core = list(detections.skeleton.core)
     looked_at = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
-    seen = np.zeros((len(looked_at), views))
+    seen = np.zeros((len(looked_at), len(names)))
     for row, frame in enumerate(looked_at.tolist()):
         found = detections[frames[frame]]
-        for view in range(views):
+        for view in range(len(names)):
             joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
             seen[row, view] = np.median(joints[core])
     by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
@@ -490,7 +494,8 @@ def unseen(
     why = "the others too little, or not as one"
     if lasts_s is not None and lasts_s < _SHORT_S:
         why = f"{lasts_s:.2g} s are too little to be sure of everybody; give more frames, or --no-temporal"
-    return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why}"]
+    most = " and ".join(names[view] for view in sorted(np.argsort(-seen.mean(axis=0), kind="stable")[:2].tolist()))
+    return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why} ({most} see most)"]
 
 
 def _outlier(uses: Sequence[CameraUse]) -> list[str]:

@@ -105,6 +105,7 @@ def test_joints_are_where_they_are(found, truth):
     assert error[~seen].mean() < 150  # half a second without elbow and wrist
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.65, *slow(1.2)])
 def test_bodies_far_from_an_adult_s_size_are_as_tall_as_they_are(fitter, found, truth, targets, size):
     small = fitter.fit_sequence(targets.larger(np.full(len(targets), size)), GROUP, TIME_S)

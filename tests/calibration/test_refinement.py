@@ -61,10 +61,12 @@ def test_disturbed_cameras_come_back(rig, recording, people):
 def test_a_sound_rig_stays_within_its_sigma(rig, recording):
     found = refine(recording, rig, TIMES, range(250))
     turn, move = off_by(found.rig, rig)
-    assert (turn < 2 * np.degrees(found.adjusted.sigma(TURN))).all()
-    assert (move < 2 * found.adjusted.sigma(MOVE)).all() and abs(found.after_px / found.before_px - 1) < 0.05
+    for off, sigma in ((turn, np.degrees(found.adjusted.sigma(TURN))), (move, found.adjusted.sigma(MOVE))):
+        assert (off < 3 * sigma).all() and np.median(off / sigma) < 2
+    assert abs(found.after_px / found.before_px - 1) < 0.1
 
 
+@pytest.mark.slow
 def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
     bumped = replace(rig, cameras=(disturbed(rig, 1, degrees=2.5).cameras[0], *rig.cameras[1:]))
     footage, now = Footage.of(recording, rig, TIMES, range(250)), bumped
@@ -85,6 +87,7 @@ def test_a_camera_that_was_knocked_far_off_is_found_again(rig, recording):
     assert found.change()["turn"][0] == pytest.approx(15, abs=1) and found.change()["turn"][1:].max() < 1
 
 
+@pytest.mark.slow
 def test_joints_behind_a_camera_are_no_trouble(rig, recording):
     """Where cameras are far off, joints end behind them; what these say is nothing, and nothing fails."""
     people = Footage.of(recording, rig, TIMES, range(250)).people(rig)
@@ -96,6 +99,7 @@ def test_joints_behind_a_camera_are_no_trouble(rig, recording):
     assert np.isfinite(adjusted.covariance).all() and np.isfinite(adjusted.rig.centres).all()
 
 
+@pytest.mark.slow
 def test_the_reference_camera_keeps_its_pose(rig, recording):
     wrong, footage = disturbed(rig, 2), Footage.of(recording, rig, TIMES, range(250))
     adjusted = adjust(wrong, wrong, footage.people(wrong), Freedom(), 12.0, reference=1)

@@ -1,6 +1,8 @@
 """Cameras that were started by hand: found from the people, to a part of a frame, or said to be unknown."""
 
 import json
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.timestamps import write_timestamps
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.setup_check.matching import Sightings
 from tests.calibration.conftest import FPS, LATE_S, filmed, merged, moving
@@ -125,3 +129,45 @@ def test_the_command_writes_what_reconstruct_takes(rig, late, two_people, tmp_pa
     for joints, time_s in zip(people.joints, people.time_s, strict=True):
         truth = moving(body, time_s + LATE_S.min())
         assert np.nanmedian(np.linalg.norm(joints - truth, axis=-1), axis=1).min() < 0.03
+
+
+@pytest.fixture
+def as_detected(rig, late, tmp_path, monkeypatch) -> Path:
+    """What `detect` leaves of phones that were started and stopped by hand: detections under their own numbers,
+    and times that say which frames each has.
+    """
+    monkeypatch.chdir(tmp_path)
+    shown = np.arange(300)[:, None] < [300, 250, 300, 220]
+    own = Recording(BODY_25, [frame.only(has[frame.view]) for frame, has in zip(late, shown, strict=True)])
+    write_rig(rig, tmp_path / "rig.json")
+    write_association(own, rig, tmp_path)
+    time_s = np.repeat(np.arange(300)[:, None] / FPS, 4, axis=1)
+    write_timestamps(tmp_path / "detection" / "times.csv", rig.names, np.where(shown, time_s, np.nan))
+    return tmp_path
+
+
+COMMON = round((10.78 - 4.0) * FPS)
+"""Frames in which all four run: the last began at 4 s, the first ended at 10.78 s."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        "synchronise --calibration rig.json --detections detection --most 8 --output same.csv",
+        "calibrate --calibration rig.json --detections detection --most 8 --times same.csv --output new.json",
+    ],
+)
+def test_files_of_unequal_length_keep_all_common_footage(as_detected, command, capsys):
+    """The line that is printed is typed as it is."""
+    with pytest.raises(SystemExit) as ended:
+        main(command.split())
+    out, error = capsys.readouterr()
+    assert ended.value.code == 0, error
+    (line,) = (each for each in out.splitlines() if each.startswith("next: "))
+    with pytest.raises(SystemExit) as ended:
+        main([*shlex.split(line)[2:], "--no-report", "--no-check"])
+    assert ended.value.code == 0, capsys.readouterr().err
+    people = Reconstruction.load("results")
+    assert abs(len(np.unique(people.frame)) - COMMON) <= 2
+    assert len(np.unique(people.person)) == 3

@@ -20,6 +20,7 @@ from tests.calibration.conftest import FPS, LATE_S, merged, moving
 from tests.calibration.test_from_people import off_after_growing, unposed
 
 
+@pytest.mark.slow
 def test_rough_offsets_need_no_poses(rig, late):
     tracks = own_tracks(Sightings.of(late, range(300)), unposed(rig), FPS)
     shift = offsets_without_poses(tracks, FPS, 8.0)

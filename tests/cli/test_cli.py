@@ -158,6 +158,7 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
     assert str(stamps) in Reconstruction.load(tmp_path / "out").run["inputs"]
 
 
+@pytest.mark.slow
 def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp_path, monkeypatch, capsys):
     fake, file = shapepose_fg.cli.reconstruct.run.reconstruct_parts, tmp_path / "kept" / "subjects.npz"
 
@@ -487,6 +488,7 @@ assert "torch" not in sys.modules, "help loads torch"
 """
 
 
+@pytest.mark.slow
 def test_importing_and_help_load_no_torch():
     result = subprocess.run([sys.executable, "-c", LIGHT], check=False, timeout=60, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
@@ -500,6 +502,7 @@ def test_train_fitter_without_torch_names_the_command(tmp_path, monkeypatch, cap
     assert said == 'error: torch is not installed; pip install "shapepose-fg[train]"\n'
 
 
+@pytest.mark.slow
 def test_a_reader_that_stops_reading_is_no_error():
     """`shapepose-fg version | head -n 0`: no traceback, no sentence."""
     reader, writer = os.pipe()

@@ -97,6 +97,24 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
         np.testing.assert_allclose(table[t].xy, expected, atol=5)
 
 
+def test_files_of_unequal_length_are_detected_whole_where_nobody_says_when_they_began(kitchen, capsys):
+    """Two are shorter than the time between their starts: no moment would be left of what they share."""
+    rig, lengths = read_rig("calibration.json"), (12, 5, 8)
+    Path("videos").mkdir()
+    for name, length in zip(rig.names, lengths, strict=True):
+        film(Path("videos") / f"{name}.avi", rig, name, range(20 - length, 20), 25)
+    assert run(*COMMON, "--videos", "videos") == 0
+    said = capsys.readouterr()
+    assert "left out" not in said.err and "5 to 12 frames" in " ".join(said.err.split())
+    table = read_detections("out", rig)
+    for view, length in enumerate(lengths):
+        assert [(frame.view == view).sum() for frame in table] == [1] * length + [0] * (12 - length)
+    (line,) = re.findall("next: (.*)", said.out)
+    with pytest.raises(SystemExit) as end:
+        main(shlex.split(line)[1:])
+    assert end.value.code == 0, "it is typed as it is printed"
+
+
 def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     rig = read_rig("calibration.json")
     for name in rig.names:
@@ -114,6 +132,7 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     assert "there are detections already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_project_is_detected_in_and_goes_on_as_a_project(kitchen, capsys, monkeypatch):
     """Cameras, videos and places come from it; the next line is the project's, quoted, from any folder."""
     rig, project = read_rig("calibration.json"), kitchen / "my walk"
@@ -213,6 +232,7 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     assert ((nose - np.minimum(right, left) > 1.1) & (nose - np.minimum(right, left) < 1.8)).all()
 
 
+@pytest.mark.slow
 def test_four_people_around_a_pizza(shared_data, network, tmp_path):
     """CMU Panoptic's demo: five letterboxed pictures of one moment. At least three of four, and nobody else."""
     data = shared_data / "panoptic_pizza"

@@ -151,6 +151,7 @@ def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_peo
             np.testing.assert_allclose(joints, expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_people_can_be_looked_at_while_they_go_elsewhere(tmp_path, cameras, five_cameras, two_people, capfd):
     """One person leaves after six of 30 pictures: rerun is told who is known in the newest moment."""
     rerun = pytest.importorskip("rerun")

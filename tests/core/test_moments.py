@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.moments import CameraClock, align
+from shapepose_fg.core.moments import CameraClock, align, own_frames
 
 
 def clock(name: str, fps: float, frames: int, start_s: float = 0.0) -> CameraClock:
@@ -77,3 +77,21 @@ def test_a_picture_stands_for_one_moment():
 def test_cameras_without_a_moment_in_common_are_named():
     with pytest.raises(InputError, match=r"camera a ends at 0\.3 s and camera b starts at 9 s: they have no"):
         align([clock("a", 10, 4), clock("b", 10, 4, start_s=9.0)], True)
+
+
+def test_where_nothing_says_when_cameras_began_every_picture_is_kept():
+    """The second is shorter, the third twice as fast: of it every second picture belongs to none."""
+    moments = own_frames([clock("a", 25, 10), clock("b", 25, 4, start_s=0.2), clock("c", 50, 20)], True)
+    own = np.arange(10)
+    np.testing.assert_array_equal(moments.picture, np.stack([own, np.where(own < 4, own, -1), 2 * own], axis=1))
+    assert moments.time_s is not None and not moments.synchronised
+    assert np.isnan(moments.time_s[4:, 1]).all() and np.isfinite(moments.time_s[:, [0, 2]]).all()
+    assert "4 to 10 frames" in moments.notes[0] and "--start" in moments.notes[0]
+
+
+def test_files_that_run_together_are_the_same_either_way():
+    clocks = [clock("a", 30, 10), clock("b", 30, 10)]
+    one, two = align(clocks, True), own_frames(clocks, True)
+    np.testing.assert_array_equal(one.picture, two.picture)
+    np.testing.assert_array_equal(one.time_s, two.time_s)
+    assert one.notes == two.notes == () and two.synchronised

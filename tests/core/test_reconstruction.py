@@ -397,6 +397,7 @@ def test_observations_of_an_earlier_result_do_not_stay(tmp_path):
         Reconstruction.load(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["people.npz", "observations.npz"])
 def test_a_file_that_is_damaged_anywhere_is_one_sentence_or_none(tmp_path, file):
     """300 files with a few bytes changed, lost or doubled: each loads, or says in one sentence what it is."""

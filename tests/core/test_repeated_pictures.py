@@ -96,6 +96,7 @@ def test_where_nothing_moves_nothing_is_left_out(recording):
     assert WithoutRepeats(still, 4).repeated(2) == ()
 
 
+@pytest.mark.slow
 def test_cameras_that_stop_do_no_harm(scene, recording):
     """Two of four cameras stop after five frames. Believed, they put joints 10 cm off in the median, and 9 % of
     those with a sigma under 3 cm by more than 20 cm; left out, it is 25 mm, of two cameras.
@@ -119,6 +120,7 @@ def test_every_picture_twice_is_every_second_one_left_out(recording):
     assert [twice.repeated(frame) for frame in range(6)] == [(), (2,), (), (2,), (), (2,)]
 
 
+@pytest.mark.slow
 def test_the_check_names_a_camera_that_stops(scene, recording, stopped):
     report = check_setup(stopped, scene.rig)
     assert [(each.kind, each.cameras) for each in report.findings] == [(Kind.STOPPED, (1,))]
@@ -126,6 +128,7 @@ def test_the_check_names_a_camera_that_stops(scene, recording, stopped):
     assert check_setup(recording, scene.rig).findings == ()
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_from_the_first_frame_is_not_said_to_see_nobody(scene, recording):
     frozen = showing(recording, 1, np.zeros(FRAMES, dtype=int))
     kinds = [each.kind for each in check_setup(frozen, scene.rig).findings]

@@ -125,6 +125,7 @@ def test_a_users_isam2_takes_a_person_and_learns_of_a_wrist(people, scene):
     assert np.trace(isam.marginalCovariance(before)) < 3.1e-4
 
 
+@pytest.mark.slow
 def test_factors_of_ones_own_are_in_it(people, scene):
     def carries_a_box(window, keys):
         for right, left in keys[:, [WRIST, OTHER_WRIST]].tolist():

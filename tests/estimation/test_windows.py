@@ -176,6 +176,7 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     np.testing.assert_array_equal(kept.covariance, carried.covariance)
 
 
+@pytest.mark.slow
 def test_a_joint_with_a_factor_of_one_s_own_stays_where_that_leaves_it(walk, five_cameras, two_people):
     """The same wrist, out of sight, with a factor that says next to nothing: `keep_limbs` leaves it alone."""
     observations, truth = walk

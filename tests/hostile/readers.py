@@ -44,6 +44,7 @@ from tests.core import test_reconstruction as results
 from tests.hostile import runs
 from tests.hostile.trying import Prepare
 from tests.io import test_calibration_formats as rigs
+from tests.io import test_detections_of_other_programs as others
 from tests.io import test_people_formats as people
 
 Read = Callable[[], object]
@@ -87,6 +88,15 @@ def _people(program: str) -> Prepare:
     def prepare(folder: Path, seed: int) -> Read:
         people.WRITERS[program](folder, people.people_of(BODY_25 if seed % 2 else COCO_17))
         rig = people.two_cameras("left", "right")
+        return lambda: read_detections(folder, rig)
+
+    return prepare
+
+
+def _others(program: str) -> Prepare:
+    def prepare(folder: Path, seed: int) -> Read:
+        rig, found = people.two_cameras("cam_0", "cam_1"), others.random_people(seed, (640, 480))
+        others.WRITERS[program](folder, rig, found)
         return lambda: read_detections(folder, rig)
 
     return prepare
@@ -326,6 +336,7 @@ PARTS: dict[str, tuple[int, dict[str, Any]]] = {
 READERS: dict[str, Prepare] = {
     **{f"cameras of {program}": _calibration(program) for program in rigs.WRITERS},
     **{f"detections of {program}": _people(program) for program in people.WRITERS},
+    **{f"detections of {program}": _others(program) for program in others.WRITERS},
     "cameras of COLMAP": _colmap,
     "cameras of 4D Association": _association,
     "cameras in our rig file": _rig_file,

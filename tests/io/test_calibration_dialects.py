@@ -76,6 +76,8 @@ def test_cameras_without_a_pose_are_named(tmp_path):
     file.write_text("\n".join(lines) + "\n" + file.read_text())
     rig = read_rig(file)
     assert rig.names == ("cam_0", "cam_1") and rig.notes == (f"{file}: camera cam_2 is left out: it has no pose",)
+    form, there = write_like(file, rig, tmp_path / "new.toml")
+    assert form == "Pose2Sim's TOML" and read_rig(there).names == rig.names and "[cam_2]" in there.read_text()
 
 
 def test_freemocap_and_caliscope_of_several_versions(shared_cases):
@@ -206,3 +208,10 @@ def test_a_file_is_never_written_under_another_format_s_name(tmp_path, rig_file)
     assert form == "our own rig file" and there == tmp_path / "new-1.json"
     assert read_rig(there).names == ("cam_1",) and not (tmp_path / "new.toml").exists()
     assert (tmp_path / "new.json").read_text() == "somebody else's"
+
+
+def test_cameras_that_are_not_wanted_are_named(rig_file):
+    rig, file = rig_file
+    (note,) = read_rig(file, without=rig.names[:2]).notes
+    assert note == f"{file}: camera {rig.names[0]} {rig.names[1]} is left out, as asked"
+    assert read_rig(file).notes == ()

@@ -6,13 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.joint_names import keypoint_names
-from shapepose_fg.core.skeleton import COCO_17, SKELETONS
+from shapepose_fg.core.skeleton import BODY_25, COCO_17, SKELETONS
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+from shapepose_fg.pipeline.pipeline import reconstruct
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
 
@@ -232,3 +237,125 @@ def test_mmpose_s_cases(shared_cases, rig):
 
 def rig_of(rig: Rig, size: tuple[int, int]) -> Rig:
     return Rig(tuple(Camera(each.name, each.K, each.wTc, size) for each in rig.cameras), rig.up)
+
+
+def looks(points: list[str], people: int, seed: int) -> np.ndarray:
+    """(N, K, 3) people in many poses before a camera 4 m away, pixels; some joints are not seen."""
+    rng = np.random.default_rng(seed)
+    known = [point or "Nose" for point in points]
+    body = BodyModel.default().with_keypoints(tuple(dict.fromkeys(known)))
+    turn = np.column_stack([rng.normal(0, 0.2, people), rng.uniform(-3, 3, people), np.zeros(people)])
+    poses, nowhere = PosePrior.default().sample(rng, people), np.zeros((people, 3))
+    xyz = body.keypoints(BodyParameters(rng.normal(0, 0.7, (people, 10)), turn, poses, nowhere))
+    xyz = xyz[:, [body.keypoint_names.index(point) for point in known]]
+    xy = (
+        [500, 400]
+        + np.array([300, -300]) * xyz[..., :2] / (xyz[..., 2:] / 4 + 1)
+        + rng.normal(0, 4, xyz[..., :2].shape)
+    )
+    xy[:, [not point for point in points]] += rng.normal(0, 20, 2)
+    score = np.where(rng.random(xy.shape[:2]) < 0.1, 0.0, 0.8)
+    return np.concatenate([xy, score[..., None]], axis=2) * (score[..., None] > 0)
+
+
+def results(folder: Path, **people: np.ndarray) -> Path:
+    """COCO's results of each camera, a person a frame."""
+    for name, found in people.items():
+        rows = [{"image_id": t, "keypoints": each.ravel().tolist()} for t, each in enumerate(found)]
+        (folder / f"{name}.json").write_text(json.dumps(rows))
+    return folder
+
+
+SHARED = [
+    each
+    for each in SKELETONS.values()
+    if sum(e.keypoint_count == each.keypoint_count for e in SKELETONS.values()) > 1
+]
+
+
+@pytest.mark.parametrize("skeleton", SHARED, ids=lambda each: each.name)
+def test_how_people_look_tells_layouts_of_one_number_apart(tmp_path, rig, skeleton):
+    names = keypoint_names(skeleton)
+    table = read_detections(results(tmp_path, a=looks(names, 200, 1), b=looks(names, 200, 2)), rig)
+    # POSETRACK_17 has COCO's joints, but for two of the head.
+    assert table.skeleton.name == skeleton.name or (skeleton.name, table.skeleton.name) == (
+        "POSETRACK_17",
+        "COCO_17",
+    )
+    assert any(f"taken as those of {table.skeleton.name}" in note for note in table.notes)
+
+
+def test_a_few_people_are_enough_for_layouts_that_differ_much(tmp_path, rig):
+    names = keypoint_names(SKELETONS["BODY_25B"])
+    table = read_detections(results(tmp_path, a=looks(names, 4, 1), b=looks(names, 4, 2)), rig)
+    assert table.skeleton.name == "BODY_25B" and "not as BODY_25" in " ".join(table.notes)
+
+
+def test_people_who_look_like_no_layout_leave_the_most_usual_and_it_is_said(tmp_path, rig):
+    mixed = looks(keypoint_names(SKELETONS["BODY_25B"]), 60, 1)[:, np.random.default_rng(0).permutation(25)]
+    mixed[..., :2] = np.random.default_rng(1).uniform(200, 600, mixed[..., :2].shape)
+    table = read_detections(results(tmp_path, a=mixed, b=mixed), rig)
+    assert table.skeleton is BODY_25 and any("people do not tell it from BODY_25B" in note for note in table.notes)
+
+
+def test_cameras_of_two_models_are_refused(tmp_path, rig):
+    one, other = (looks(keypoint_names(SKELETONS[name]), 60, 1) for name in ("BODY_25", "BODY_25B"))
+    with pytest.raises(
+        InputError, match=r"joints lie as in BODY_25, those of .* as in BODY_25B; give the detections"
+    ):
+        read_detections(results(tmp_path, a=one, b=other), rig)
+
+
+def test_openpose_s_body_25b_is_recognised(shared_cases):
+    """Real detections: read as BODY_25 wrists are half a metre off."""
+    rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
+    table = read_detections(shared_cases / "body25b" / "detections", rig)
+    assert table.skeleton.name == "BODY_25B" and {"Neck", "MidHip"} <= set(table.skeleton.joints)
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [
+        ("mvor/openpose", "COCO_17"),
+        ("mvor/rtpose", "COCO_17"),
+        ("mvor/alphapose", "MPII_16"),
+        ("pose2sim_single/openpose", "BODY_25"),
+    ],
+)
+def test_real_recordings_are_what_they_are(shared_data, folder, name):
+    rig = read_rig(shared_data / folder.split("/")[0] / "rig.json")
+    assert read_detections(shared_data / folder, rig).skeleton.name == name
+
+
+def test_names_are_text_of_strangers(tmp_path, rig):
+    """Names do not reach the terminal as they are, nor take long."""
+    names = [*keypoint_names(COCO_17), "\x1b[31mred\nline", "(" * 200_000, "left_" * 50_000]
+    table = read_detections(written(tmp_path, data_set(names, 20)), rig)
+    said = " ".join(table.notes)
+    assert said.isprintable() and len(said) < 2000 and table.skeleton.joints == COCO_17.joints
+    table = read_detections(written(tmp_path, video({"dataset_name": "\x1b" * 5000}, 17)), rig)
+    assert " ".join(table.notes).isprintable()
+
+
+def median_error_m(people, joints: np.ndarray, names: list[str]) -> float:
+    """Median over joints and frames of the distance to one person's (T, K, 3) joints, of who is nearest."""
+    shared = [name for name in people.joint_names.tolist() if name in names and name not in ("Neck", "Head")]
+    found = people.joints[:, [people.joint_names.tolist().index(name) for name in shared]]
+    wanted = joints[people.frame][:, [names.index(name) for name in shared]]
+    apart = np.linalg.norm(found - wanted, axis=2)
+    return min(float(np.nanmedian(apart[people.person == each])) for each in np.unique(people.person))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["body25b/detections", "h36m_coco/detections_end_to_end"])
+def test_real_people_are_where_pose2sim_has_them(shared_cases, folder):
+    """Pose2Sim's own result of the same detections: 24 mm away, 500 mm with joints of other names."""
+    rows = (shared_cases / "body25b" / "demo_0-100.trc").read_text().split("\n")
+    names = [name for name in rows[3].split("\t")[2:] if name.strip()]
+    values = [[float(value or "nan") for value in row.split("\t")[2:]] for row in rows[5:] if row.strip()]
+    truth = np.array([row[: 3 * len(names)] for row in values]).reshape(len(values), -1, 3)[..., [2, 0, 1]]
+    rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
+    detections = read_detections(shared_cases / folder, rig)
+    frames = Recording(detections.skeleton, [detections[t] for t in range(40)])
+    people = reconstruct(frames, rig, times=FrameTimes.from_fps(60, 40))
+    assert median_error_m(people, truth, names) < 0.06

@@ -74,6 +74,7 @@ def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_pat
     assert backwards[::-1] == [whole[frame].xy.sum() for frame in range(FRAMES)]
 
 
+@pytest.mark.slow
 def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_path):
     """A JSON file per frame and per camera; scores of the last block alone say that they are per cent."""
     rng = np.random.default_rng(0)
@@ -214,3 +215,10 @@ def test_files_of_which_some_frames_are_common(scene, once, tmp_path, lead, end)
     for frame in range(len(table)):
         for name in COLUMNS:
             np.testing.assert_array_equal(getattr(table[frame], name), getattr(everything[lead + frame], name))
+    every = read_detections(tmp_path / "whole", scene.rig, own_frames=True)
+    assert len(every) == FRAMES
+    for frame in range(FRAMES):
+        one = everything[frame]
+        there = one if lead <= frame < FRAMES - end else one.only(one.view == 0)
+        for name in COLUMNS:
+            np.testing.assert_array_equal(getattr(every[frame], name), getattr(there, name))

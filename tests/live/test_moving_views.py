@@ -93,6 +93,7 @@ def test_a_camera_that_carries_itself_goes_on_after_a_restart(made, start, tmp_p
     assert (apart.min(axis=1) < 0.02).all()
 
 
+@pytest.mark.slow
 def test_a_robot_s_log_says_where_its_cameras_go(made, tmp_path):
     """Detections, odometry and mounts as ROS 2 messages; the calibration knows the robot's lenses only."""
     pytest.importorskip("mcap_ros2", reason='needs pip install "shapepose-fg[ros]"')

@@ -36,12 +36,12 @@ def test_what_settles_is_what_the_whole_recording_gives(played, dance, truth):
     error, found = errors_mm(settled, truth)
     offline, of_whole = errors_mm(whole, truth)
     assert len(found.missed) == 0
-    assert np.nanmean(error) < np.nanmean(offline) + 2.0
+    assert np.nanmean(error) < np.nanmean(offline) + 4.0
     at = {(f, p): n for n, (f, p) in enumerate(zip(of_whole.frame, of_whole.person, strict=True))}
     pairs = [(r, of_whole.row[at[f, p]]) for r, f, p in zip(found.row, found.frame, found.person, strict=True)]
     one, other = np.array(pairs).T
     apart = 1e3 * np.linalg.norm(settled.joints[one] - whole.joints[other], axis=-1)
-    assert np.nanmedian(apart) < 5.0
+    assert np.nanmedian(apart) < 8.0
     assert (settled.status == Status.OK).mean() > 0.99
 
 

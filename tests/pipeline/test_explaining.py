@@ -264,3 +264,30 @@ def test_who_is_not_there_is_said(people, scene):
         explain(people, scene.rig, person=int(people.person[0]), joint="Tail", frame=int(people.frame[0]))
     with pytest.raises(InputError, match="is not in frame 99"):
         explain(people, scene.rig, person=int(people.person[0]), joint="LElbow", frame=99)
+
+
+@pytest.mark.parametrize(
+    ("words", "change"),
+    {
+        "time_s must rise": lambda people: replace(people, time_s=np.zeros(len(people))),
+        "does not at person": lambda people: replace(people, time_s=np.full(len(people), np.nan)),
+        "is twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
+        "persons must be at most": lambda people: with_both(people, person=people.person + 10**6),
+        "people.problems must be": lambda people: people.with_run(people={"problems": 3}),
+        "setup.left_out": lambda people: people.with_run(setup={"left_out": [{"camera": {}, "frames": [0, 9]}]}),
+        "extra_factors must be": lambda people: people.with_run(extra_factors=[1]),
+        "cameras are not those of": lambda people: replace(
+            people, observations=replace(people.observations, view_names=people.observations.view_names[::-1])
+        ),
+    }.items(),
+)
+def test_files_that_were_changed_are_refused_in_one_sentence(people, scene, words, change):
+    tampered = change(people)
+    with pytest.raises(InputError, match=words):
+        explain(tampered, scene.rig, person=int(tampered.person[0]), joint="LElbow", frame=5)
+
+
+def with_both(people: Reconstruction, **columns) -> Reconstruction:
+    """The rows with other identities or frames, what they were solved from included."""
+    assert people.observations is not None
+    return replace(people, observations=replace(people.observations, **columns), **columns)

@@ -80,6 +80,7 @@ def crowd_as_it_is() -> Reconstruction:
     return people
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_people_and_detections():
     rig, frames = crowd()
     rng, order = np.random.default_rng(0), [2, 0, 1]
@@ -106,6 +107,7 @@ def test_the_size_of_the_pictures():
     assert farthest_m(crowd_as_it_is(), people, people.joints) < SAME_M
 
 
+@pytest.mark.slow
 @few
 @given(st.floats(-180, 180), st.tuples(*[st.floats(-50, 50)] * 3))
 def test_where_the_world_begins(degrees: float, shift: tuple[float, float, float]):

@@ -95,6 +95,7 @@ def test_an_empty_recording_and_one_that_begins_empty(dance):
     assert sorted(set(people.frame.tolist())) == list(range(5, 13)) and len(np.unique(people.person)) == 4
 
 
+@pytest.mark.slow
 def test_people_are_carried_through_frames_in_which_no_camera_sees_anything(dance):
     scene, recording, times = dance.scene, dance.recording, dance.times
     gap = range(10, 14)

@@ -28,7 +28,7 @@ LEVELS = (
     "body.kernels",
     "body.model",
     "body.fitting body.shapes",
-    "body.offsets",
+    "body.offsets body.joint_order",
     "core.detections core.frame_times core.moments",
     "core.trust",
     "core.observations core.notes core.repeated_pictures",

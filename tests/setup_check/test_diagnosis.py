@@ -55,6 +55,7 @@ def test_nothing_is_said_where_nothing_is_wrong(recording, room):
     np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [[0, 1], [0, 2, 3], [0, 1, 2, 4]])
 def test_nothing_is_said_of_fewer_cameras(recording, room, views):
     assert diagnose(*some_cameras(recording, room, views)).findings == ()
@@ -69,6 +70,7 @@ def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     assert found.amount == pytest.approx(degrees, rel=0.05, abs=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [10, *slow(3, 6, -8, 15)])
 def test_a_late_camera_is_named_with_its_frames(recording, room, frames):
     found = only_finding(delayed(recording, 1, frames), room)
@@ -89,6 +91,7 @@ def test_mistakes_of_one_camera_are_told_apart(recording, room):
             assert found.amount == pytest.approx(amount, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("right", "down"), [(0.08, 0.0), *slow((0.0, 0.05), (-0.07, 0.07))])
 def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, down):
     shift = right, down
@@ -100,6 +103,7 @@ def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, d
     assert noted.amount == pytest.approx(np.hypot(*shift), rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixels", [100.0, *slow(25.0)])
 def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, pixels):
     found = only_finding(recording, shifted(room, 3, pixels, 0.0))
@@ -107,6 +111,7 @@ def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, p
     np.testing.assert_allclose(found.shift_px, [(-pixels, 0.0)], atol=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of", ["turned", *slow("shifted")])
 def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recording, room, of):
     # 0.6 degrees are 10 px here. A turn sideways is a shift of the picture, but for its perspective.
@@ -120,6 +125,7 @@ def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recordi
         assert f"({each.sure:.2f})" in words and "; or " in words
 
 
+@pytest.mark.slow
 def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detector(room, people, look_at):
     diagnosis = diagnose(look_at(room, people[:, :1]), shifted(room, 2, 15.0, 0.0))
     assert diagnosis.findings == ()
@@ -144,6 +150,7 @@ def test_no_step_of_a_focal_length_leaves_the_numbers(room):
     assert (views.focal_px > 0).all() and np.isfinite(views.focal_px).all()
 
 
+@pytest.mark.slow
 def test_exchanged_cameras_are_named(recording, room):
     found = only_finding(recording, exchanged(room, 1, 4))
     assert (found.kind, found.cameras) == (Kind.EXCHANGED, (1, 4))
@@ -196,6 +203,7 @@ def test_cameras_that_see_nobody_are_named(recording, room):
     assert "no camera sees a person" in sentence(found, room).lower()
 
 
+@pytest.mark.slow
 def test_people_before_and_after_a_long_gap_are_looked_at(recording, room):
     """Of a hundred frames spread over the recording next to none shows anybody."""
     gap = [Detections.empty()] * 5000
@@ -257,6 +265,7 @@ def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
     assert len(wanted) == 0
 
 
+@pytest.mark.slow
 def test_pose2sim_s_recording_has_what_is_wrong_with_it(shared_data):
     folder = shared_data / "pose2sim_single"
     rig = read_rig(folder / "Calib.qca.txt")

@@ -32,12 +32,14 @@ def test_a_camera_that_is_bumped_is_named_with_the_frame_and_left_out_from_there
     assert "left out" in report.with_consequences(room)[0]
 
 
+@pytest.mark.slow
 def test_before_the_bump_it_may_be_that_it_does_not_fit(recording, room):
     found = only_finding(check_setup(turning(recording, room, 0, lambda t: 0.0 if t >= 40 else 6.0), room))
     assert (found.kind, found.cameras, found.frames[0]) == (Kind.BUMPED, (0,), None)
     assert found.frames[1] == pytest.approx(40, abs=1)
 
 
+@pytest.mark.slow
 def test_a_camera_that_drifts_is_named(recording, room):
     report = check_setup(turning(recording, room, 3, lambda t: 8 * t / 59), room)
     found = only_finding(report)
@@ -46,6 +48,7 @@ def test_a_camera_that_drifts_is_named(recording, room):
     assert report.trust.dark(30) == (3,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.8])
 def test_a_small_drift_is_told_from_a_turn_that_lasts(recording, room, degrees):
     found = only_finding(check_setup(turning(recording, room, 1, lambda t: degrees * t / 59), room))
@@ -53,6 +56,7 @@ def test_a_small_drift_is_told_from_a_turn_that_lasts(recording, room, degrees):
     assert found.amount == pytest.approx(degrees, rel=0.3)  # the usual size of a turn pulls it to 0
 
 
+@pytest.mark.slow
 def test_cameras_that_fit_nothing_are_one_sentence(recording, room):
     """Two of five whose pictures jump by some hundred pixels from frame to frame."""
     jumps = np.random.default_rng(1).uniform(-500, 500, (2, 60, 2))
@@ -66,6 +70,7 @@ def test_cameras_that_fit_nothing_are_one_sentence(recording, room):
     assert report.trust == Trust(left_out=((1, 0, 60), (3, 0, 60)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [[0, 1, 2, 3, 4], [0, 2, 3]])
 def test_a_mirrored_camera_is_named_and_left_out(recording, room, views):
     seen, rig = some_cameras(recording, room, views)
@@ -75,6 +80,7 @@ def test_a_mirrored_camera_is_named_and_left_out(recording, room, views):
     assert report.trust == Trust(left_out=((1, 0, 60),))
 
 
+@pytest.mark.slow
 def test_of_two_cameras_nothing_says_which_is_wrong(recording, room):
     seen, rig = some_cameras(recording, room, [0, 2])
     assert check_setup(seen, rig).trust == Trust()

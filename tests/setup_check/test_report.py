@@ -48,6 +48,7 @@ def test_figures_of_a_good_set_up(recording, room):
     assert len(report.pairs) == 10
 
 
+@pytest.mark.slow
 def test_the_bad_camera_stands_out_in_the_figures(recording, room):
     report = check_setup(recording, turned(room, 2, 30, np.array([0.0, 1.0, 0.0])))
     fits = [each.left_out_matched for each in report.cameras]

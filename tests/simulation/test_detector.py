@@ -255,6 +255,7 @@ def test_people_are_lost_as_wholes():
     assert np.median(missed) <= 0.04 + 1e-9  # one joint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_missed_joint_is_captured_by_who_hides_it(share: float):
     """Person 1's right wrist is behind person 0: his elbow is joined to the wrist in front, or to none."""

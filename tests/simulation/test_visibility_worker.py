@@ -38,6 +38,7 @@ def same_bytes(one: object, two: object) -> bool:
     return all(value.tobytes() == vars(two)[name].tobytes() for name, value in vars(one).items())
 
 
+@pytest.mark.slow
 def test_workers_and_the_choice_of_frames_change_no_byte(scene: Scene):
     told: list[tuple[int, int]] = []
     alone = simulate(scene, seed=2)

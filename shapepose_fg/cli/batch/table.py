@@ -7,7 +7,7 @@ from typing import Any
 
 from shapepose_fg.cli.reconstruct.request import Request
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.skeleton import SKELETONS
+from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.config import config_from
 from shapepose_fg.io.validation import describe
@@ -86,7 +86,7 @@ def _check_names(names: list[str], path: Path) -> None:
 def _located(request: Request, path: Path, place: str) -> Request:
     """The same with its paths found from the table's folder."""
     given = {name: getattr(request, name) for name in _PATHS}
-    if request.skeleton is not None and request.skeleton not in SKELETONS:
+    if request.skeleton is not None and not layouts_called(request.skeleton):
         given["skeleton"] = Path(request.skeleton)
     found = {name: _inside(value, path, f"{place}.{name}") for name, value in given.items() if value is not None}
     return replace(request, **{name: str(value) if name == "skeleton" else value for name, value in found.items()})

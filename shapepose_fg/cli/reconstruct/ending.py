@@ -82,7 +82,7 @@ def summary_table(
     ]
     if unchecked:  # else the check says it
         lasts = float(np.ptp(task.whole()[1].frame_s[span.start : span.stop])) * len(span) / max(len(span) - 1, 1)
-        lost += unseen(task.detections, cameras, span, per_frame, lasts if task.config.temporal else None)
+        lost += unseen(task.detections, task.rig.names, span, per_frame, lasts if task.config.temporal else None)
     if len(lost) > 0:
         table.add_row("lost", "; ".join(lost), style="yellow")
     for what, spans in run.get("thinned_frames", {}).items():

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
@@ -121,11 +119,11 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")
-        found, count = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
+        found, taken_s = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
         show_clocks(found, rig)
         if problems := found.undetermined(rig):
             raise InputError(f"--synchronise: {'; '.join(problems)}")
-        write_timestamps(file, rig.names, found.at(np.arange(count) / asked.fps))
+        write_timestamps(file, rig.names, taken_s)
     return replace(known, request=replace(asked, fps=None, timestamps=file))
 
 

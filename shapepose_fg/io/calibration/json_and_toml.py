@@ -208,19 +208,29 @@ def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis |
     return ("mm" if any(key.endswith("_length_mm") for key in sizes) else None), ("z" if grounded else None)
 
 
+def _tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The tables of cameras in a TOML file, by their keys."""
+    inner = value.get("cameras")
+    every = inner if isinstance(inner, dict) else value
+    return {key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table}
+
+
+def wanted_tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Those that are read: not to be ignored, and with a pose where any has one."""
+    tables = {key: table for key, table in _tables(value).items() if table.get("ignore") is not True}
+    return {key: table for key, table in tables.items() if _POSE & table.keys()} or tables
+
+
 def _read_tables(content: Content, program: str) -> WrittenRig | None:
     """The cameras that are not to be ignored: camera from world; keys of single programs are passed over."""
-    inner = content.value.get("cameras") if content.syntax == "TOML" else None
-    every = inner if isinstance(inner, dict) else content.value if content.syntax == "TOML" else {}
-    tables = {key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table}
+    tables = _tables(content.value) if content.syntax == "TOML" else {}
     metadata = content.value.get("metadata") if len(tables) > 0 else None
     metadata = metadata if isinstance(metadata, dict) else {}
     if len(tables) == 0 or _program(tables, metadata) != program:
         return None
-    cameras, notes = [], list[str]()
-    posed = any(_POSE & table.keys() for table in tables.values())
+    cameras, notes, wanted = [], list[str](), wanted_tables(content.value)
     for key, table in tables.items():
-        if table.get("ignore") is True or (posed and not _POSE & table.keys()):
+        if key not in wanted:
             why = "it is to be ignored" if table.get("ignore") is True else "it has no pose"
             notes.append(f"camera {table.get('name') or key} is left out: {why}")
             continue

@@ -16,6 +16,7 @@ from shapepose_fg.core.rig_file import write_rig
 from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
+from shapepose_fg.io.calibration.json_and_toml import wanted_tables
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
 from shapepose_fg.io.calibration.reading import FORMATS
 from shapepose_fg.io.calibration.rewriting import REWRITTEN
@@ -162,11 +163,8 @@ def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:
 
 def _toml(source: Path, content: Content, rig: Rig, metres: float) -> str:
     """The file with the numbers of each camera's table replaced, line by line."""
-    inner = content.value.get("cameras")
-    tables = inner if isinstance(inner, dict) else content.value
-    used = [key for key, each in tables.items() if isinstance(each, dict) and "matrix" in each]
-    used = [key for key in used if tables[key].get("ignore") is not True]
-    cameras, camera, lines, depth = dict(zip(used, rig.cameras, strict=True)), None, [], 0
+    tables = wanted_tables(content.value)
+    cameras, camera, lines, depth = dict(zip(tables, rig.cameras, strict=True)), None, [], 0
     for line in read_text(source).splitlines():
         if depth > 0:  # the rest of a value that was replaced
             depth += line.count("[") - line.count("]")

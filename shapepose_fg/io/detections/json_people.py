@@ -1,5 +1,6 @@
-"""People in JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures), or one file per camera with all its
-frames (COCO's keypoint results, AlphaPose, MMPose of a video).
+"""People in JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures, OpenPifPaf, Ultralytics, AlphaPose's
+sep-json), or one file per camera with all its frames (COCO's keypoint results, AlphaPose, MMPose of a video,
+OpenPifPaf of a video).
 
 Pose2Sim (RTMLib's people written in OpenPose's way) leaves `_keypoints` out of the names, writes NaN for people
 that it dropped, and `{}` for people that a camera does not see.
@@ -17,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import MIDDLE, read_json
+from shapepose_fg.core.storage.files import LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
 from shapepose_fg.io.camera_names import MOST_FRAME, in_order
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
@@ -26,6 +27,7 @@ from shapepose_fg.io.validation import describe, validated, validated_list
 
 _OPENPOSE, _POSE2SIM, _PICTURES = "OpenPose's JSON", "Pose2Sim's JSON", "MMPose's JSON of pictures"
 _COCO, _ALPHAPOSE, _VIDEO = "COCO's keypoint results", "AlphaPose's JSON", "MMPose's JSON of a video"
+_PIFPAF, _YOLO, _SEPARATE = "OpenPifPaf's JSON", "Ultralytics' JSON", "AlphaPose's JSON of frames"
 _RERUN = {
     _OPENPOSE: "run OpenPose again with --write_json --keypoint_scale 0",
     _POSE2SIM: "run Pose2Sim's pose estimation again",
@@ -33,15 +35,22 @@ _RERUN = {
     _COCO: "write the results again, in pixels",
     _ALPHAPOSE: "run AlphaPose again with --format coco",
     _VIDEO: "run MMPose again with --save-predictions or --pred-out-dir",
+    _PIFPAF: "run OpenPifPaf again with --json-output",
+    _YOLO: "write each frame's result.to_json() again, or run yolo pose with save_txt=True",
+    _SEPARATE: "run AlphaPose again, without --format",
 }
 _LONGEST_GAP = 1000
 """Frames that may be missing, and as many as there are: more are numbers of something else."""
+_LOOKED_AT = 100
+"""Files of frames without people that are passed over to tell whose they are."""
 _LONGEST_NAME = 4096
 """Characters of a picture's path: the search takes the square of them."""
-_FRAME_FILE = re.compile(r"(\d+)(_keypoints)?\.json$")
+_FRAME_FILE = re.compile(r"(\d+)(_keypoints|(\.\w{1,5})?\.predictions)?\.json$")
 """How the file of a frame is named."""
 _FRAME_NUMBER = re.compile(r"(\d+)\D*$")
 """The last number in the name of a picture."""
+_ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
+"""AlphaPose's file of all frames, and its folder for a file a frame, of --format open and cmu."""
 _LISTS = ("annotations", "instance_info")
 """Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
 _AT_ONCE = 1024
@@ -93,7 +102,62 @@ class _Result(BaseModel):
     category_id: int | str | None = None
 
 
+class _Flat(BaseModel):
+    """A person of OpenPifPaf."""
+
+    model_config = ConfigDict(strict=True)
+    keypoints: Annotated[list[float], Field(min_length=1)]
+
+
+class _Columns(BaseModel):
+    """The keypoints of a person of Ultralytics."""
+
+    model_config = ConfigDict(strict=True)
+    x: list[FiniteFloat]
+    y: list[FiniteFloat]
+    visible: list[FiniteFloat] | None = None
+
+
+class _Object(BaseModel):
+    """A person, or another thing, of Ultralytics."""
+
+    model_config = ConfigDict(strict=True)
+    keypoints: _Columns | None = None
+
+    def flat(self, place: str) -> list[float]:
+        """x, y and score of each keypoint; those that are hardly seen are in the corner 0 0."""
+        own = self.keypoints
+        if own is None:
+            return []
+        scores = [1.0] * len(own.x) if own.visible is None else own.visible
+        if not len(own.x) == len(own.y) == len(scores):
+            raise InputError(f"{place}.keypoints must have as many x, y and visible; {_RERUN[_YOLO]}")
+        rows = zip(own.x, own.y, scores, strict=True)
+        return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
+
+
+class _Body(BaseModel):
+    """A person of AlphaPose's --format cmu."""
+
+    model_config = ConfigDict(strict=True)
+    joints: Annotated[list[float], Field(min_length=1)]
+
+
+class _Bodies(BaseModel):
+    model_config = ConfigDict(strict=True)
+    bodies: list[_Body]
+
+
+class _PifPafFrame(BaseModel):
+    """A frame of OpenPifPaf's video."""
+
+    model_config = ConfigDict(strict=True)
+    frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
+    predictions: list[_Flat]
+
+
 _INSTANCES = TypeAdapter(list[_Instance])
+_FLAT, _OBJECTS = TypeAdapter(list[_Flat]), TypeAdapter(list[_Object])
 _RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
 
 
@@ -120,7 +184,11 @@ def read_json_people(place: Path) -> CameraPeople:
     """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
     if not place.is_dir():
         return read_one_file(place)
+    if (place / _SEP_JSON).is_dir() and len(frame_files(place)) == 0:
+        return read_frame_files(place / _SEP_JSON)
     lists = _lists(place)
+    if [each.name for each in lists] == [_ALL_FRAMES]:
+        return read_one_file(lists[0])
     if len(lists) == 1:
         items = JsonItems(lists[0], _LISTS)
         first = next(iter(items), None)
@@ -188,10 +256,7 @@ def read_frame_files(folder: Path) -> CameraPeople:
         raise InputError(f"{folder}: {what}")
     program, joints = _OPENPOSE, None
     if not files[0].name.endswith("_keypoints.json"):
-        content = read_json(files[0], most=MIDDLE)
-        picture = isinstance(content, list) or (isinstance(content, dict) and "instance_info" in content)
-        program = _PICTURES if picture else _POSE2SIM
-        joints = _joints_of_meta(content.get("meta_info")) if isinstance(content, dict) else None
+        program, joints = _program_of_frames(files)
     numbered = in_order([(frame_number(file), file) for file in files])
     first, last = numbered[0][0], numbered[-1][0]
     if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
@@ -200,6 +265,31 @@ def read_frame_files(folder: Path) -> CameraPeople:
     gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
     blocks = _frame_blocks(folder, program, numbered, joints)
     return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints)
+
+
+def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | None]:
+    """Whose files of frames these are, by the first with people, and the joints that it names."""
+    program, joints = _POSE2SIM, None
+    for n, file in enumerate(files[:_LOOKED_AT]):
+        content = read_json(file, most=MIDDLE)
+        if isinstance(content, dict):
+            if n == 0:
+                joints = _joints_of_meta(content.get("meta_info"))
+            if "instance_info" in content:
+                return _PICTURES, joints
+            if "bodies" in content:
+                return _SEPARATE, "openpose coco"
+            return program, joints
+        program = _PIFPAF if ".predictions." in file.name else _PICTURES
+        people = [each for each in content if isinstance(each, dict)] if isinstance(content, list) else []
+        if len(people) == 0:
+            continue
+        keypoints = next((each["keypoints"] for each in people if "keypoints" in each), None)
+        if isinstance(keypoints, dict) or "box" in people[0]:
+            return _YOLO, None
+        flat = isinstance(keypoints, list) and not isinstance(next(iter(keypoints), None), list)
+        return (_PIFPAF if flat else _PICTURES), None
+    return program, joints
 
 
 def _frame_blocks(
@@ -220,6 +310,15 @@ def _frame_blocks(
 def _people_of_frame(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
     """Flat keypoints of the people of a frame; people without keypoints are left out."""
     content, rerun, found = read_json(file, most=MIDDLE), _RERUN[program], list[list[float]]()
+    if program in (_PIFPAF, _SEPARATE):
+        if program == _PIFPAF:
+            flat = [each.keypoints for each in validated_list(_FLAT, content, file, rerun)]
+        else:
+            flat = [each.joints for each in validated(_Bodies, content, file, rerun).bodies]
+        return [_checked(each, f"{file}: [{number}]", program) for number, each in enumerate(flat)]
+    if program == _YOLO:
+        objects = validated_list(_OBJECTS, content, file, rerun)
+        return [own for number, each in enumerate(objects) if (own := each.flat(f"{file}: [{number}]"))]
     if program == _PICTURES:
         if isinstance(content, dict):
             if _joints_of_meta(content.get("meta_info")) != joints:
@@ -252,7 +351,12 @@ def _known(item: Any) -> bool:
 
 def read_one_file(path: Path) -> CameraPeople:
     """Read all frames that one camera saw; InputError naming file, key and cure."""
+    if (lines := _pifpaf_video(path)) is not None:
+        return lines
     items = JsonItems(path, _LISTS)
+    is_object = items.key is None and not items.found and isinstance(items.value, dict)
+    if is_object and (named := _by_picture(path)) is not None:
+        return named
     if items.key is not None and not items.found:
         raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
     every = iter(items)
@@ -311,6 +415,49 @@ class _Collected:
             for n in np.unique(part).tolist():
                 keypoints[part == n] = parts[n][index[part == n] - starts[n]]
             yield PeopleBlock(frames[index], keypoints)
+
+
+def _pifpaf_video(path: Path) -> CameraPeople | None:
+    """OpenPifPaf's file of a video, a line of JSON a frame; None where it is another file."""
+    with open_regular(path) as stream:
+        begin = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").replace(b" ", b"")
+    if not begin.startswith(b'{"frame":'):
+        return None
+    people, frames, last = _Collected(path, _PIFPAF), list[int](), -1
+    lines = read_text(path, most=LARGE).splitlines()
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        one = validated(_PifPafFrame, parse_json(line, path), path, _RERUN[_PIFPAF])
+        if one.frame <= last:
+            raise InputError(f"{path}: line {number}: frames must rise; {_RERUN[_PIFPAF]}")
+        last = one.frame
+        place = f"{path}: line {number}"
+        people.add([_checked(each.keypoints, place, _PIFPAF) for each in one.predictions])
+        frames += [one.frame] * len(one.predictions)
+    return people.camera(frames, (min(frames, default=0), last), None)
+
+
+def _by_picture(path: Path) -> CameraPeople | None:
+    """AlphaPose's file of --format open and cmu, people by the name of their picture; None where it is another."""
+    content = read_json(path, most=2**28)
+    kinds = {key for each in content.values() for key in (each if isinstance(each, dict) else ())}
+    if len(content) == 0 or not kinds & {"people", "bodies"}:
+        return None
+    people, numbered = _Collected(path, _SEPARATE), list[tuple[int, list[list[float]]]]()
+    for name, frame in content.items():
+        place, rerun = f"{path}: {name[:40]!r}", _RERUN[_SEPARATE]
+        number = _number(name, None, place, _SEPARATE)
+        if "bodies" in kinds:
+            flat = [each.joints for each in validated(_Bodies, frame, path, rerun).bodies]
+        else:
+            flat = [each.pose_keypoints_2d or [] for each in validated(_Frame, frame, path, rerun).people]
+        numbered.append((number, [_checked(each, place, _SEPARATE) for each in flat if each]))
+    for _, flat in numbered:
+        people.add(flat)
+    listed = [number for number, _ in numbered]
+    frames = [number for number, flat in numbered for _ in flat]
+    return people.camera(frames, (min(listed), max(listed)), "openpose coco")
 
 
 def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:

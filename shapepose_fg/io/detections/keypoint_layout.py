@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import body_points, keypoint_names, layouts_called, skeleton_of_names
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS, Skeleton
@@ -9,6 +12,11 @@ from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople
 
 _CURE = "name the detector's own with --skeleton"
+_MOST_PEOPLE = 200
+"""People of a camera whose looks are compared with a body's."""
+_SPREAD, _SIGMAS = 0.5, 2.5
+"""Spread of a person's fit that is assumed beside the seen one, nats a pair of joints, as few people alike are no
+proof; and how many sigmas are sure. Layouts differ by 0.7 to 1.7, some with two other joints by 0.07."""
 
 
 def skeleton_of_people(
@@ -33,7 +41,11 @@ def skeleton_of_people(
         return wanted, []
     if named is not None:
         skeleton, who, passed = named
-        over = [f"joints that the body does not have are passed over: {listing(passed)}"] if passed else []
+        over = (
+            [f"joints that the body does not have are passed over: {listing([_shown(each) for each in passed])}"]
+            if passed
+            else []
+        )
         return skeleton, [f"joints are those of {skeleton.name}: {who}", *over]
     if declared is not None:
         found, what = _declared(declared, count)
@@ -45,9 +57,64 @@ def skeleton_of_people(
         known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
         problem = "which is not known here"
         raise InputError(f"{place}, {problem}; describe them in a --skeleton file; known are {known}")
-    others = f" ({' '.join(each.name for each in alike[1:])} would have as many)" if len(alike) > 1 else ""
-    notes.append(f"{count} keypoints a person and no names of joints: taken as those of {alike[0].name}{others}")
-    return alike[0], notes
+    found, why = (alike[0], "") if len(alike) == 1 else _best_fit(people, alike)
+    said = f"{count} keypoints a person and no names of joints: taken as those of {found.name}{why}"
+    return found, [*notes, said]
+
+
+def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tuple[Skeleton, str]:
+    """Of layouts with as many keypoints the one that people fit surely better than the most usual, which is the
+    first, and why; the most usual where none does.
+
+    InputError where cameras surely fit different ones.
+    """
+    chosen: dict[str, CameraPeople] = {}
+    usual, fits = layouts[0], list[Array]()
+    for each in people:
+        if each.keypoint_count is not None:
+            fits.append(_fits(each.some(_MOST_PEOPLE), layouts))
+            if (best := _sure(fits[-1])) is not None:
+                chosen.setdefault(layouts[best].name, each.camera)
+    if len(chosen) > 1:
+        (one, first), (other, second) = list(chosen.items())[:2]
+        raise InputError(
+            f"{first.source}: joints lie as in {one}, those of {second.source} as in {other}; give the detections"
+            f" of one model for all cameras, or {_CURE}"
+        )
+    fits_of_all = np.concatenate(fits, axis=1)
+    best = _sure(fits_of_all)
+    if best is None:
+        rivals = [
+            each.name for each, fit in zip(layouts, fits_of_all, strict=True) if not _surely(fits_of_all[0] - fit)
+        ]
+        return usual, f", the most usual; people do not tell it from {', '.join(rivals[1:])}"
+    return layouts[best], ", as people look" + (f", and not as {usual.name}" if best > 0 else "")
+
+
+def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
+    """(L, N) how well people (N, K, 2) fit each layout, without those who tell nothing."""
+    from shapepose_fg.body.joint_order import fit_of_order
+
+    fits = np.array([fit_of_order(people, keypoint_names(each)) for each in layouts])
+    return fits[:, np.isfinite(fits).all(axis=0)]
+
+
+def _sure(fits: Array) -> int | None:
+    """The layout that people fit best (L, N), if surely better than the most usual, the first, or that one if it
+    surely fits better than all others; else None.
+    """
+    from shapepose_fg.body.joint_order import LIKE_A_BODY
+
+    if fits.shape[1] == 0 or fits.mean(axis=1).max() < LIKE_A_BODY:
+        return None
+    best = int(np.argmax(fits.mean(axis=1)))
+    rivals = range(1, len(fits)) if best == 0 else range(1)
+    return best if all(_surely(fits[best] - fits[rival]) for rival in rivals) else None
+
+
+def _surely(more: Array) -> bool:
+    """Whether people fit one layout surely better than another, by so much `more` (N,)."""
+    return len(more) > 0 and bool(more.mean() > _SIGMAS * np.sqrt((more.var() + _SPREAD**2) / len(more)))
 
 
 def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
@@ -113,11 +180,11 @@ def _called(
         layouts = layouts_called(joints)
         fit = [each for each in layouts if each.keypoint_count == count]
         if fit:
-            return (fit[0], []), f"{source} says {joints[:40]}"
+            return (fit[0], []), f"{source} says {_shown(joints)}"
         has = f"have {layouts[0].keypoint_count} keypoints, not {count}" if layouts else "are not known here"
-        return None, f"{source} says {joints[:40]}, which {has}"
+        return None, f"{source} says {_shown(joints)}, which {has}"
     if not any(body_points(joints)):
-        return None, f"{source} names joints that are not known here, such as {joints[0][:40]!r}"
+        return None, f"{source} names joints that are not known here, such as {_shown(joints[0])}"
     if len(joints) != count:
         raise InputError(
             f"{source} names {len(joints)} joints, and its people have {count} keypoints; correct the names, or"
@@ -127,3 +194,8 @@ def _called(
         return skeleton_of_names(joints), f"{source} names its joints"
     except ValueError as error:
         raise InputError(f"{source} names joints, but {str(error).partition(': ')[2]}; {_CURE}") from None
+
+
+def _shown(name: str) -> str:
+    """A name of another program, for a line of text."""
+    return name[:40] if name.isprintable() and name else repr(name[:40])

@@ -18,6 +18,8 @@ _RARE = 0.01
 """Scores are divided by what this share of them exceeds: the highest alone would be decided by one outlier."""
 _MOST_LOOKED_AT = 4_000_000
 """Of more scores than this every second, third ... is looked at for that."""
+_BLOCKS_LOOKED_AT = 10
+"""Blocks of a camera's people that are read to see what they look like."""
 _OCCLUDED = 0.5
 """The score of a keypoint that an annotator marked though it was hidden: COCO's visibility 1 of 2."""
 
@@ -108,6 +110,15 @@ class KeptPeople:
             xy = np.abs(block.keypoints[block.keypoints[..., 2] > 0][:, :2])
             if not np.isnan(xy).all():
                 self.farthest = max(self.farthest or 0.0, float(np.nanmax(xy)))
+
+    def some(self, most: int) -> Array:
+        """(N, K, 2) positions of some of them, at most so many, spread over the recording; NaN where not seen."""
+        count = self.keypoint_count or 0
+        names = self._names[:: -(-len(self._names) // _BLOCKS_LOOKED_AT) if self._names else 1]
+        parts = [np.asarray(self._kept.array(name, "keypoints")) for name in names]
+        every = np.concatenate([np.zeros((0, count, 3)), *(part[:: -(-len(part) // most)] for part in parts)])
+        every = every[:: -(-len(every) // most) if len(every) > 0 else 1]
+        return np.where(every[..., 2:] > 0, every[..., :2], np.nan)
 
     def blocks(self, *, last_time: bool = False) -> Iterator[PeopleBlock]:
         """The people in the order of their frames; the last time they are not kept any longer."""

@@ -3,6 +3,7 @@
 A format of your own is an entry in `FORMATS` and a function that reads it.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +14,14 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
+from shapepose_fg.io.detections.arrays import read_freemocap, read_sleap, what_it_is
 from shapepose_fg.io.detections.association_text import read_association_text
+from shapepose_fg.io.detections.csv_people import is_caliscope, is_deeplabcut, read_caliscope, read_deeplabcut
 from shapepose_fg.io.detections.json_people import read_json_people
 from shapepose_fg.io.detections.keypoint_layout import skeleton_of_people
 from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople, candidates_of, score_rule
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
+from shapepose_fg.io.detections.yolo import label_files, read_yolo
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000
@@ -41,10 +45,13 @@ class Format:
 JSON = Format(
     "JSON of OpenPose, Pose2Sim, MMPose, AlphaPose, or COCO's keypoint results",
     ("{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json"),
-    lambda place, camera: read_json_people(place),
+    lambda place, camera: _read_folder(place, camera),
 )
-FORMATS = [Format("4D Association's text", ("{}.txt",), read_association_text), JSON]
+CSV = Format("CSV of DeepLabCut and AniPose", ("{}.csv",), lambda place, camera: read_deeplabcut(place))
+HDF5 = Format("SLEAP's analysis HDF5", ("{}.h5", "{}.analysis.h5"), lambda place, camera: read_sleap(place))
+FORMATS = [Format("4D Association's text", ("{}.txt",), read_association_text), JSON, CSV, HDF5]
 """The first by whose names some camera has a file or folder reads those of all cameras."""
+_FREEMOCAP_FILES = re.compile(r"2dData_numCams_numFrames_numTrackedPoints_pixelXY\.npy$|^mediaPipeData_2d\.npy$")
 
 
 def read_detections(
@@ -94,7 +101,11 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
     InputError naming the camera that is missing.
     """
     if path.is_file():
-        raise InputError(f"{path}: this is a file; give the folder that holds the detections of all cameras")
+        if (form := _of_all_cameras(path, rig)) is not None:
+            return form, [path] * len(rig), []
+        known = what_it_is(path)
+        what = "this is a file" if known is None else f"this is {known}"
+        raise InputError(f"{path}: {what}; give the folder that holds the detections of all cameras")
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; check the path of the detections")
     folder = path / "detection" if (path / "detection").is_dir() else path
@@ -112,16 +123,56 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
                 f" {folder} holds {holds}; add them, or choose cameras by --without {missing}"
             )
     # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
-    offered = [each for each in entries if each.is_dir() or each.suffix == ".json"]
-    names = [each.name.removesuffix(".json").removesuffix("_json") for each in offered]
-    told = told_by_parts(folder, rig.names, offered, names)
-    if told is None:
-        raise InputError(
-            f"{folder}: no detections of the cameras {' '.join(rig.names)} here, only {holds}; give the folder"
-            " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
-            " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
-        )
-    return JSON, *told
+    for form, offered in (
+        (JSON, [each for each in entries if each.is_dir() or each.suffix == ".json"]),
+        (CSV, _unfiltered([each for each in entries if each.suffix == ".csv" and is_deeplabcut(each)])),
+        (HDF5, _unfiltered([each for each in entries if each.suffix in (".h5", ".hdf5")])),
+    ):
+        names = [each.name.removesuffix(each.suffix).removesuffix("_json") for each in offered]
+        # What DeepLabCut adds to a video's name has numbers of its own.
+        names = [re.split(r"DLC[_A-Za-z]", name)[0] for name in names]
+        if (told := told_by_parts(folder, rig.names, offered, names)) is not None:
+            return form, *told
+    whole = [
+        (form, each) for each in entries if each.is_file() and (form := _of_all_cameras(each, rig)) is not None
+    ]
+    if len(whole) == 1:
+        form, file = whole[0]
+        return form, [file] * len(rig), []
+    if len(whole) > 1:
+        names = " ".join(file.name for _, file in whole)
+        raise InputError(f"{folder}: several files of all cameras ({names[:200]}); give the one to be read")
+    for each in entries:
+        if each.is_file() and (known := what_it_is(each)) is not None:
+            raise InputError(f"{each}: this is {known}")
+    raise InputError(
+        f"{folder}: no detections of the cameras {' '.join(rig.names)} here, only {holds}; give the folder"
+        " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
+        " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
+    )
+
+
+def _of_all_cameras(file: Path, rig: Rig) -> Format | None:
+    """The format of a file that holds all cameras; None where it is none."""
+    names = rig.names
+    if _FREEMOCAP_FILES.search(file.name) is not None:
+        return Format("", (), lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)))
+    if file.suffix == ".csv" and is_caliscope(file):
+        return Format("", (), lambda place, camera: read_caliscope(place, names.index(camera.name), names))
+    return None
+
+
+def _unfiltered(files: list[Path]) -> list[Path]:
+    """Files, without DeepLabCut's `_filtered` ones of those that are there as they were detected."""
+    there = {each.name for each in files}
+    return [each for each in files if each.name.replace("_filtered", "") not in there - {each.name}]
+
+
+def _read_folder(place: Path, camera: Camera) -> CameraPeople:
+    """The people in a camera's folder or file: YOLO's labels, or JSON."""
+    if place.is_dir() and not any(place.glob("*.json")) and len(label_files(place)) > 0:
+        return read_yolo(place, camera.image_size)
+    return read_json_people(place)
 
 
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:

@@ -77,24 +77,29 @@ def assemble(
     and nobody is seen in those that a camera lacks. Raises InputError where there are none, or where the views do
     not fit their pictures.
     """
-    views, count, said = _longest(views) if own_frames else _common(views)
+    views, count, said = _any_frame(views) if own_frames else _common(views)
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
     for n, blocks in enumerate(zip_longest(*(view.blocks for view in views), fillvalue=_NOTHING)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
         stop = min((n + 1) * BLOCK_FRAMES, count)
         keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
     notes = tuple(note for each in ideal for reason in each.reasons for note in reason.note())
-    return DetectionTable(skeleton, kept, count, tuple(view.source for view in views), (*said, *notes))
+    table = DetectionTable(skeleton, kept, count, tuple(view.source for view in views), (*said, *notes))
+    if all(view.frame_count == count for view in views):
+        return table
+    frame = np.arange(count)
+    has = [np.where(frame < view.frame_count, frame, -1) for view in views]
+    return replace(table, picture=np.column_stack(has))
 
 
-def _longest(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
-    """The views, and how many frames the longest has; InputError where they begin at different numbers."""
-    first = max(views, key=lambda view: view.frame_count)
-    for view in views:
-        if view.first_number != first.first_number:
-            what = f"starts at frame {view.first_number}, but {first.source} starts at frame {first.first_number}"
-            raise InputError(f"{view.source} {what}; number the files of every camera from its first frame")
-    return views, first.frame_count, []
+def _any_frame(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
+    """The frames that any view has, how many there are, and a note where views begin at different numbers."""
+    start = min(view.first_number for view in views)
+    count = max(view.first_number + view.frame_count for view in views) - start
+    if all(view.first_number == start for view in views):
+        return views, count, []
+    note = f"{views[0].source.parent}: frame 0 is number {start} of the files ({_spans(views)})"
+    return [_part(view, start - view.first_number, count) for view in views], count, [note]
 
 
 def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
@@ -103,8 +108,7 @@ def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, lis
     stop = min(view.first_number + view.frame_count for view in views)
     if all(view.first_number == start and view.frame_count == stop - start for view in views):
         return views, stop - start, []
-    spans = ", ".join(f"{view.source.name} {_span_words(view)}" for view in views[:12])
-    spans += f" and {len(views) - 12} more" if len(views) > 12 else ""
+    spans = _spans(views)
     if start >= stop:
         for view in views:  # what is wrong with their files goes first
             for _ in view.blocks:
@@ -119,6 +123,12 @@ def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, lis
     return [_part(view, start - view.first_number, count) for view in views], count, [note]
 
 
+def _spans(views: Sequence[ViewStream]) -> str:
+    """Which frames each view has."""
+    words = ", ".join(f"{view.source.name} {_span_words(view)}" for view in views[:12])
+    return words + (f" and {len(views) - 12} more" if len(views) > 12 else "")
+
+
 def _span_words(view: ViewStream) -> str:
     """How many frames a view has, and their numbers."""
     if view.frame_count == 0:
@@ -127,7 +137,9 @@ def _span_words(view: ViewStream) -> str:
 
 
 def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
-    """The `count` frames of a view that follow its first `lead`; all of its blocks are read."""
+    """The `count` frames of a view that follow its first `lead`, or of `-lead` empty frames and its own where that
+    is negative. All blocks of the view are read.
+    """
 
     def blocks() -> Iterator[ViewCandidates]:
         waiting, number = _NOTHING, 0

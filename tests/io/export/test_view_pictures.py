@@ -77,6 +77,7 @@ def filmed(result, scene, tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     rerun = pytest.importorskip("rerun")
     take = read_take(filmed, frames=range(FIRST, FIRST + 3))
@@ -104,6 +105,7 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     assert np.median(away) < 0.5
 
 
+@pytest.mark.slow
 def test_frames_that_are_other_frames_of_the_camera(filmed):
     """The result's frame 1 is frame 3 of the camera; its frame 2 none, its frame 3 one that was not filmed."""
     take = read_take(filmed)

@@ -1,0 +1,166 @@
+"""People in arrays: FreeMoCap's NumPy file of all cameras, SLEAP's analysis HDF5 of each; never a pickle."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.errors import InputError, optional
+from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.io.detection_table import BLOCK_FRAMES
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+
+_FREEMOCAP, _SLEAP = "FreeMoCap's 2D points", "SLEAP's analysis HDF5"
+_RERUN = "write the detections again, in pixels"
+_MOST_VALUES = 2**29
+"""Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
+_MOST_NAMES = 1000
+_BLAZEPOSE = 33
+"""MediaPipe's points of the body come first; hands and face follow."""
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_OTHERS = {
+    ".npy": "a NumPy array, and only FreeMoCap's of (cameras, frames, points, 2 or 3) pixels is known here",
+    ".npz": "a NumPy archive, which has no layout of its own",
+    ".mat": "a MATLAB file, which has no layout of its own",
+    ".pkl": "a Python pickle, which could run code and is not opened",
+    ".pickle": "a Python pickle, which could run code and is not opened",
+    ".slp": "a SLEAP project; export the analysis HDF5: sio export FILE.slp -o FILE.h5",
+    ".h5": "an HDF5 file, and only SLEAP's analysis files are known here; of DeepLabCut or AniPose give the CSV"
+    " (deeplabcut.analyze_videos_converth5_to_csv)",
+    ".hdf5": "an HDF5 file, and only SLEAP's analysis files are known here",
+    ".parquet": "a Parquet table, which has no layout of its own",
+    ".c3d": "a C3D file of points in 3D, and 2D detections are needed",
+    ".trc": "a TRC file of points in 3D, and 2D detections are needed",
+}
+
+
+def what_it_is(path: Path) -> str | None:
+    """What a file is that cannot be read, and how to bring its content; None where its ending tells nothing."""
+    if (known := _OTHERS.get(path.suffix.lower())) is None:
+        return None
+    cure = "" if ";" in known else "; write what it holds as <camera>.json, COCO's keypoint results"
+    return f"{known}{cure}"
+
+
+def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
+    """One person before camera number `camera` of so many, which are in the file in the calibration's order.
+
+    The file is (cameras, frames, points, 2 or 3): pixels, NaN where nobody is seen; a third number is a score
+    where it lies between 0 and 1, else MediaPipe's depth, which is not used. InputError naming file and cure.
+    """
+    with open_regular(path) as stream:
+        shape, dtype, fortran, offset = _header(path, stream)
+        if len(shape) != 4 or shape[3] not in (2, 3) or dtype.kind != "f":
+            raise InputError(f"{path}: holds {dtype} of shape {shape}; {what_it_is(path)}")
+        if shape[0] != cameras:
+            raise InputError(
+                f"{path}: has {shape[0]} cameras, and {cameras} are wanted; give the calibration of the same"
+                " recording, with all of its cameras in their order"
+            )
+        if np.prod(shape, dtype=float) > _MOST_VALUES:
+            raise InputError(f"{path}: {shape} are too many numbers; cut the recording into parts")
+        size = path.stat().st_size - offset
+        if size < int(np.prod(shape)) * dtype.itemsize:
+            raise InputError(f"{path}: the file ends too early; copy it again")
+    order = "F" if fortran else "C"
+    every = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=shape, order=order)
+    own = every[camera]
+    body = _BLAZEPOSE if "mediapipe" in path.name.lower() and shape[2] >= _BLAZEPOSE else shape[2]
+    third = own[:, :body, 2] if shape[3] == 3 else None
+    scored = third is not None and not ((third < 0) | (third > 1)).any() and bool(np.isfinite(third).any())
+
+    def blocks() -> Iterator[PeopleBlock]:
+        for start in range(0, shape[1], BLOCK_FRAMES):
+            part = np.array(own[start : start + BLOCK_FRAMES, :body], dtype=np.float64)
+            seen = np.isfinite(part[..., :2]).all(axis=2)
+            score = np.nan_to_num(part[..., 2]) if scored else np.ones(seen.shape)
+            points = np.concatenate([np.nan_to_num(part[..., :2]), np.where(seen, score, 0.0)[..., None]], axis=2)
+            frame = np.flatnonzero(seen.any(axis=1))
+            yield PeopleBlock(frame + start, points[frame])
+
+    joints = "mediapipe" if body == _BLAZEPOSE else None
+    return CameraPeople(path, _FREEMOCAP, blocks(), 0, shape[1] - 1, rerun=_RERUN, joints=joints)
+
+
+def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:
+    """Shape, type and order of the array in an .npy file, and where its numbers begin."""
+    try:
+        version = npy.read_magic(stream)
+        shape, fortran, dtype = _HEADERS[version](stream)
+    except Exception:  # NumPy parses the header as Python's own text, with all errors of that
+        raise InputError(f"{path}: this is no NumPy array; {what_it_is(path)}") from None
+    if dtype.hasobject:
+        raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
+    return shape, dtype, fortran, stream.tell()
+
+
+def read_sleap(path: Path) -> CameraPeople:
+    """The people of one camera: each track is one, its nodes are named. InputError naming file and cure."""
+    h5py = optional("h5py", "hdf5")
+    with open_regular(path) as stream:
+        if stream.read(8) != b"\x89HDF\r\n\x1a\n":
+            raise InputError(f"{path}: this is no HDF5 file; {what_it_is(path)}")
+    try:
+        with h5py.File(path, "r") as file:
+            tracks = _dataset(h5py, file, "tracks")
+            names = _dataset(h5py, file, "node_names")
+            if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
+                raise InputError(f"{path}: {what_it_is(path)}")
+            joints = tuple(_text(each) for each in names[:])
+            xy = _ordered(path, tracks, ("frame", "track", "node", "xy"), ("track", "xy", "node", "frame"))
+            scores = _dataset(h5py, file, "point_scores")
+            if scores is not None and scores.ndim == 3:
+                score = _ordered(path, scores, ("frame", "track", "node"), ("track", "node", "frame"))
+            else:
+                score = np.ones(xy.shape[:3])
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again") from None
+    if xy.shape[3] != 2 or xy.shape[2] != len(joints) or score.shape != xy.shape[:3]:
+        raise InputError(
+            f"{path}: tracks are {xy.shape}, and there are {len(joints)} node_names; export it again with SLEAP"
+        )
+    seen = np.isfinite(xy).all(axis=3)
+    score = np.where(seen, np.where(np.isfinite(score), score, 1.0), 0.0)
+    points = np.concatenate([np.where(seen[..., None], xy, 0.0), score[..., None]], axis=3)
+
+    def blocks() -> Iterator[PeopleBlock]:
+        for start in range(0, len(points), BLOCK_FRAMES):
+            part = slice(start, start + BLOCK_FRAMES)
+            frame, track = np.nonzero(seen[part].any(axis=2))
+            yield PeopleBlock(frame + start, points[part][frame, track])
+
+    return CameraPeople(path, _SLEAP, blocks(), 0, len(points) - 1, rerun=_RERUN, joints=joints)
+
+
+def _dataset(h5py: Any, file: Any, name: str) -> Any:
+    """A dataset of the file itself: None where there is none, or its numbers are in another file."""
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        return None
+    found = file[name]
+    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+        return None
+    return found
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+
+
+def _ordered(path: Path, dataset: Any, wanted: tuple[str, ...], usual: tuple[str, ...]) -> Array:
+    """All of a dataset, with its axes in the order that is wanted; they are as it says, or as `usual`."""
+    if dataset.size > _MOST_VALUES:
+        raise InputError(f"{path}: {dataset.shape} are too many numbers; export a part of the recording")
+    axes = usual
+    if "dims" in dataset.attrs:
+        said = json.loads(_text(dataset.attrs["dims"])[:1000])
+        if not isinstance(said, list) or sorted(map(str, said)) != sorted(usual):
+            raise InputError(f"{path}: its dims are {str(said)[:80]}, not {' '.join(usual)}; export it again")
+        axes = tuple(said)
+    values = np.asarray(dataset[:], dtype=np.float64)
+    return values.transpose([axes.index(axis) for axis in wanted])

@@ -1,0 +1,191 @@
+"""People in CSV: DeepLabCut's and AniPose's of one camera, with three or four header rows; Caliscope's of all."""
+
+import csv
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import open_regular, text_pieces
+from shapepose_fg.io.camera_names import MOST_FRAME, match_names
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+from shapepose_fg.io.validation import is_number
+
+_DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
+_RERUN = "write the detections again, in pixels"
+_MOST_COLUMNS = 10_000
+_BLAZEPOSE = 33
+"""Caliscope numbers MediaPipe's points of the body so; those of hands and face have other numbers."""
+_LINES = 4096
+"""Lines that are taken in together."""
+
+
+def head_of(path: Path) -> list[str]:
+    """The first line's fields; none where it is no text."""
+    with open_regular(path) as stream:
+        line = stream.read(4096).split(b"\n", 1)[0]
+    try:
+        return [word.strip() for word in line.decode("utf-8-sig").split(",")]
+    except UnicodeError:
+        return []
+
+
+def is_deeplabcut(path: Path) -> bool:
+    """Whether a CSV file begins as DeepLabCut's do."""
+    return head_of(path)[:1] == ["scorer"]
+
+
+def is_caliscope(path: Path) -> bool:
+    """Whether a CSV file has the columns of Caliscope's points of all cameras."""
+    return {"sync_index", "img_loc_x", "img_loc_y"} <= set(head_of(path))
+
+
+def read_deeplabcut(path: Path) -> CameraPeople:
+    """The people of one camera: one, or each individual; body parts are named. InputError naming line and cure."""
+    rows = _rows(path)
+    heads = dict[str, list[str]]()
+    for _, row in islice(rows, 4):
+        heads[row[0].strip()] = [word.strip() for word in row[1:]]
+        if row[0].strip() == "coords":
+            break
+    if "bodyparts" not in heads or "coords" not in heads:
+        raise InputError(f"{path}: no rows bodyparts and coords under scorer, as DeepLabCut writes them; {_RERUN}")
+    parts, coords = heads["bodyparts"], heads["coords"]
+    count = min(len(parts), len(coords))
+    whose = heads.get("individuals", [""] * count)
+    people = dict[str, dict[str, dict[str, int]]]()
+    for column, (one, part, axis) in enumerate(zip(whose, parts, coords, strict=False), start=1):
+        people.setdefault(one, {}).setdefault(part, {})[axis] = column
+    joints = tuple(next(iter(people.values()))) if people else ()
+    # Parts that all animals share, such as corners of the cage, are an individual of other parts.
+    columns = [
+        [[axes.get(name, 0) for name in ("x", "y", "likelihood")] for axes in own.values()]
+        for own in people.values()
+        if tuple(own) == joints
+    ]
+    if len(joints) == 0 or any(0 in axes[:2] for own in columns for axes in own):
+        raise InputError(f"{path}: each body part must have the columns x and y; {_RERUN}")
+    picked = np.array(columns)
+    width = count + 1
+
+    frames, found, first, last = list[Index](), list[Array](), 0, -1
+    while len(some := list(islice(rows, _LINES))) > 0:
+        numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[:, 0]
+        if (np.diff(numbers, prepend=last) <= 0).any():
+            line = some[int(np.argmax(np.diff(numbers, prepend=last) <= 0))][0]
+            raise InputError(f"{path}: line {line}: frames must rise; {_RERUN}")
+        first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
+        values = np.array([_numbers(path, line, row, width) for line, row in some])
+        taken = np.where(picked > 0, values[:, picked], 1.0)  # no likelihood: as sure as any
+        seen = np.isfinite(taken).all(axis=3)
+        taken = np.where(seen[..., None], taken, 0.0)
+        row, person = np.nonzero(seen.any(axis=2))
+        frames.append(numbers[row])
+        found.append(taken[row, person])
+    if last < 0:
+        raise InputError(f"{path}: no frames under the heads; {_RERUN}")
+    blocks = (PeopleBlock(*each) for each in zip(frames, found, strict=True) if len(each[0]) > 0)
+    return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+
+
+def read_caliscope(path: Path, camera: int, cameras: list[str]) -> CameraPeople:
+    """One person before camera number `camera` of `cameras`, with MediaPipe's points; frames are `sync_index`.
+
+    InputError naming line and cure.
+    """
+    rows = _rows(path)
+    _, head = next(rows)
+    names = [word.strip() for word in head]
+    who = next((name for name in ("cam_id", "port") if name in names), None)
+    what = next((name for name in ("keypoint_id", "point_id") if name in names), None)
+    if who is None or what is None:
+        raise InputError(f"{path}: no columns cam_id and keypoint_id (or port and point_id); export it again")
+    columns = [names.index(each) for each in ("sync_index", who, what, "img_loc_x", "img_loc_y")]
+    parts = []
+    while len(some := list(islice(rows, _LINES))) > 0:
+        values = np.array([_numbers(path, line, row, len(names)) for line, row in some])[:, columns]
+        bad = ~np.isfinite(values).all(axis=1) | (values[:, :3] != np.round(values[:, :3])).any(axis=1)
+        bad |= (values[:, :3] < 0).any(axis=1) | (values[:, 0] >= MOST_FRAME)
+        if bad.any():
+            line = some[int(np.argmax(bad))][0]
+            raise InputError(f"{path}: line {line} must hold whole numbers and pixels; export it again")
+        parts.append(values)
+    table = np.concatenate(parts) if parts else np.zeros((0, 5))
+    ports = np.unique(table[:, 1].astype(np.intp)).tolist()
+    if table[:, 2].max(initial=0) > _BLAZEPOSE and not (table[:, 2] == 0).any():
+        table = table[:0]
+    if len(table) == 0:
+        raise InputError(f"{path}: no points of a person's body; track with Caliscope's POSE or HOLISTIC")
+    own = table[table[:, 1] == _port(path, camera, cameras, ports)]
+    own = own[own[:, 2] < _BLAZEPOSE]
+    frame, place = np.unique(own[:, 0].astype(np.intp), return_inverse=True)
+    keypoints = np.zeros((len(frame), _BLAZEPOSE, 3))
+    keypoints[place, own[:, 2].astype(np.intp)] = np.column_stack([own[:, 3:], np.ones(len(own))])
+    first, last = int(table[:, 0].min()), int(table[:, 0].max())
+    blocks = iter([PeopleBlock(frame, keypoints)])
+    return CameraPeople(path, _CALISCOPE, blocks, first, last, rerun=_RERUN, joints="mediapipe")
+
+
+def _port(path: Path, camera: int, cameras: list[str], ports: list[int]) -> int:
+    """The number that the file has for a camera."""
+    chosen = match_names(cameras, [str(port) for port in ports])
+    if chosen is not None:
+        return ports[chosen[camera]]
+    digits = "".join(each for each in cameras[camera] if each.isdigit())
+    if digits and int(digits) in ports:
+        return int(digits)
+    numbers = " ".join(map(str, ports))
+    raise InputError(f"{path}: has cameras {numbers}, and none is {cameras[camera]}; give its own calibration")
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Lines that are not empty, and their numbers; InputError on one that is too long or no CSV."""
+
+    def lines() -> Iterator[str]:
+        rest = ""
+        for piece in text_pieces(path):
+            *whole, rest = (rest + piece).split("\n")
+            yield from (f"{line}\n" for line in whole)
+            if len(rest) > 2**20:
+                raise InputError(f"{path}: a line has over a million characters; {_RERUN}")
+        if rest:
+            yield rest
+
+    reader = csv.reader(lines())
+    try:
+        for row in reader:
+            if len(row) > _MOST_COLUMNS:
+                raise InputError(f"{path}: line {reader.line_num} has {len(row)} columns; {_RERUN}")
+            if any(row):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise InputError(f"{path}: line {reader.line_num} is no CSV ({error}); {_RERUN}") from None
+
+
+def _frame(path: Path, line: int, word: str) -> int:
+    """The frame's number: the first field, or the last number in a picture's name."""
+    digits = ""
+    for each in reversed(word.strip().rsplit(".", 1)[0]):
+        if each.isdigit() and each.isascii():
+            digits = each + digits
+        elif digits:
+            break
+    if digits and len(digits) <= len(str(MOST_FRAME)):
+        return int(digits)
+    raise InputError(f"{path}: line {line} begins with no frame's number, {word[:40]!r}; {_RERUN}")
+
+
+def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
+    """The numbers of a line, NaN where a field is empty; what stands in the first field does not count."""
+    if len(row) != width:
+        raise InputError(f"{path}: line {line} must hold {width} fields, got {len(row)}; {_RERUN}")
+    found = []
+    for n, word in enumerate(row):
+        text = word.strip()
+        if n > 0 and text and not is_number(text) and text.lower() != "nan":
+            raise InputError(f"{path}: line {line} must hold numbers, got {text[:20]!r}; {_RERUN}")
+        found.append(float(text) if is_number(text) else np.nan)
+    return found
