@@ -16,11 +16,10 @@ import numba
 from numba.extending import typeof_impl
 
 from shapepose_fg.core.compiling import compile_beside, saying
-from shapepose_fg.core.kept_kernels import kept_in, module_folder
+from shapepose_fg.core.kept_kernels import NUMBA, OPTIONS, kept_in, module_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": {"contract", "reassoc"}, "no_cfunc_wrapper": True}
 _NUMBERS = {"f": numba.float64, "i": numba.intp, "b": numba.boolean}
 _NUMBERS |= {"s": numba.float32, "w": numba.int32, "u": numba.uint8}
 
@@ -70,7 +69,7 @@ class Kernel:
     def load(self) -> Any:
         """Read or compile it for the types that it names, with all others that are missing; `loaded`."""
         with _lock:
-            if numba.config.DISABLE_JIT:
+            if NUMBA.DISABLE_JIT:
                 return self.py_func
             if self.loaded is None and not self.is_kept:
                 compile_beside([each for each in KERNELS.values() if not each.is_kept])
@@ -110,7 +109,7 @@ class Kernel:
         return None
 
     def _compile(self, function: Any) -> Any:
-        with saying("" if self.is_kept else f"compiling {self.__name__} for this machine"):
+        with saying("" if self.is_kept else f"compiling {self.name} for this machine"):
             function.compile(signature(self))
         return function
 
@@ -121,7 +120,7 @@ def _type_within_kernels(kernel: Kernel, context: Any) -> Any:
 
 
 def _njit(**options: Any) -> Any:
-    return cast(Any, numba.njit)(**_OPTIONS, **options)
+    return cast(Any, numba.njit)(**OPTIONS, **options)
 
 
 def signature(kernel: Any) -> tuple[Any, ...]:

@@ -64,7 +64,7 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
     # The same packages as here, whatever lies in the working folder.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)}
     command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()"]
-    started = list[subprocess.Popen[bytes]]()
+    started = list[subprocess.Popen[Any]]()
     try:
         for share in shares:
             words = command + [each.name for each in share]

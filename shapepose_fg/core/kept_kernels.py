@@ -16,11 +16,20 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, cast
 
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
+OPTIONS: dict[str, Any] = {
+    "error_model": "numpy",
+    "nogil": True,
+    "fastmath": {"contract", "reassoc"},
+    "no_cfunc_wrapper": True,
+}
+"""Numba's options of everything that is compiled."""
+NUMBA: Any = cast(Any, numba).config
+"""Numba's own settings, from its environment variables."""
 _GIVEN = "SHAPEPOSE_FG_KERNELS"
 """Environment variable that names a process's temporary folder to the processes that it starts."""
 _SPACE = 50_000_000
@@ -105,27 +114,30 @@ def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
     code = function.__code__.replace(co_filename=str(folder / Path(function.__code__.co_filename).name))
     copy = FunctionType(code, function.__globals__, function.__name__, function.__defaults__)
     copy.__qualname__ = function.__qualname__
-    given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, ""
+    given, NUMBA.CACHE_DIR = NUMBA.CACHE_DIR, ""
     try:
         return njit(copy)
     finally:
-        numba.config.CACHE_DIR = given
+        NUMBA.CACHE_DIR = given
 
 
 @cache
 def _digest(module: str) -> str:
     """Of the sources that a module's kernels are compiled from, of Numba, Python and the processor."""
-    config = numba.config
-    features = config.CPU_FEATURES if config.CPU_FEATURES is not None else get_host_cpu_features().flatten()
-    host = (numba.__version__, sys.implementation.cache_tag, config.CPU_NAME or get_host_cpu_name(), features)
+    given = NUMBA.CPU_FEATURES
+    features = get_host_cpu_features().flatten() if given is None else given
+    options = sorted(f"{name}={sorted(each) if isinstance(each, set) else each}" for name, each in OPTIONS.items())
+    host = (
+        options,
+        numba.__version__,
+        sys.implementation.cache_tag,
+        NUMBA.CPU_NAME or get_host_cpu_name(),
+        features,
+    )
     state = hashlib.sha256(repr(host).encode())
-    for content in sorted(Path(each).read_bytes() for each in {_OPTIONS, *_sources(module)}):
+    for content in sorted(Path(each).read_bytes() for each in _sources(module)):
         state.update(content)
     return state.hexdigest()[:16]
-
-
-_OPTIONS = str(Path(__file__).with_name("compiled.py"))
-"""File that has the options of all kernels."""
 
 
 @cache

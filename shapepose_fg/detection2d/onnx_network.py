@@ -2,6 +2,8 @@
 
 import hashlib
 import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -21,6 +23,12 @@ Blob = NDArray[np.float32]
 """What it takes and gives."""
 PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
 """onnxruntime's names of devices."""
+_TRY = """
+import sys, cv2, numpy
+cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), dtype=numpy.uint8))
+"""
+_LOADS_S = 120
+"""Longest time to read a network, seconds; 400 MB take a few."""
 _BATCH = 32
 """Pictures at once: a crowd fills no memory."""
 
@@ -69,6 +77,7 @@ class OnnxNetwork:
 
 def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
     """`forward` of the network run by OpenCV's dnn, on the CPU, which takes pictures of any size."""
+    _try_elsewhere(file, content)
     try:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
         empty = net.empty()
@@ -82,6 +91,29 @@ def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
         return [np.asarray(net.forward(), dtype=np.float32)]
 
     return (forward,)
+
+
+def _try_elsewhere(file: Path, content: bytes) -> None:
+    """InputError where OpenCV, in a process of its own, dies of a network or does not come back: of damaged files,
+    it may do either.
+    """
+    if not sys.executable:
+        return
+    command = [sys.executable, "-P", "-c", _TRY]  # -P: nothing is imported from the present folder
+    try:
+        done = subprocess.run(
+            command,
+            input=content,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=_LOADS_S,
+            check=False,
+        )
+        what = "it makes OpenCV crash" if done.returncode < 0 else ""
+    except subprocess.TimeoutExpired:
+        what = f"OpenCV takes over {_LOADS_S} s to read it"
+    if what:
+        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({what}); give another copy of it")
 
 
 def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:

@@ -28,7 +28,7 @@ from shapepose_fg.live.filtering import Filter
 from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
-from shapepose_fg.live.views import ViewsInStep, joined, with_pose
+from shapepose_fg.live.views import MOST_S, ViewsInStep, joined, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.workers import workers as worker_processes
@@ -53,8 +53,6 @@ _OFF_CLOCK = 10
 """Views in a row whose time is elsewhere, after which a camera is named, and the frames of `push` are believed."""
 _STANDS = 30
 """So many more views without a pose than with one say that a camera is where the rig has it after all."""
-_MOST_S = 1e12
-"""Largest time, seconds: behind it, doubles are too coarse for pictures."""
 _BACK_S = 1.0
 """Poses of cameras that move are kept for so much longer than a frame can wait to be solved."""
 
@@ -380,8 +378,8 @@ class OnlineReconstructor:
         return list(self._said)
 
     def _check_time(self, time_s: Array) -> None:
-        if not (np.abs(time_s) <= _MOST_S).all():
-            raise ValueError(f"time_s must be finite, and at most {_MOST_S:g}")
+        if not (np.abs(time_s) <= MOST_S).all():
+            raise ValueError(f"time_s must be finite, and at most {MOST_S:g}")
 
     def _check(self, detections: Detections) -> None:
         for name, values, count in (

@@ -23,7 +23,7 @@ from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import CommonClock
 from shapepose_fg.live.filtering import OF_TRACKS, Filter, Gone, Moment
 from shapepose_fg.live.refining import LiveState, Slot
-from shapepose_fg.live.views import ViewsInStep, joined
+from shapepose_fg.live.views import MOST_S, SHORTEST_S, ViewsInStep, joined
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
@@ -35,6 +35,8 @@ _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """The columns of detections."""
 _POSES = ("time_s", "wTb", "covariance")
 """The columns of poses of cameras that move, beside the carrier's name."""
+_MOST_PIXELS, _MOST_APART_M, _MOST_AFFINITY = 1e9, 1e3, 10
+"""Largest coordinate of a detection, px, distance of a camera from the others, m, and affinity."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """The counts of a state."""
 _COLUMNS = {
@@ -145,6 +147,13 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         raise ValueError("its rows are not of its frames")
     if not all(np.isfinite(found[name]).all() for name in ("mean", "covariance", "time_s", "seen.xy")):
         raise ValueError("its tracks, times and detections must be finite")
+    covariance = found["covariance"]
+    small = 1e-6 * np.abs(covariance).max(axis=(-2, -1), initial=0.0)
+    asymmetric = np.abs(covariance - covariance.mT).max(axis=(-2, -1), initial=0.0) > small
+    if asymmetric.any() or (np.linalg.eigvalsh(covariance)[..., 0] < -small).any():
+        raise ValueError("covariances of its tracks must be symmetric, with no negative eigenvalue")
+    if not all((found[name] >= 0).all() for name in ("peak_s", "length_m", "count")):
+        raise ValueError("bones and the most evidence of its tracks must not be negative")
     if (np.diff(found["time_s"].mean(axis=1)) <= 0).any():
         raise ValueError("its frames must be in order of time")
     slots, starts = [], np.vstack([np.zeros((1, 8), dtype=np.int64), np.cumsum(counts, axis=0)])
@@ -172,13 +181,22 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
 
 
 def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
-    """ValueError where detections are of no camera or joint, or people have others than these."""
+    """ValueError where detections are of no camera or joint, or nowhere, or people have others than these."""
+    if not (np.abs(seen.xy) <= _MOST_PIXELS).all():
+        raise ValueError("its detections must be finite")
+    for each, most in ((seen.confidence, 1), (seen.affinity, _MOST_AFFINITY)):
+        if not ((each >= 0) & (each <= most)).all():
+            raise ValueError(f"confidences and affinities of its detections must be 0 to 1 and {_MOST_AFFINITY}")
     within = all(
         len(values) == 0 or (values.min() >= 0 and values.max() < most)
         for values, most in ((seen.view, views), (seen.joint, joints), (seen.pairs, len(seen)))
     )
     if not within or (candidate.size > 0 and (candidate.min() < -1 or candidate.max() >= len(seen))):
         raise ValueError("its detections are of other cameras, joints or people")
+    person, joint, view = np.nonzero(candidate >= 0)
+    own = candidate[person, joint, view]
+    if (seen.joint[own] != joint).any() or (seen.view[own] != view).any():
+        raise ValueError("its people have detections of other joints or cameras")
 
 
 def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
@@ -244,11 +262,21 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     seen = {}
     for name in ("waiting", "before"):
         seen[name] = Detections(**{each: arrays[f"{name}.{each}"] for each in _DETECTIONS})
-        _check(seen[name], np.zeros(0, dtype=np.int64), V, len(skeleton))
+        _check(seen[name], np.zeros((0, len(skeleton), V), dtype=np.int64), V, len(skeleton))
     waiting = {
         view: (seen["waiting"].only(seen["waiting"].view == view), float(arrays["waiting_s"][view]))
         for view in np.flatnonzero(np.isfinite(arrays["waiting_s"])).tolist()
     }
+    done_s, period_s = arrays["clock"].tolist()
+    late = np.concatenate([arrays["waiting_s"], last_s, heard_s, [done_s]])
+    if (np.abs(late[np.isfinite(late)]) > MOST_S).any() or np.isposinf(late).any() or np.isnan(last_s).any():
+        raise ValueError(f"times must be at most {MOST_S:g} s")
+    if np.isnan(done_s) or not SHORTEST_S <= period_s <= 2 * MOST_S:
+        raise ValueError(f"clock must hold a time, and a period of {SHORTEST_S:g} s at least")
+    if not (np.isnan(apart_m) | ((apart_m >= 0) & (apart_m < _MOST_APART_M))).all() or np.isnan(heard_s).any():
+        raise ValueError("cameras must hold distances, and times")
+    if (arrays["counts"] < 0).any():
+        raise ValueError("counts must not be negative")
     if not np.isin(code, list(CameraState)).all():
         raise ValueError("cameras must have states that there are")
     watch = CameraWatch(apart_m, heard_s, code.astype(np.int64))

@@ -16,9 +16,10 @@ _ASSUMED_S = 1 / 30
 """Between a camera's pictures, until it has given two."""
 _FRESH = 0.05
 """How much of a camera's period its last step is."""
-_SHORTEST_S = 1 / 250
+SHORTEST_S = 1 / 250
 """Shortest time between a camera's pictures: closer ones are one picture, told twice."""
-
+MOST_S = 1e12
+"""Largest time, seconds: behind it doubles are too coarse for pictures."""
 _BEFORE_S = 0.4
 """A camera was so long where its first pose has it."""
 
@@ -47,7 +48,7 @@ class ViewsInStep:
 
     def is_late(self, view: int, time_s: float) -> bool:
         """Whether the frame of this view is complete without it, or it is the camera's last one again."""
-        step_s = min(self.period_s, max(time_s - float(self.heard_s[view]), _SHORTEST_S))
+        step_s = min(self.period_s, max(time_s - float(self.heard_s[view]), SHORTEST_S))
         return time_s <= max(self.heard_s[view], self.done_s + step_s / 2)
 
     def heard(self, view: int, time_s: float) -> None:
@@ -59,7 +60,7 @@ class ViewsInStep:
         found = self.rest() if view in self.waiting else []
         step_s = time_s - float(self.heard_s[view])
         if np.isfinite(step_s):
-            self.period_s += _FRESH * (min(max(step_s, _SHORTEST_S), 3 * self.period_s) - self.period_s)
+            self.period_s += _FRESH * (min(max(step_s, SHORTEST_S), 3 * self.period_s) - self.period_s)
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
         # Before the first frame every camera is waited for, until one comes again.

@@ -194,6 +194,20 @@ def test_what_can_not_be_kept_is_said_with_the_cure(program):
     assert "cannot be written; set NUMBA_CACHE_DIR" in program()[2]
 
 
+@pytest.mark.slow
+def test_the_command_compiles_all_ahead():
+    """In the cache of the user who runs the tests, where most are already."""
+    command = [sys.executable, "-m", "shapepose_fg", "compile"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert " kept in " in done.stdout
+    place = os.environ | {"NUMBA_CACHE_DIR": "/proc/nothing"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=place)
+    assert (
+        done.returncode == 2
+        and "/proc/nothing/shapepose-fg: cannot be written; set NUMBA_CACHE_DIR" in done.stderr
+    )
+
+
 def test_a_reconstruction_calls_kernels_with_the_types_that_they_name():
     """Each is compiled once: for one more layout of an array it would be compiled again, for seconds."""
 

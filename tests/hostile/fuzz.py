@@ -2,7 +2,7 @@
 
 Every reader of files from others, also of runs, finished and not, and of what exports read (readers.py), is run
 on changed files. A case may end in a result or an InputError. Anything else, over 20 s, over 1 GiB beyond what
-was in use before, or a file written elsewhere is a fault: its file is kept in data/fuzz, where
+was in use before, or a file written, or read, elsewhere is a fault: its file is kept in data/fuzz, where
 test_every_reader.py tries it again.
 
 With `--cases` each reader gets so many, the same ones each time. With `--seconds` they are guided by which lines

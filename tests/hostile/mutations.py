@@ -45,6 +45,8 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         if content[:2] == b"PK" and rng.random() < 0.9:
             content = _archive(content, rng)
+        elif content[:3] == b"\x08\x07:" and rng.random() < 0.7:
+            content = _fields(content, rng)
         elif content[8:10] == b'{"' and rng.random() < 0.8:
             content = _tensors(content, rng)
         elif content[:1] in (b"{", b"[") and rng.random() < 0.6:
@@ -241,3 +243,78 @@ def _bytes(content: bytes, rng: random.Random) -> bytes:
             return content[: place + length] + content[place:]
         case _:
             return content[:place] + b"\xff" * length + content[place + length :]
+
+
+_ELSEWHERE = b"j\x12\x0a\x08location\x12\x06canary", b"p\x01", b"j\x12\x12\x06canary\x0a\x08location", b"j\x00"
+"""What a tensor of ONNX says whose numbers are in the file "canary"."""
+
+
+def _fields(content: bytes, rng: random.Random) -> bytes:
+    """A message of protobuf with one of its fields, or of a message in it, changed; lengths right again."""
+    fields, at = list[tuple[bytes, bytes | None, bytes]](), 0
+    while at < len(content):  # tag, value of a number, content
+        try:
+            start = at
+            tag, at = _number(content, at)
+            head = content[start:at]
+            if tag & 7 == 2:
+                length, at = _number(content, at)
+                fields.append((head, None, content[at : at + length]))
+                at += length
+            else:
+                start, at = at, _number(content, at)[1] if tag & 7 == 0 else at + (8 if tag & 7 == 1 else 4)
+                fields.append((head, content[start:at], b""))
+        except IndexError:
+            return _bytes(content, rng)
+    if len(fields) == 0:
+        return rng.choice((b"", *_ELSEWHERE))
+    n = rng.randrange(len(fields))
+    head, value, inner = fields[n]
+    match rng.randrange(12):
+        case 0:
+            del fields[n]
+        case 1:
+            fields.insert(n, fields[rng.randrange(len(fields))])
+        case 2:
+            fields[n] = fields[rng.randrange(len(fields))]
+        case 3:
+            fields[n] = rng.choice((b"\xba\x00", b"\x3b", b"\x3c", bytes([rng.randrange(128)]))), value, inner
+        case 4:
+            fields[n] = _wide(head, rng), value, inner
+        case 5 if value is None:
+            fields[n] = head, None, inner + rng.choice(_ELSEWHERE)
+        case 6 if value is None:
+            fields[n] = head, None, inner * 2
+        case _ if value is None:
+            fields[n] = head, None, _fields(inner, rng) if rng.random() < 0.8 else _bytes(inner, rng)
+        case _:
+            fields[n] = (
+                head,
+                rng.choice((b"\0", b"\1", b"\x7f", b"\xff" * 9 + b"\1", b"\x81\x80\x80\x80\x10")),
+                b"",
+            )
+    return b"".join(
+        head + (value if value is not None else _length(len(inner), rng) + inner) for head, value, inner in fields
+    )
+
+
+def _number(content: bytes, at: int) -> tuple[int, int]:
+    """A whole number of protobuf at a place, and where it ends."""
+    value = shift = 0
+    while content[at] > 127:
+        value, at, shift = value | (content[at] & 127) << shift, at + 1, shift + 7
+    return value | content[at] << shift, at + 1
+
+
+def _length(number: int, rng: random.Random) -> bytes:
+    """A whole number as protobuf writes it; now and then in more bytes."""
+    out = b""
+    while number > 127:
+        out, number = out + bytes([number & 127 | 128]), number >> 7
+    return out + bytes([number]) if rng.random() < 0.97 else _wide(out + bytes([number]), rng)
+
+
+def _wide(number: bytes, rng: random.Random) -> bytes:
+    """The same whole number in more bytes, or with bits that 32 do not hold."""
+    more = b"\x80" * rng.randrange(9)
+    return number[:-1] + bytes([number[-1] | 128]) + more + rng.choice((b"\0", b"\x10", b"\x01"))

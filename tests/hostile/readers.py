@@ -32,8 +32,10 @@ from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.recording import read_moments, write_moments
 from shapepose_fg.io.skeleton_file import read_skeleton
+from shapepose_fg.io.solved_setup import cameras_of
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.io.trajectories import read_trajectory
+from shapepose_fg.pipeline.explaining import explain
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.solving import Solver
 from shapepose_fg.tracking.edits import Action, Edit
@@ -41,7 +43,7 @@ from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
 from tests.conftest import read_body
 from tests.core import test_reconstruction as results
-from tests.hostile import runs
+from tests.hostile import runs, streams
 from tests.hostile.trying import Prepare
 from tests.io import test_calibration_formats as rigs
 from tests.io import test_detections_of_other_programs as others
@@ -229,6 +231,16 @@ def _listed(folder: Path) -> None:
         list_saved_tracks(opened, read_body())
 
 
+def _explained(folder: Path) -> None:
+    """Every tenth joint of everybody, in the first frame in which each is."""
+    people, rig = Reconstruction.load(folder), cameras_of(folder)
+    for person in np.unique(people.person).tolist()[:2]:
+        frame = int(people.frame[people.person == person][0])
+        for joint in people.joint_names.tolist()[::10]:
+            found = explain(people, rig, person=person, joint=joint, frame=frame)
+            json.dumps(found.as_dict(), allow_nan=False)
+
+
 def _settings_of(folder: Path) -> None:
     Solver.read(folder, Reconstruction.load(folder))
 
@@ -349,6 +361,15 @@ READERS: dict[str, Prepare] = {
     "project of Pose2Sim": _project,
     "recordings": _recordings,
     "batch": _batch,
+    "ONNX": streams.network,
+    "ONNX's file": streams.network_file,
+    "photo, JPEG": streams.photo("JPEG"),
+    "photo, PNG": streams.photo("PNG"),
+    "photo, TIFF": streams.photo("TIFF"),
+    "MCAP of poses": streams.mcap("poses"),
+    "MCAP of detections": streams.mcap("detections"),
+    "lines of live": streams.live_lines,
+    "state of live": streams.live_state,
     "network": _network,
     "corrections": _corrections,
     "footage": _footage,
@@ -357,6 +378,7 @@ READERS: dict[str, Prepare] = {
     "result": _result,
     **{f"result as {name}": runs.finished(runs.exported(name)) for name in FORMATS},
     "result for its report": runs.finished(report_of),
+    "result to be explained": runs.finished(_explained),
     "result for its tracks": runs.finished(_listed),
     "result for corrections": runs.finished(_merged),
     "result and its settings": runs.finished(_settings_of),

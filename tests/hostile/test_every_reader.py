@@ -22,6 +22,7 @@ MOST_S = 5.0
 
 
 HEAVY = ("result as amass", "result as glb", "result as rrd", "result for its report", "run before its bodies")
+HEAVY += ("ONNX", "lines of live", "state of live", "result to be explained")
 
 
 @pytest.mark.parametrize("name", [*sorted(READERS.keys() - set(HEAVY)), *slow(*HEAVY)])

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import user_cache
 from tests.hostile.mutations import mutated
 
 CASE_S, CASE_MB = 20, 1024
@@ -32,6 +33,13 @@ _CHANGES = {
     "os.rmdir": ((0, 1),),
 }
 """What Python tells of files that are changed: which arguments are paths, and the folders that these are in."""
+_KERNELS = os.path.realpath(os.environ.get("NUMBA_CACHE_DIR") or user_cache("kernels"))
+"""Where compiled functions are kept, which are part of the program."""
+_READABLE = (
+    *{os.path.realpath(each) for each in (sys.prefix, sys.base_prefix, Path(__file__).parents[2], _KERNELS)},
+    *("/proc", "/sys", "/dev"),
+)
+"""Where files may be read besides: this project and what it is made of."""
 _allowed: list[tuple[str, ...]] = []
 """Where files may be changed at present: the last ones count."""
 _outside: list[str] = []
@@ -71,12 +79,14 @@ class Trial:
         finally:
             file.write_bytes(self.valid[number])
             if len(_outside) > 0:
-                raise AssertionError(f"written elsewhere: {_outside}")
+                raise AssertionError(f"written or read elsewhere: {_outside}")
 
 
 @contextmanager
 def only_in(*folders: str | Path) -> Iterator[None]:
-    """What Python itself changes outside of these folders during the block is an AssertionError."""
+    """What Python itself changes outside of these folders during the block, or reads outside of them and of the
+    program, is an AssertionError.
+    """
     if len(_allowed) == 0 and not _watching:
         sys.addaudithook(_watch)
         _watching.append(True)
@@ -97,13 +107,18 @@ def _watch(event: str, told: tuple[Any, ...]) -> None:
     paths: list[tuple[Any, Any]] = []
     if event == "open" and told[2] is not None and told[2] & _WRITES:
         paths = [(told[0], -1)]
+    elif event == "open" and isinstance(told[0], str | bytes):
+        place = Path(os.path.realpath(os.fsdecode(told[0])))
+        if not any(place.is_relative_to(each) for each in (*_allowed[-1], *_READABLE)):
+            _outside.append(f"open {place}")
+            raise AssertionError(f"read elsewhere: {place}")
     elif event in _CHANGES:
         paths = [(told[path], told[folder]) for path, folder in _CHANGES[event]]
     for path, folder in paths:
         if isinstance(path, str | bytes):
             named = Path("." if folder == -1 else f"/proc/self/fd/{folder}") / os.fsdecode(path)
             place = Path(os.path.realpath(named.parent)) / named.name
-            inside = any(place.is_relative_to(each) for each in _allowed[-1])
+            inside = any(place.is_relative_to(each) for each in (*_allowed[-1], _KERNELS))
             if not inside and str(place) != os.devnull and "__pycache__" not in place.parts:
                 _outside.append(f"{event} {place}")
                 raise AssertionError(f"written elsewhere: {place}")

@@ -108,6 +108,7 @@ def sleap(folder: Path, name: str, people: np.ndarray, _: object, *, standard: b
             tracks.attrs["dims"] = json.dumps(["frame", "track", "node", "xy"])
             scores.attrs["dims"] = json.dumps(["frame", "track", "node"])
         file.create_dataset("node_names", data=[each.encode() for each in NAMES])
+        file.create_dataset("track_occupancy", data=np.isfinite(xy).any(axis=(2, 3)))
         file.create_dataset("track_names", data=[b"a", b"b"])
 
 

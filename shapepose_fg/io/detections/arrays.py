@@ -1,9 +1,8 @@
 """People in arrays: FreeMoCap's NumPy file of all cameras, SLEAP's analysis HDF5 of each; never a pickle."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -18,7 +17,11 @@ _FREEMOCAP, _SLEAP = "FreeMoCap's 2D points", "SLEAP's analysis HDF5"
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
-_MOST_NAMES = 1000
+_SMALL_BYTES, _MOST_PACKED = 2**27, 50
+"""Bytes of an array of a packed file, small or at the most so many times the file: columns of NaN pack well."""
+_MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
+_RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
+"""How HDF5 keeps a text of any length: how long it is, and where."""
 _BLAZEPOSE = 33
 """MediaPipe's points of the body come first; hands and face follow."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -110,14 +113,15 @@ def read_sleap(path: Path) -> CameraPeople:
             names = _dataset(h5py, file, "node_names")
             if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
                 raise InputError(f"{path}: {what_it_is(path)}")
-            joints = tuple(_text(each) for each in names[:])
-            xy = _ordered(path, tracks, ("frame", "track", "node", "xy"), ("track", "xy", "node", "frame"))
-            scores = _dataset(h5py, file, "point_scores")
-            if scores is not None and scores.ndim == 3:
-                score = _ordered(path, scores, ("frame", "track", "node"), ("track", "node", "frame"))
-            else:
-                score = np.ones(xy.shape[:3])
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, UnicodeError) as error:
+            joints = _names(path, names)
+            xy, score = _numbers(path, tracks), None
+            if (scores := _dataset(h5py, file, "point_scores")) is not None and scores.ndim == 3:
+                score = _numbers(path, scores)
+            occupancy = _dataset(h5py, file, "track_occupancy")
+            if not _frames_first(xy.shape, len(joints), None if occupancy is None else occupancy.shape):
+                xy, score = xy.transpose(3, 0, 2, 1), None if score is None else score.transpose(2, 0, 1)
+            score = np.ones(xy.shape[:3]) if score is None else score
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again") from None
@@ -148,19 +152,47 @@ def _dataset(h5py: Any, file: Any, name: str) -> Any:
     return found
 
 
-def _text(value: Any) -> str:
-    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+def _names(path: Path, names: Any) -> tuple[str, ...]:
+    """The texts of a dataset (N,). Those of any length are read here: libhdf5 trusts damaged lengths."""
+    if names.dtype.kind == "S" and names.dtype.itemsize <= _LONGEST_NAME:
+        return tuple(each.decode("utf-8") for each in names[:])
+    begin = names.id.get_offset() if names.dtype.kind == "O" and names.chunks is None else None
+    if begin is None:
+        raise InputError(f"{path}: node_names are no plain texts; export it again with SLEAP")
+    with open_regular(path) as stream:
+        stream.seek(begin)
+        records = np.frombuffer(stream.read(len(names) * _RECORD.itemsize), dtype=_RECORD)
+        return tuple(_from_heap(stream, *map(int, record)).decode("utf-8") for record in records.tolist())
 
 
-def _ordered(path: Path, dataset: Any, wanted: tuple[str, ...], usual: tuple[str, ...]) -> Array:
-    """All of a dataset, with its axes in the order that is wanted; they are as it says, or as `usual`."""
-    if dataset.size > _MOST_VALUES:
+def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes:
+    """A text from one of HDF5's global heaps; ValueError where it is not there."""
+    stream.seek(address)
+    head = stream.read(16)
+    size = int.from_bytes(head[8:], "little")
+    if head[:4] != b"GCOL" or not 16 <= size <= _LARGEST_HEAP or length > _LONGEST_NAME:
+        raise ValueError("a text is not where it should be")
+    heap, at = stream.read(size - 16), 0
+    while at + 16 <= len(heap):
+        number, begin = int.from_bytes(heap[at : at + 2], "little"), at + 16
+        if number == index:
+            return heap[begin : begin + length]
+        at = begin + -(-int.from_bytes(heap[at + 8 : begin], "little") // 8) * 8
+    raise ValueError("a text is not in its heap")
+
+
+def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...] | None) -> bool:
+    """Whether `tracks` are (frames, tracks, nodes, 2), sleap-io's standard, and not as MATLAB reads them:
+    (tracks, 2, nodes, frames). `occupancy` are (frames, tracks) in both.
+    """
+    standard, matlab = tracks[2:] == (nodes, 2), tracks[1:3] == (2, nodes)
+    if standard and matlab and occupancy is not None:
+        return occupancy != (tracks[3], tracks[0])
+    return standard and not matlab
+
+
+def _numbers(path: Path, dataset: Any) -> Array:
+    """All of a dataset."""
+    if 8 * dataset.size > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size) or dataset.dtype.kind not in "fiu":
         raise InputError(f"{path}: {dataset.shape} are too many numbers; export a part of the recording")
-    axes = usual
-    if "dims" in dataset.attrs:
-        said = json.loads(_text(dataset.attrs["dims"])[:1000])
-        if not isinstance(said, list) or sorted(map(str, said)) != sorted(usual):
-            raise InputError(f"{path}: its dims are {str(said)[:80]}, not {' '.join(usual)}; export it again")
-        axes = tuple(said)
-    values = np.asarray(dataset[:], dtype=np.float64)
-    return values.transpose([axes.index(axis) for axis in wanted])
+    return np.asarray(dataset[:], dtype=np.float64)
