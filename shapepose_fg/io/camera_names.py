@@ -45,12 +45,12 @@ def _own_words(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
     return found if all(found) and len(set(found)) == len(found) else None
 
 
-def _one_number_each(names: Sequence[str]) -> list[int] | None:
+def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
     """The only number in each name; None where one has none or several, or two have the same."""
     found = [_NUMBERS.findall(name) for name in names]
     if any(len(each) != 1 for each in found):
         return None
-    numbers = [int(each[0]) for each in found]
+    numbers: list[tuple[str | int, ...]] = [(int(each[0]),) for each in found]
     return numbers if len(set(numbers)) == len(numbers) else None
 
 

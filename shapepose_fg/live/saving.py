@@ -35,7 +35,8 @@ _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """The columns of detections."""
 _POSES = ("time_s", "wTb", "covariance")
 """The columns of poses of cameras that move, beside the carrier's name."""
-_MOST_PIXELS, _MOST_APART_M = 1e9, 1e3
+_MOST_PIXELS, _MOST_APART_M, _MOST_AFFINITY = 1e9, 1e3, 10
+"""Largest coordinate of a detection, px, distance of a camera from the others, m, and affinity."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """The counts of a state."""
 _COLUMNS = {
@@ -183,8 +184,9 @@ def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
     """ValueError where detections are of no camera or joint, or nowhere, or people have others than these."""
     if not (np.abs(seen.xy) <= _MOST_PIXELS).all():
         raise ValueError("its detections must be finite")
-    if not all(((each >= 0) & (each <= 1)).all() for each in (seen.confidence, seen.affinity)):
-        raise ValueError("confidences and affinities of its detections must be 0 to 1")
+    for each, most in ((seen.confidence, 1), (seen.affinity, _MOST_AFFINITY)):
+        if not ((each >= 0) & (each <= most)).all():
+            raise ValueError(f"confidences and affinities of its detections must be 0 to 1 and {_MOST_AFFINITY}")
     within = all(
         len(values) == 0 or (values.min() >= 0 and values.max() < most)
         for values, most in ((seen.view, views), (seen.joint, joints), (seen.pairs, len(seen)))
