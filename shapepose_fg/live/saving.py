@@ -154,6 +154,8 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         raise ValueError("covariances of its tracks must be symmetric, with no negative eigenvalue")
     if not all((found[name] >= 0).all() for name in ("peak_s", "length_m", "count")):
         raise ValueError("bones and the most evidence of its tracks must not be negative")
+    if not (np.abs(found["times"][:, 0] - found["time_s"].mean(axis=1)) < 1e-3).all():
+        raise ValueError("its tracks must be of the times of its frames")
     if (np.diff(found["time_s"].mean(axis=1)) <= 0).any():
         raise ValueError("its frames must be in order of time")
     slots, starts = [], np.vstack([np.zeros((1, 8), dtype=np.int64), np.cumsum(counts, axis=0)])

@@ -116,7 +116,8 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
     def placed(now_s: float) -> Iterator[View]:
         while waiting:
             (camera, seen, time_s), frame = waiting[0]
-            (pose,), (surely,), (there,) = frames.at(frame, np.array([time_s]))
+            with naming(file, _CURE_POSES):
+                (pose,), (surely,), (there,) = frames.at(frame, np.array([time_s]))
             stands = not (carrier[camera] or frames.moves(frame))
             if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
                 return
