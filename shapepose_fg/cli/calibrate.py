@@ -41,7 +41,9 @@ class LensOptions:
     """What a 2D detector saw, and the lenses it saw it through."""
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
-    skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
+    skeleton: str | None = option(
+        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+    )
     calibration: Path | None = option(INPUT, "File of the lenses; its poses, if any, are not used.")
     field_of_view: list[str] | None = option(
         INPUT,

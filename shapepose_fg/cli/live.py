@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 def live(
     cameras: CameraOptions,
     detections: str | None = option(INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; standard input."),
-    skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME"),
+    skeleton: str | None = option(
+        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+    ),
     lag: float = option(TIME, "How much later refined people follow, seconds.", 0.3),
     output: list[str] | None = option(
         RESULT, "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun to look; standard output; may be repeated."

@@ -180,7 +180,9 @@ class DetectionOptions(CameraOptions):
     """Cameras, and what a 2D detector saw with them."""
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
-    skeleton: str | None = option(INPUT, "The detector's skeleton, or a TOML file of it.", metavar="NAME")
+    skeleton: str | None = option(
+        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+    )
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used, or do not see depth."""

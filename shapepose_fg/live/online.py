@@ -408,8 +408,10 @@ class OnlineReconstructor:
         last_s = slots[-1].time_s if len(slots) > 0 else time_s
         before, stands = self._state.watch, self._state.rig.at(times)
         watch, rig = before.seen(detections, self._state.before, stands, time_s)
+        last = slots[-1].moment if len(slots) > 0 else self._state.begin
         given = Input(self._state.frames, times, _without(detections, rig), rig)
-        moment, candidate = self._filter.step(slots[-1].moment if len(slots) > 0 else self._state.begin, given)
+        given = self._filter.tracker.with_sides_held(last.tracks, given)
+        moment, candidate = self._filter.step(last, given)
         self._state.frames += 1
         self._state.before = detections
         seen = (moment.views >= 2) & moment.named[:, None]
@@ -459,7 +461,9 @@ class OnlineReconstructor:
         """Follow from slot `first` on once more."""
         for at in range(first, len(self._state.slots)):
             slot = self._state.slots[at]
-            slot.moment, slot.candidate = self._filter.step(self._state.slots[at - 1].moment, slot.given)
+            last = self._state.slots[at - 1].moment
+            slot.given = self._filter.tracker.with_sides_held(last.tracks, slot.given)
+            slot.moment, slot.candidate = self._filter.step(last, slot.given)
             if slot.refined is not None:
                 slot.moment = fed_back(self._filter.tracker, slot.moment, slot.refined)
         self._show()

@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
+from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of, with_sides_held
 
 BLOCK_S = 3.0
 """People are decided for so long at a time: in some of its frames everybody is seen well."""
@@ -87,6 +87,7 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     """Rows of the first `own` keyframes that are pending; and none, for now, of the frames between."""
     keys = [n for n, frame in enumerate(state.pending) if frame.key]
     frames, until = [state.pending[n] for n in keys], [*keys, len(state.pending)][own]
+    frames = with_sides_held(tracker, frames, state.people)
     found, chosen = explained(tracker, frames, state.people, own - 1)
     rest = found.account.left_over(chosen)
     for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
@@ -95,7 +96,8 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
     rows = {keys[t]: _rows(frame, t, found, chosen, identity) for t, frame in enumerate(frames[:own])}
     nobody = next(iter(rows.values())).rows(slice(0, 0))
-    decided = [(frame, rows.get(n, nobody)) for n, frame in enumerate(state.pending[:until])]
+    held = dict(zip(keys, frames, strict=True))
+    decided = [(held.get(n, frame), rows.get(n, nobody)) for n, frame in enumerate(state.pending[:until])]
     last = chosen.during(own - 1) & (identity >= 0)
     who = chosen.hypothesis[last]
     people = people_at(frames[own - 1], identity[last], found.joints.rows(who))

@@ -16,13 +16,14 @@ from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
+from shapepose_fg.tracking.sides import with_sides_held
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 FindPeople = Callable[[Detections, Rig], Observations]
@@ -146,6 +147,15 @@ class Tracker:
         joints, candidate, evident = measured(joints, lost, candidate, weight, sight, self._trust, bones)
         evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
+
+    def with_sides_held(self, tracks: Tracks, given: Input) -> Input:
+        """The frame with the detections of people on the sides of the body on which the `tracks` have them."""
+        if len(tracks) == 0:
+            return given
+        step_s = float(given.time_s.mean()) - tracks.time_s
+        joints, _ = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)
+        held = with_sides_held(given.detections, joints.position, joints.sigma_m, given.rig, self.skeleton)
+        return given if held is given.detections else replace(given, detections=held)
 
     @cached_property
     def _bones(self) -> Bones:

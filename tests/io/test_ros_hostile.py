@@ -19,7 +19,7 @@ KINDS = (
     "geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Odometry",
     "tf2_msgs/TFMessage", "shapepose_msgs/Detections",
 )  # fmt: skip
-LINES = [(kind, line) for kind in KINDS for line in set(definition(kind).splitlines()) if line[:1].islower()]
+LINES = [(kind, line) for kind in KINDS for line in sorted({*definition(kind).splitlines()}) if line[:1].islower()]
 
 
 def write(path, kind: str, text: str, data: bytes, count: int = 2):

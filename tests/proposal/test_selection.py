@@ -117,7 +117,7 @@ def test_who_is_listed_twice_is_there_once(five_cameras, two_people, seen_exactl
 
 
 def test_a_ray_that_misses_hardly_moves_the_joint(five_cameras, two_people, seen_exactly):
-    """One of five views is 30 px off, 10 cm at the joint: half a detector's error is left of it."""
+    """One of five views is 30 px off, 10 cm at the joint: a detector's error at most is left of it."""
     detections = seen_exactly(five_cameras, two_people[:1])
     frame = frame_of(detections, five_cameras)
     hypothesis = settled(two_people[:1], every_detection(detections, 5), frame, 1)
@@ -127,7 +127,7 @@ def test_a_ray_that_misses_hardly_moves_the_joint(five_cameras, two_people, seen
     xy[hypothesis.chosen[0, 4, 0]] += [30.0, 0.0]
     places, gap_m = triangulated(hypothesis.chosen, frame_of(replace(detections, xy=xy), five_cameras))
     off_m = np.linalg.norm(places[0] - two_people[0], axis=1)
-    assert 0 < off_m[4] < 0.015 and np.delete(off_m, 4).max() < 1e-6
+    assert 0 < off_m[4] < 0.03 and np.delete(off_m, 4).max() < 1e-6
     assert gap_m[0, 4, 0] > 3 * np.delete(gap_m[0, 4], 0).max()
 
 
