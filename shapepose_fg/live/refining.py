@@ -116,12 +116,14 @@ class Refinery:
         for slot in window:
             ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
             names |= {track: name for track, name in zip(ids, who, strict=True) if name != ON_TRIAL}
-        decided = []
+        decided, tracks = [], np.array(sorted(names), dtype=np.int64)
         for n, slot in enumerate(window):
             # Frames are numbered by their times, in whatever order they came.
             given = replace(slot.given, frame=n)
             rows = self._filter.observations(slot.moment, slot.candidate, given)
-            decided.append((given, rows.rows(np.isin(rows.track, list(names)))))
+            rows = rows.rows(np.isin(rows.track, tracks))
+            # Tracks are counted anew in each window: keys of a graph do not reach as far as a service goes on.
+            decided.append((given, replace(rows, track=np.searchsorted(tracks, rows.track))))
         rows = Observations.concatenate([each for _, each in decided])
         if len(rows) == 0:
             return
@@ -129,6 +131,7 @@ class Refinery:
         part = self._pool.submit(
             Setup.solve, Span(tuple(decided), start, len(decided), rig=rig if rig.moves else None)
         )
+        names = {n: names[track] for n, track in enumerate(tracks.tolist())}
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:

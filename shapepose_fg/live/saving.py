@@ -21,7 +21,7 @@ from shapepose_fg.core.storage.schema import Column
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import CommonClock
-from shapepose_fg.live.filtering import OF_TRACKS, Filter, Gone, Moment
+from shapepose_fg.live.filtering import OF_TRACKS, ON_TRIAL, Filter, Gone, Moment
 from shapepose_fg.live.refining import LiveState, Slot
 from shapepose_fg.live.views import MOST_S, SHORTEST_S, ViewsInStep, joined
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -154,6 +154,8 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         raise ValueError("covariances of its tracks must be symmetric, with no negative eigenvalue")
     if not all((found[name] >= 0).all() for name in ("peak_s", "length_m", "count")):
         raise ValueError("bones and the most evidence of its tracks must not be negative")
+    if not (np.abs(found["times"][:, 0] - found["time_s"].mean(axis=1)) < 1e-3).all():
+        raise ValueError("its tracks must be of the times of its frames")
     if (np.diff(found["time_s"].mean(axis=1)) <= 0).any():
         raise ValueError("its frames must be in order of time")
     slots, starts = [], np.vstack([np.zeros((1, 8), dtype=np.int64), np.cumsum(counts, axis=0)])
@@ -172,6 +174,11 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         _check(seen, candidate, len(rig), J)
         time_s, sought_s = found["times"][n].tolist()
         joints = JointStates(found["mean"][a], found["covariance"][a])
+        ids, who = found["ids"][a], found["identity"][a]
+        if len(np.unique(ids)) < len(ids) or not ((ids >= 0) & (ids < track)).all():
+            raise ValueError("its tracks must have numbers of their own")
+        if not ((who >= ON_TRIAL) & (who < identity)).all():
+            raise ValueError("identities of its people must be below the next one")
         tracks = Tracks(time_s, found["ids"][a], found["world"][a], joints, found["evident_s"][a])
         own = {name: found[name][a] for name in OF_TRACKS}
         gone = Gone(*(found[f"gone.{each.name}"][g] for each in fields(Gone)))

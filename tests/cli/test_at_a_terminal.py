@@ -151,7 +151,8 @@ def test_a_log_has_lines_now_and_then(work, tmp_path):
         "import sys,", "from shapepose_fg.cli import terminal; terminal._EVERY_S = 0.3\nimport sys,"
     )
     command = [sys.executable, "-c", often]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "FORCE_COLOR": "", "TERM": "xterm"}
+    environment = {name: each for name, each in os.environ.items() if name != "FORCE_COLOR"}
+    environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm"}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     told = [line for line in done.stderr.splitlines() if line.startswith("looking through")]
     assert 1 <= len(told) <= 5 and re.search(r"\d+ of 40 frames, 0 min left", told[0])

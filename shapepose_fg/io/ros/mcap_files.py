@@ -3,6 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -115,7 +116,8 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
     def placed(now_s: float) -> Iterator[View]:
         while waiting:
             (camera, seen, time_s), frame = waiting[0]
-            (pose,), (surely,), (there,) = frames.at(frame, np.array([time_s]))
+            with naming(file, _CURE_POSES):
+                (pose,), (surely,), (there,) = frames.at(frame, np.array([time_s]))
             stands = not (carrier[camera] or frames.moves(frame))
             if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
                 return
@@ -129,14 +131,16 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
         for topic, kind, logged_s, message in _decoded(stream, file, {type_name(_DETECTIONS), *KINDS}, _CURE):
             begun_s = min(begun_s, logged_s)
             if kind != type_name(_DETECTIONS):
-                frames.add(topic, kind, message, f"{file}: topic {topic}")
+                with _whole(file, _CURE):
+                    frames.add(topic, kind, message, f"{file}: topic {topic}")
             else:
                 number += 1
-                people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
-                time_s = stamp_ns(message.header) / NS
-                view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
-                goes = carrier[message.camera]
-                waiting.append((view, frame_of(goes) if goes else message.header.frame_id.lstrip("/")))
+                with _whole(file, _CURE):
+                    people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
+                    time_s = stamp_ns(message.header) / NS
+                    view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
+                    goes = carrier[message.camera]
+                    waiting.append((view, frame_of(goes) if goes else message.header.frame_id.lstrip("/")))
             yield from placed(logged_s)
             if logged_s > tidied_s + 1.0:
                 frames.forget(logged_s - _POSES_KEPT_S)
@@ -154,13 +158,25 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
     frames = Frames()
     with open_regular(file, _CURE_POSES) as stream:
         for topic, kind, _, message in _decoded(stream, file, set(KINDS), _CURE_POSES):
-            frames.add(topic, kind, message, f"{file}: topic {topic}")
+            with _whole(file, _CURE_POSES):
+                frames.add(topic, kind, message, f"{file}: topic {topic}")
     known, wanted = frames.moving, frame.lstrip("/")
     if (not wanted and len(known) != 1) or (wanted and not frames.moves(wanted)):
         which = listing(known) if known else "none"
         raise InputError(f"{file}: frames that move in it are {which}; say which one, {file.name}#FRAME")
     with naming(f"{file}: frame {wanted or known[0]}", "record more"):
         return frames.trajectory(wanted or known[0], name)
+
+
+@contextmanager
+def _whole(file: Path, cure: str) -> Iterator[None]:
+    """InputError where a message in the block lacks a field, or has another kind of value there: the library may
+    take a damaged definition otherwise than `check_definition` does.
+    """
+    try:
+        yield
+    except (AttributeError, TypeError) as error:
+        raise InputError(f"{file}: cannot be read (a message lacks a field: {error}); {cure}") from None
 
 
 def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
