@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cloudpickle
 
@@ -116,7 +116,7 @@ def _local_cluster(count: int, dashboard: bool) -> Scheduler:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address="127.0.0.1:8787" if dashboard else None,
+            dashboard_address=cast(str, "127.0.0.1:8787" if dashboard else None),
             silence_logs=50,
         )
     _running.append(cluster)

@@ -42,7 +42,7 @@ def clipped(found: Detections, rig: Rig) -> Mask:
             here = found.view == view
             measured[here] = camera.distort(measured[here])
     edge = np.array([camera.image_size for camera in rig.cameras]) - 1 - _BORDER_PX
-    wrong = ((measured <= _BORDER_PX) | (measured >= edge[found.view])).any(axis=1)
+    wrong = np.asarray(((measured <= _BORDER_PX) | (measured >= edge[found.view])).any(axis=1))
     for along in (*measured.T, *-measured.T):
         highest = np.full(len(rig), -np.inf)
         np.maximum.at(highest, found.view, along)

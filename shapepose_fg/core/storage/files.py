@@ -9,6 +9,7 @@ import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
 from secrets import token_hex
 from typing import Any, BinaryIO
@@ -28,7 +29,7 @@ _BROKEN_OFF = re.compile(r"(-|\.|[eE][+-]?|tr?u?|fa?l?s?|nu?l?)?\s*")
 """What is left of a JSON text that ends within a number or a word, or between two values."""
 
 
-def open_regular(path: Path, cure: str = "check the path", most: int | None = None) -> BinaryIO:
+def open_regular(path: Path, cure: str = "check the path", most: int | None = None) -> BufferedReader:
     """The file at `path`, open for reading bytes.
 
     InputError where it is missing, unreadable, over `most` bytes, or no regular file: a pipe would wait for ever,

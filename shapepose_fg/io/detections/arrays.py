@@ -79,7 +79,7 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
     def blocks() -> Iterator[PeopleBlock]:
         for start in range(0, shape[1], BLOCK_FRAMES):
             part = np.array(own[start : start + BLOCK_FRAMES, :body], dtype=np.float64)
-            seen = np.isfinite(part[..., :2]).all(axis=2)
+            seen = np.asarray(np.isfinite(part[..., :2]).all(axis=2))
             score = np.nan_to_num(part[..., 2]) if scored else np.ones(seen.shape)
             points = np.concatenate([np.nan_to_num(part[..., :2]), np.where(seen, score, 0.0)[..., None]], axis=2)
             frame = np.flatnonzero(seen.any(axis=1))
@@ -129,7 +129,7 @@ def read_sleap(path: Path) -> CameraPeople:
         raise InputError(
             f"{path}: tracks are {xy.shape}, and there are {len(joints)} node_names; export it again with SLEAP"
         )
-    seen = np.isfinite(xy).all(axis=3)
+    seen = np.asarray(np.isfinite(xy).all(axis=3))
     score = np.where(seen, np.where(np.isfinite(score), score, 1.0), 0.0)
     points = np.concatenate([np.where(seen[..., None], xy, 0.0), score[..., None]], axis=3)
 

@@ -1,7 +1,7 @@
 """People in CSV: DeepLabCut's and AniPose's of one camera, with three or four header rows; Caliscope's of all."""
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -80,7 +80,7 @@ def read_deeplabcut(path: Path) -> CameraPeople:
         first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
         values = np.array([_numbers(path, line, row, width) for line, row in some])
         taken = np.where(picked > 0, values[:, picked], 1.0)  # no likelihood: as sure as any
-        seen = np.isfinite(taken).all(axis=3)
+        seen = np.asarray(np.isfinite(taken).all(axis=3))
         taken = np.where(seen[..., None], taken, 0.0)
         row, person = np.nonzero(seen.any(axis=2))
         frames.append(numbers[row])
@@ -91,7 +91,7 @@ def read_deeplabcut(path: Path) -> CameraPeople:
     return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
 
 
-def read_caliscope(path: Path, camera: int, cameras: list[str]) -> CameraPeople:
+def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeople:
     """One person before camera number `camera` of `cameras`, with MediaPipe's points; frames are `sync_index`.
 
     InputError naming line and cure.

@@ -206,20 +206,25 @@ def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
     if isinstance(names, dict):
         count = count if type(count) is int and 0 <= count <= len(names) else len(names)
         names = [names.get(str(place)) for place in range(count)]
-    if isinstance(names, list) and len(names) > 0 and all(isinstance(name, str) for name in names):
-        return tuple(names)
+    if named := _texts(names):
+        return named
     data_set = meta.get("dataset_name")
     return data_set if isinstance(data_set, str) else None
+
+
+def _texts(names: Any) -> tuple[str, ...]:
+    """A list of texts as a tuple; empty where it is anything else."""
+    listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return tuple(names) if listed else ()
 
 
 def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple[str, ...] | None:
     """The joints that COCO's `categories` name for those in use; None where they name none, or different ones."""
     found = set[tuple[str, ...]]()
     for each in categories if isinstance(categories, list) else []:
-        names = each.get("keypoints") if isinstance(each, dict) else None
-        named = isinstance(names, list) and len(names) > 0 and all(isinstance(name, str) for name in names)
+        named = _texts(each.get("keypoints")) if isinstance(each, dict) else ()
         if named and (None in used or each.get("id") in used):
-            found.add(tuple(names))
+            found.add(named)
     return found.pop() if len(found) == 1 else None
 
 
