@@ -19,9 +19,12 @@ def explain(
     results: Path = argument("RESULTS", "Folder of a reconstruction."),
     person: int = argument("PERSON", "Number of the person: `shapepose-fg tracks RESULTS` lists them."),
     joint: str = argument("JOINT", "Name of the joint, such as RWrist."),
-    frame: int | None = option(TIME, "In this frame; or"),
-    time: float | None = option(TIME, "in the person's frame nearest to this time, seconds."),
+    frame: int | None = option(TIME, "Frame number."),
+    time: float | None = option(TIME, "Time, seconds: the person's frame nearest to it is explained."),
     detections: Path | None = option(INPUT, "Folder that was reconstructed: names refused detections, too."),
+    skeleton: str | None = option(
+        INPUT, "The detector's joints, as in the reconstruction: a layout or a TOML file.", metavar="NAME"
+    ),
     as_json: bool = json_option(),
 ) -> None:
     """Say why a joint is where it is: what each camera, the body and motion say, and what is the matter."""
@@ -35,7 +38,7 @@ def explain(
         raise InputError("--frame, --time: give one of them")
     folder = results_folder(results)
     rig, people = cameras_of(folder), Reconstruction.load(folder)
-    seen = None if detections is None else read_detections(detections, rig)
+    seen = None if detections is None else read_detections(detections, rig, skeleton)
     found = explain(people, rig, person=person, joint=joint, frame=frame, time_s=time, detections=seen)
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))

@@ -162,6 +162,8 @@ class Rig:
     """Where the carriers of cameras that move go; two cameras on one robot share its trajectory."""
     notes: tuple[str, ...] = field(default=(), compare=False)
     """What a reader left out of the calibration file or took for granted, a sentence each."""
+    unwanted: tuple[str, ...] = field(default=(), compare=False)
+    """Names of cameras that `only` left out: what they saw is passed over, while an unknown camera is an error."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
@@ -192,7 +194,10 @@ class Rig:
         )
         carriers = {camera.carrier for camera in cameras}
         trajectories = tuple(each for each in self.trajectories if each.name in carriers)
-        return replace(self, cameras=cameras, dark=dark, doubted=doubted, trajectories=trajectories)
+        unwanted = (*self.unwanted, *(name for name in self.names if name not in names))
+        return replace(
+            self, cameras=cameras, dark=dark, doubted=doubted, trajectories=trajectories, unwanted=unwanted
+        )
 
     def without(self, names: Iterable[str]) -> "Rig":
         """A rig with all cameras but those of these names; ValueError where there is no such camera."""

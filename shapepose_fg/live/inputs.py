@@ -95,8 +95,8 @@ class _Sender:
         else:
             self._number += 1
 
-    def take(self, read: Callable[[str], tuple[Any, ...]]) -> None:
-        """Push what `read` makes of the name of the next line. InputError as in `line`."""
+    def take(self, read: Callable[[str], tuple[Any, ...] | None]) -> None:
+        """Push what `read` makes of the name of the next line, unless it is None. InputError as in `line`."""
         self._number += 1
         place = f"{self.name}, line {self._number}"
         try:
@@ -108,6 +108,8 @@ class _Sender:
             self.given.note(f"{error}; the line is left out")
             return
         self._bad = 0
+        if view is None:
+            return
         try:
             with naming(place):
                 self.given.push(*view)
@@ -122,7 +124,7 @@ class _Sender:
         if self.good == 0 and self.refused is not None:
             raise self.refused
 
-    def _read(self, line: bytes | None, place: str) -> tuple[Any, ...]:
+    def _read(self, line: bytes | None, place: str) -> tuple[Any, ...] | None:
         if line is None:
             raise InputError(f"{place}: it is longer than {_LONGEST_LINE} bytes; write a line for each picture")
         try:

@@ -52,6 +52,17 @@ def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
         assert np.linalg.norm(joints[order] - two_people, axis=-1).mean() < 0.01
 
 
+def test_cameras_that_are_not_wanted_are_passed_over(tmp_path, cameras, five_cameras, two_people, capsys):
+    (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 4))
+    given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]
+    with pytest.raises(SystemExit) as ended:
+        main([*given, "--without", five_cameras.names[0], "--output", str(tmp_path / "out.jsonl")])
+    assert ended.value.code == 0
+    told = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [len(each["people"]) for each in told if each["kind"] == "now"] == [2] * 4
+    assert "the line is left out" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [

@@ -83,7 +83,7 @@ def read_rig(
         carriers = {camera.carrier for camera in finished}
         trajectories = tuple(each for each in written.trajectories if each.name in carriers)
         notes = tuple(f"{path}: {each}" for each in written.notes)
-        return carried(Rig(finished, up, trajectories=trajectories, notes=notes))
+        return carried(Rig(finished, up, trajectories=trajectories, notes=notes, unwanted=tuple(unwanted)))
 
 
 def carried(rig: Rig) -> Rig:

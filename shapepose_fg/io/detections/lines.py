@@ -39,13 +39,16 @@ class _Line(BaseModel):
     pose_covariance: Annotated[list[_Row6], Len(6, 6)] | None = None
 
 
-def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[Any, ...]:
+def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[Any, ...] | None:
     """What `OnlineReconstructor.push_view` takes: the camera, what it saw, undistorted, when, seconds, and its
     pose with covariance, None where the line has none. Joints far outside the picture are left out.
+    None where the camera is one of `Rig.unwanted`.
 
     InputError naming the `place` of a line that is none.
     """
     line = validated(_Line, parse_json(text.strip(), Path(place)), place, _CURE)
+    if line.camera in rig.unwanted:
+        return None
     people = [one.pose_keypoints_2d for one in line.people]
     pose, surely = (None if each is None else np.array(each) for each in (line.pose, line.pose_covariance))
     if pose is not None:

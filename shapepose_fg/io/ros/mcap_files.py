@@ -136,6 +136,8 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
             else:
                 number += 1
                 with _whole(file, _CURE):
+                    if message.camera in rig.unwanted:
+                        continue
                     people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
                     time_s = stamp_ns(message.header) / NS
                     view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
