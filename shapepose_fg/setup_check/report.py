@@ -494,9 +494,8 @@ def unseen(
     why = "the others too little, or not as one"
     if lasts_s is not None and lasts_s < _SHORT_S:
         why = f"{lasts_s:.2g} s are too little to be sure of everybody; give more frames, or --no-temporal"
-    most = " and ".join(
-        names[view] for view in sorted(np.argsort(-np.asarray(seen.mean(axis=0)), kind="stable")[:2].tolist())
-    )
+    two: list[int] = sorted(np.argsort(-np.asarray(seen.mean(axis=0)), kind="stable")[:2].tolist())
+    most = " and ".join(names[view] for view in two)
     return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why} ({most} see most)"]
 
 

@@ -129,7 +129,7 @@ def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeo
     return CameraPeople(path, _CALISCOPE, blocks, first, last, rerun=_RERUN, joints="mediapipe")
 
 
-def _port(path: Path, camera: int, cameras: list[str], ports: list[int]) -> int:
+def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> int:
     """The number that the file has for a camera."""
     chosen = match_names(cameras, [str(port) for port in ports])
     if chosen is not None:
