@@ -137,14 +137,17 @@ def with_sides_held(tracker: Tracker, frames: Sequence[Input], carried: Tracks) 
     held, tracks, sought_s = list[Input](), carried, -np.inf
     for each in frames:
         time_s, frame = float(each.time_s.mean()), tracker.with_sides_held(tracks, each)
-        tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
-        alive = tracker.alive(tracks)
-        tracks, candidate = tracks.rows(alive), candidate[alive]
+        candidate = np.zeros((0, len(tracker.skeleton), len(frame.rig)), dtype=np.intp)
+        if len(tracks) > 0:
+            tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
+            alive = tracker.alive(tracks)
+            tracks, candidate = tracks.rows(alive), candidate[alive]
         if time_s - sought_s >= _KEY_S:
             sought_s = time_s
             places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
-            new = np.zeros(len(places), dtype=np.intp)
-            tracks = tracks.joined(tracker.at(places, new, new, time_s))
+            if len(places) > 0:
+                new = np.zeros(len(places), dtype=np.intp)
+                tracks = replace(tracks, time_s=time_s).joined(tracker.at(places, new, new, time_s))
         held.append(frame)
     return held
 

@@ -1,6 +1,7 @@
 """Detections as MediaPipe's, DeepLabCut's, SLEAP's, YOLO's and others write them: the same people in all."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -253,9 +254,7 @@ def caliscope(folder: Path, rig: Rig, people: np.ndarray) -> None:
 
 def test_caliscope_s_points_of_all_cameras(rig, people, tmp_path):
     caliscope(tmp_path, rig, people)
-    named = Rig(
-        tuple(type(camera)(**(vars(camera) | {"name": f"cam_{n}"})) for n, camera in enumerate(rig.cameras)), "z"
-    )
+    named = Rig(tuple(replace(camera, name=f"cam_{n}") for n, camera in enumerate(rig.cameras)), "z")
     same_as_mediapipe(read_detections(tmp_path, named), people, named)
 
 

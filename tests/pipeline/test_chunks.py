@@ -216,6 +216,10 @@ class NobodyIsThere:
         """Nobody."""
         return np.zeros((0, 25, 3)), np.zeros((0, 25, 1), dtype=np.intp)
 
+    def with_sides_held(self, _: object, given: Input) -> Input:
+        """As they are."""
+        return given
+
 
 @pytest.mark.parametrize("fps", [3.0, *slow(25.0), 50.0, *slow(60.0)])
 @pytest.mark.parametrize("views", [*slow(1), 3, *slow(6)])
