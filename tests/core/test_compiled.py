@@ -102,6 +102,7 @@ def test_a_damaged_cache_is_made_anew(program, ending, content):
     assert program()[:2] == (21.0, [1, 1])
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_read(program):
     """As in an image, where another user made it; nothing is left in the folder for temporary files."""
     program()
@@ -110,6 +111,7 @@ def test_a_cache_that_cannot_be_written_is_read(program):
     assert list(program.temporary.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refused", ["cache", "cache tmp"])
 def test_where_nothing_can_be_kept_it_still_runs(program, refused):
     program.program = refuse(*refused.split()) + PROGRAM
@@ -135,6 +137,7 @@ sys.addaudithook(refuse)
 """
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_is_no_obstacle(program):
     """Files of more than 4 kB cannot be written: sources can, compiled functions cannot."""
     limit = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
@@ -144,6 +147,7 @@ def test_a_disk_that_is_full_is_no_obstacle(program):
     assert program()[0] == 21.0 and program()[:2] == (21.0, [1, 1])
 
 
+@pytest.mark.slow
 def test_no_home(program, tmp_path):
     """A container's user of any number: no home, or one that is not there."""
     for home in ("", "/nonexistent/home"):
@@ -179,6 +183,7 @@ compiling._share_out = lambda *arguments: (real(*arguments), time.sleep(1.5))
 """Changes by which two functions are work for two processes, and for more than a second."""
 
 
+@pytest.mark.slow
 def test_compiling_is_done_side_by_side_and_said_once_before_it_ends(program):
     """On stderr, though it is no terminal; and not when functions are read."""
     program.program = SLOW + PROGRAM

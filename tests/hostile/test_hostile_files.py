@@ -171,6 +171,7 @@ def test_arrays_that_claim_what_they_do_not_hold(tmp_path, header):
     refused(read_npz, tmp_path / "a.npz", ("a",), "no cure")
 
 
+@pytest.mark.slow
 def test_what_nobody_asked_for_takes_no_memory(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("asked", "other"):

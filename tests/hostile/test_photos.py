@@ -44,6 +44,7 @@ def degrees(tmp_path, name: str) -> float:
     return float(np.degrees(2 * np.arctan(800 / camera.K[0, 0])))
 
 
+@pytest.mark.slow
 def test_a_large_picture_in_a_small_file_is_not_unpacked(tmp_path):
     (tmp_path / "a.png").write_bytes(bomb(13_000))
     (tmp_path / "b.png").write_bytes(bomb(13_000, exif(28)))

@@ -155,6 +155,7 @@ def test_people_are_named_where_a_result_is_solved_anew(joined, scene):
     assert apart == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_keyframes_have_the_factor_and_worker_processes_give_the_same(scene):
     fast = replace(PipelineConfig(), windows=replace(WindowConfig(), keyframe_s=0.1))
     recording, box = simulate(scene, seed=0), Box(scene)

@@ -65,6 +65,7 @@ def test_nothing_is_said_of_the_right_names(dance):
     assert order_findings(dance.recording, dance.scene.rig) == []
 
 
+@pytest.mark.slow
 def test_a_known_layout_that_fits_is_named(shared_cases):
     rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
     detections = read_detections(shared_cases / "body25b" / "detections", rig, "BODY_25")

@@ -125,6 +125,7 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     assert "people explain 8" in said and "surer ones" in said
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, room):
     """Turned by 25 degrees, it is left out by the check; without that nobody is given what it saw."""
     turned = turning(recording, room, 2, lambda t: 25.0)
@@ -147,6 +148,7 @@ def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, ro
     assert not any(each.camera in warning.split(":")[0] for each in others for warning in checked.warnings)
 
 
+@pytest.mark.slow
 def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording, room):
     """Somebody is left out of the result: the sentence is among the warnings, which run.json and stderr have."""
     people = reconstruct(recording, room, frames=range(20), times=FrameTimes.from_fps(10, len(recording)))

@@ -69,6 +69,7 @@ def test_every_kind_has_a_sentence(room, kind):
     assert not words.endswith(".") and "nan" not in words and len(words) > 30
 
 
+@pytest.mark.slow
 def test_the_command_says_it_in_words(files, room, capsys):
     options = ["--detections", files / "openpose", "--frames", "0:40"]
     code, out, _ = run(["check-calibration", "--calibration", files / "rig.json", *options], capsys)

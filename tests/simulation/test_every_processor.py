@@ -21,9 +21,6 @@ PROCESSORS = [
     {"OPENBLAS_CORETYPE": "Prescott"} | NO_VECTORS,
     *slow(
         {"OPENBLAS_CORETYPE": "Nehalem"},
-        {"OPENBLAS_CORETYPE": "Sandybridge"},
-        {"OPENBLAS_CORETYPE": "Haswell"},
-        {"OPENBLAS_CORETYPE": "Zen"},
         {"OPENBLAS_CORETYPE": "Prescott", "NUMBA_CPU_NAME": "generic"} | NO_VECTORS,
     ),
 ]
