@@ -49,6 +49,10 @@ def rate_of(time_s: Array) -> float:
     return exact_rate(1 / slope, min(2 * (off + 1e-6) / lasts, 0.01) / slope)
 
 
+LEAST_STEP_S = 1e-5
+"""Shortest time between two frames, s: the motion over less is singular."""
+
+
 @dataclass(frozen=True)
 class FrameTimes:
     """The times of T frames; frame numbers count from 0 in the file, as in `Reconstruction.frame`."""
@@ -68,9 +72,12 @@ class FrameTimes:
         finite = np.isfinite(columns).all(axis=1)
         if not finite.all():
             raise ValueError(f"time_s must be finite, at frame {np.argmin(finite)} it is not")
-        rising = np.append(True, (np.diff(columns, axis=0) > 0).all(axis=1))
+        rising = np.append(True, (np.diff(columns, axis=0) > LEAST_STEP_S).all(axis=1))
         if not rising.all():
-            raise ValueError(f"time_s must rise from frame to frame, at frame {np.argmin(rising)} it does not")
+            raise ValueError(
+                f"time_s must rise from frame to frame, at frame {np.argmin(rising)} it does not"
+                f" (by more than {LEAST_STEP_S:g} s)"
+            )
 
     def __len__(self) -> int:
         return len(self.time_s)

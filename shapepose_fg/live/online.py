@@ -18,6 +18,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import LEAST_STEP_S
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
@@ -402,7 +403,7 @@ class OnlineReconstructor:
         """A frame, in its place among those that came."""
         time_s, slots = float(times.mean()), self._state.slots
         detections, _ = thinned(detections, self.rig, self._config.candidates)
-        if len(slots) > 0 and time_s <= slots[-1].time_s:
+        if len(slots) > 0 and time_s <= slots[-1].time_s + LEAST_STEP_S:
             self._insert(detections, times, time_s)
             return
         last_s = slots[-1].time_s if len(slots) > 0 else time_s
@@ -427,7 +428,8 @@ class OnlineReconstructor:
         """A frame that came after later ones: these are followed once more."""
         slots = self._state.slots
         at = bisect_left([slot.time_s for slot in slots], time_s)
-        if at == 0 or slots[-1].time_s - time_s > self.lag_s or slots[at].time_s == time_s:
+        twice = any(abs(slot.time_s - time_s) <= LEAST_STEP_S for slot in slots[max(at - 1, 0) : at + 1])
+        if at == 0 or twice or slots[-1].time_s - time_s > self.lag_s:
             self._state.dropped += 1
             return
         rig = self._state.watch.believed(detections, self._state.rig.at(times))

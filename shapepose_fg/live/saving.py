@@ -13,6 +13,7 @@ from shapepose_fg.core.arrays import Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import LEAST_STEP_S
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import write_atomically
@@ -156,7 +157,7 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         raise ValueError("bones and the most evidence of its tracks must not be negative")
     if not (np.abs(found["times"][:, 0] - found["time_s"].mean(axis=1)) < 1e-3).all():
         raise ValueError("its tracks must be of the times of its frames")
-    if (np.diff(found["time_s"].mean(axis=1)) <= 0).any():
+    if (np.diff(found["time_s"].mean(axis=1)) <= LEAST_STEP_S).any():
         raise ValueError("its frames must be in order of time")
     slots, starts = [], np.vstack([np.zeros((1, 8), dtype=np.int64), np.cumsum(counts, axis=0)])
     for n, (frame, settled, track, identity, *_) in enumerate(counts.tolist()):

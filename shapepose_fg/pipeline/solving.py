@@ -14,7 +14,7 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_times import segments
+from shapepose_fg.core.frame_times import LEAST_STEP_S, segments
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
@@ -153,7 +153,7 @@ def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
         problem = f"persons must be at most {MAX_PERSON} and frames {MAX_FRAME}"
     if over_time and not problem:
         wrong = ~np.isfinite(time_s)
-        wrong[1:] |= same & ~(np.diff(time_s) > 0)
+        wrong[1:] |= same & ~(np.diff(time_s) > LEAST_STEP_S)
         if wrong.any():
             at = int(wrong.argmax())
             problem = f"time_s must rise with the frames, and does not at person {person[at]}, frame {frame[at]}"

@@ -49,6 +49,7 @@ def test_a_rate_of_no_camera_stays_what_it_is_and_29_97_is_30000_by_1001():
     [
         ([0.0, 0.1, 0.1], "time_s must rise from frame to frame, at frame 2 it does not"),
         ([[0.0, 0.0], [0.1, -0.1]], "at frame 1 it does not"),
+        ([0.0, 1e-300, 0.1], "at frame 1 it does not"),
         ([0.0, np.nan], "time_s must be finite, at frame 1 it is not"),
         (np.zeros((2, 2, 2)), r"time_s must be \(T,\) or \(T, V\), got \(2, 2, 2\)"),
     ],

@@ -91,6 +91,9 @@ def test_a_late_frame_takes_part_and_one_that_is_too_late_is_counted(start, danc
     live.push(dance.recording[0], -0.1)
     live.push(dance.recording[5], 5 / 30)
     assert (live.report().frames, live.report().dropped) == (11, 2)
+    for nearly in (5 / 30 - 1e-9, 5 / 30 + 1e-9, 10 / 30 + 1e-9):
+        live.push(dance.recording[5], nearly)
+    assert (live.report().frames, live.report().dropped) == (11, 5)
     settled = live.finish()
     assert settled.time_s.min() == 0.0 and len(np.unique(settled.frame)) == 11
     assert len(np.unique(np.column_stack([settled.frame, settled.person]), axis=0)) == len(settled)
