@@ -127,7 +127,7 @@ class Input:
     rig: Rig
     """Where the cameras were."""
     key: bool = True
-    """Whether people are sought in it; those between keyframes are empty (`pipeline/keyframes.py`)."""
+    """Whether people are sought in it. Detections of frames between keyframes are not thinned."""
 
 
 class DetectionSequence(Protocol):

@@ -21,7 +21,7 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.keyframes import with_rows_between
+from shapepose_fg.pipeline.keyframes import halved, with_rows_between
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.solve_window import Assigning, solve_window
 from shapepose_fg.pipeline.windows import Engine, Span
@@ -106,6 +106,12 @@ class Setup:
         key = np.array([each.key for each in every])
         motion = MotionModel.load(self.skeleton.joints, self.config.motion)
         carried = with_rows_between(self._result(whole, given, rig), frame, time_s, key, motion)
+        for part in map(self.solve, halved(span, whole, carried, self.config)):
+            anew = np.unique(part.rows.frame)
+            carried = Reconstruction.concatenate([carried.rows(~np.isin(carried.frame, anew)), part.rows])
+            notes.problems = [each for each in notes.problems if each.frame not in anew] + part.notes.problems
+            notes.seconds.update(part.notes.seconds)
+        carried = carried.rows(np.lexsort((carried.person, carried.frame)))
         return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
 
     def _result(self, solution: WindowSolution, given: Sequence[Input], rig: Rig) -> Reconstruction:

@@ -9,7 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.frame_times import FrameTimes, segments
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
@@ -50,23 +50,24 @@ class SolvedWindows:
         return self.times.of_views(len(self.setup.rig))
 
     def read(self, frame: int) -> Input:
-        """What the cameras give of a frame; nothing between keyframes."""
-        if not _among(frame, self.keyframes):
-            return Input(frame, self._time_s[frame], Detections.empty(), self.setup.rig, key=False)
+        """What the cameras give of a frame; between keyframes it is not thinned."""
+        key = _among(frame, self.keyframes)
         with self.book.stage("read"):
             thinned = self.detections.is_thinned(frame)
-            self.book.thin("detections", thinned, frame)
             repeated, trust = self.pictures.repeated(frame), self.pictures.trust
-            self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
+            if key:
+                self.book.thin("detections", thinned, frame)
+                self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
+            found = self.detections[frame] if key else self.pictures[frame]
             # Who is who among more detections than people make is chance.
             doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
             said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
             if self.setup.rig.moves:
                 rig = replace(self.setup.rig.at(self._time_s[frame]), dark=said[0], doubted=said[1])
-                return Input(frame, self._time_s[frame], self.detections[frame], rig)
+                return Input(frame, self._time_s[frame], found, rig, key)
             if said not in self._rigs:
                 self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
-            return Input(frame, self._time_s[frame], self.detections[frame], self._rigs[said])
+            return Input(frame, self._time_s[frame], found, self._rigs[said], key)
 
     def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
         """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""

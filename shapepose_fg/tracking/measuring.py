@@ -86,16 +86,18 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
         for v in range(views):
             depths[v] = _mean_depth(mean[a], cameras[v])
         for j in range(joints):
-            seen, at[0], at[1], at[2] = 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
+            seen, near, at[0], at[1], at[2] = 0, 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             for v in range(views):
                 d, sigma_px[v], inlier[j, v] = candidate[a, j, v], 0.0, False
                 if d >= 0 and confident[d] > 0:
-                    depth = project(cameras[v], mean[a, j])[2]
+                    x, y, depth = project(cameras[v], mean[a, j])
+                    apart_px = np.sqrt((x - xy[d, 0]) ** 2 + (y - xy[d, 1]) ** 2)
+                    near += apart_px * depth < trust.rho_2d_m * focal[v]
                     depth = depth if depth >= MIN_DEPTH_M else depths[v]
                     depth = fixed_m if fixed_m > 0 else depth
                     px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
                     sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
-            if lost[a, j] and seen >= 2:
+            if seen >= 2 and (lost[a, j] or near == 0):
                 for v in range(views):
                     d = candidate[a, j, v]
                     sure[v] = sight.confidence[d] if d >= 0 else 0.0

@@ -136,8 +136,8 @@ def _assign(
     people_count, joints, views = chosen.shape
     for a in range(people_count):
         for j in range(joints):
-            gate_m[a, j] = _REACH_M if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
-            reach_m[a, j] = max(gate_m[a, j], OVERLAP_M)
+            gate_m[a, j] = 0.0 if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
+            reach_m[a, j] = _REACH_M
             for v in range(views):
                 before[a, j, v] = -1
     begins, person, detection, distance_m, score, possible = near
@@ -147,9 +147,8 @@ def _assign(
     of_joint = sight.of_joint
     for e in range(count):
         a, j = person[e], of_joint[detection[e]]
-        within = distance_m[e] < gate_m[a, j]
-        sought[e] = lost[a, j] and within
-        nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2)) if within else -np.inf
+        sought[e] = not distance_m[e] < gate_m[a, j]
+        nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2))
     for _ in range(1 + _PASSES):
         claim(
             begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied, score,
@@ -165,7 +164,7 @@ def _assign(
             break
     share(begins, person, detection, distance_m, tied, chosen)
     for e in range(count):
-        possible[e] = possible[e] or (nearness[e] > -np.inf and not sought[e])
+        possible[e] = possible[e] or not sought[e]
     return count
 
 
