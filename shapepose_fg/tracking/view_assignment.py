@@ -147,7 +147,7 @@ def _assign(
     of_joint = sight.of_joint
     for e in range(count):
         a, j = person[e], of_joint[detection[e]]
-        sought[e] = not distance_m[e] < gate_m[a, j]
+        sought[e] = lost[a, j]
         nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2))
     for _ in range(1 + _PASSES):
         claim(
@@ -164,7 +164,7 @@ def _assign(
             break
     share(begins, person, detection, distance_m, tied, chosen)
     for e in range(count):
-        possible[e] = possible[e] or not sought[e]
+        possible[e] = possible[e] or distance_m[e] < gate_m[person[e], of_joint[detection[e]]]
     return count
 
 

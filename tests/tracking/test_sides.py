@@ -58,3 +58,14 @@ def test_somebody_else_who_faces_the_other_way_stays_as_they_are(five_cameras, t
     other[:, :2] += 0.5
     found = seen_exactly(five_cameras, np.stack([two_people[0], other]))
     assert held(found, five_cameras, two_people[:1]) is found
+
+
+@pytest.mark.parametrize("joints", [("Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle", "BigToe", "SmallToe", "Heel")])
+def test_arms_or_legs_that_are_exchanged_alone(seen, five_cameras, two_people, joints):
+    of = np.isin(seen.joint, [BODY_25.joints.index(side + name) for side in "RL" for name in joints])
+    wrong = of & np.isin(seen.view, [1, 3, 4]) & (person_of(seen, five_cameras, two_people) == 0)
+    turned = replace(seen, joint=np.where(wrong, MIRROR[seen.joint], seen.joint))
+    again = held(turned, five_cameras, two_people + np.array([0.02, 0.02, 0.01]))
+    sides = MIRROR[seen.joint] != seen.joint
+    assert (again.joint == seen.joint)[sides].mean() > 0.98
+    assert (again.joint == seen.joint)[wrong].mean() > 0.95
