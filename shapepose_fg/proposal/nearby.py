@@ -29,7 +29,7 @@ serves both. A detector is 2 to 3 cm off."""
 class Sight(NamedTuple):
     """A frame as kernels take it: V cameras, D detections, and the limbs of J joints."""
 
-    kinds = "f3 f1 f2 i1 i1 f2 f1 i1 f1 i1 i1 f1 i1 i1"
+    kinds = "f3 f1 f2 i1 i1 f2 f1 i1 f1 i1 i1 f1 i1 i1 b1"
     cameras: Array
     """(V, 3, 4) K [R | t] of each view."""
     focal: Array
@@ -56,6 +56,8 @@ class Sight(NamedTuple):
     """(J + 1,) where the limbs of each joint begin."""
     limb_ends: Index
     """(2 L,) the joints at their other ends."""
+    swings: Mask
+    """(J,) joints of arms and legs beyond shoulders and hips."""
 
     @classmethod
     def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "Sight":
@@ -155,10 +157,14 @@ def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight
 
 
 @cache
-def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index]:
-    """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin."""
+def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index, Mask]:
+    """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin; and
+    which joints are beyond shoulders and hips.
+    """
     joint, other = np.nonzero(skeleton.adjacency)
-    return np.searchsorted(joint, np.arange(len(skeleton) + 1)), np.ascontiguousarray(other)
+    paired = np.array(skeleton.mirror) != np.arange(len(skeleton))
+    swings = paired & paired[np.array(skeleton.parents)]
+    return np.searchsorted(joint, np.arange(len(skeleton) + 1)), np.ascontiguousarray(other), swings
 
 
 @cache

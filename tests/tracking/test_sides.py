@@ -60,7 +60,9 @@ def test_somebody_else_who_faces_the_other_way_stays_as_they_are(five_cameras, t
     assert held(found, five_cameras, two_people[:1]) is found
 
 
-@pytest.mark.parametrize("joints", [("Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle", "BigToe", "SmallToe", "Heel")])
+@pytest.mark.parametrize(
+    "joints", [("Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle", "BigToe", "SmallToe", "Heel")]
+)
 def test_arms_or_legs_that_are_exchanged_alone(seen, five_cameras, two_people, joints):
     of = np.isin(seen.joint, [BODY_25.joints.index(side + name) for side in "RL" for name in joints])
     wrong = of & np.isin(seen.view, [1, 3, 4]) & (person_of(seen, five_cameras, two_people) == 0)
