@@ -13,20 +13,13 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observation_table import Gate
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.state import window_rows
-from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.windows import Span
-from shapepose_fg.proposal.thinning import thinned
-from shapepose_fg.tracking.following import Decided
 
 _ROUNDING_S = 1e-6
-_STRAY_M = 0.03
-"""Deviation of a joint from the cubic between two keyframes, m, above which a frame between is a keyframe too: more
-than the errors of detectors."""
+STRAY_M = 0.03
+"""Deviation of a joint from the cubic between two keyframes, m, above which a frame between becomes one: more than
+the errors of detectors."""
 
 
 def spaced(time_s: Array, apart_s: float) -> Mask:
@@ -84,46 +77,6 @@ def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
     density = 12 * moved**2 / lasts_s**3 - 12 * moved * turned / lasts_s**2 + 4 * turned**2 / lasts_s
     variance = density.sum(axis=2) / 2 * lasts_s[..., 0] ** 3 / 192  # a third of 6 numbers, on 3 axes
     return np.sqrt(np.nan_to_num(variance).max(axis=1, initial=0.0))
-
-
-def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: PipelineConfig) -> list[Span]:
-    """The parts of a span that must be solved anew, with another keyframe where a joint strays from its curve.
-
-    `solved` are the rows of the span's keyframes, `between` has those that motion carries.
-    """
-    given, rows = [each for each, _ in span.decided], solved.observations
-    number, time_s = np.array([each.frame for each in given]), np.array([each.time_s.mean() for each in given])
-    key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
-    for mine in window_rows(rows):
-        at = np.searchsorted(number, rows.frame[mine])
-        far = strays_m(solved.joints[mine], solved.velocity[mine], time_s[at]) > _STRAY_M
-        far &= (np.diff(np.cumsum(key)[at]) == 1) & (np.diff(at) > 1)
-        new[(at[1:] + at[:-1])[far] // 2] = True
-    new[: span.start] = new[span.stop :] = False
-    decided = list[Decided]()
-    for n, each in enumerate(given):
-        if new[n]:
-            carried = between.rows(between.frame == each.frame)
-            unseen = np.full((*carried.joints.shape[:2], len(each.rig)), -1)
-            when = {"frame": carried.frame, "time_s": np.repeat(each.time_s[None], len(carried), axis=0)}
-            found = thinned(each.detections, each.rig, config.candidates)[0]
-            decided.append((
-                replace(each, detections=found, key=True),
-                Observations.of(unseen, found, carried.joints, track=carried.person, **when),
-            ))  # fmt: skip
-        else:
-            decided.append((each, rows.rows(rows.frame == each.frame)))
-    # From the keyframe before the first to that behind the last of those that are new and near each other.
-    keys, near_s, spans = np.flatnonzero(key), config.windows.shared_s, list[Span]()
-    every = np.flatnonzero(new)
-    apart = np.flatnonzero(np.diff(time_s[every]) > near_s) + 1
-    for part in np.split(every, apart) if len(every) > 0 else ():
-        begin, end = keys[np.searchsorted(keys, part[0]) - 1], keys[np.searchsorted(keys, part[-1])]
-        first = int(np.searchsorted(time_s, time_s[begin] - near_s - _ROUNDING_S))
-        until = int(np.searchsorted(time_s, time_s[end] + near_s + _ROUNDING_S))
-        start, stop = max(int(begin), span.start), min(int(end) + 1, span.stop)
-        spans.append(Span(tuple(decided[first:until]), start - first, stop - first, rig=span.rig))
-    return spans
 
 
 def looked_at(rows: Reconstruction) -> Mask:

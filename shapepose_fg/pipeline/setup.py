@@ -21,10 +21,10 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.keyframes import halved, with_rows_between
+from shapepose_fg.pipeline.keyframes import with_rows_between
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.solve_window import Assigning, solve_window
-from shapepose_fg.pipeline.windows import Engine, Span
+from shapepose_fg.pipeline.windows import Engine, Span, halved
 from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.tracking.tracker import BodyScale, Tracker
 

@@ -5,15 +5,21 @@ recording. Windows know nothing of each other, and are solved here or in other p
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Input
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.estimation.state import window_rows
+from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
+from shapepose_fg.pipeline.keyframes import STRAY_M, strays_m
+from shapepose_fg.proposal.thinning import thinned
 from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
 from shapepose_fg.tracking.tracker import Tracker
 
@@ -117,3 +123,43 @@ class Engine:
         times = np.array([frame.time_s.mean() for frame, _ in decided])
         near = near_border(times, times[min(at, len(times) - 1)], self.config.windows.shared_s)
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1
+
+
+def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: PipelineConfig) -> list[Span]:
+    """The parts of a span that must be solved anew, with another keyframe where a joint strays from its curve.
+
+    `solved` are the rows of the span's keyframes, `between` has those that motion carries.
+    """
+    given, rows = [each for each, _ in span.decided], solved.observations
+    number, time_s = np.array([each.frame for each in given]), np.array([each.time_s.mean() for each in given])
+    key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
+    for mine in window_rows(rows):
+        at = np.searchsorted(number, rows.frame[mine])
+        far = strays_m(solved.joints[mine], solved.velocity[mine], time_s[at]) > STRAY_M
+        far &= (np.diff(np.cumsum(key)[at]) == 1) & (np.diff(at) > 1)
+        new[(at[1:] + at[:-1])[far] // 2] = True
+    new[: span.start] = new[span.stop :] = False
+    decided = list[Decided]()
+    for n, each in enumerate(given):
+        if new[n]:
+            carried = between.rows(between.frame == each.frame)
+            unseen = np.full((*carried.joints.shape[:2], len(each.rig)), -1)
+            when = {"frame": carried.frame, "time_s": np.repeat(each.time_s[None], len(carried), axis=0)}
+            found = thinned(each.detections, each.rig, config.candidates)[0]
+            decided.append((
+                replace(each, detections=found, key=True),
+                Observations.of(unseen, found, carried.joints, track=carried.person, **when),
+            ))  # fmt: skip
+        else:
+            decided.append((each, rows.rows(rows.frame == each.frame)))
+    # From the keyframe before the first to that behind the last of those that are new and near each other.
+    keys, near_s, spans = np.flatnonzero(key), config.windows.shared_s, list[Span]()
+    every = np.flatnonzero(new)
+    apart = np.flatnonzero(np.diff(time_s[every]) > near_s) + 1
+    for part in np.split(every, apart) if len(every) > 0 else ():
+        begin, end = keys[np.searchsorted(keys, part[0]) - 1], keys[np.searchsorted(keys, part[-1])]
+        first = int(np.searchsorted(time_s, time_s[begin] - near_s - 1e-6))
+        until = int(np.searchsorted(time_s, time_s[end] + near_s + 1e-6))
+        start, stop = max(int(begin), span.start), min(int(end) + 1, span.stop)
+        spans.append(Span(tuple(decided[first:until]), start - first, stop - first, rig=span.rig))
+    return spans

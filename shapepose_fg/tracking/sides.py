@@ -27,9 +27,9 @@ _SURE = 6.0
 
 
 def with_sides_held(found: Detections, places: Array, sigma_m: Array, rig: Rig, skeleton: Skeleton) -> Detections:
-    """The detections of a frame, left and right exchanged where a view has a person's sides the wrong way round:
-    of the whole person, or of arms, legs or face only.
+    """The detections of a frame, left and right exchanged where a view has a person's sides the wrong way round.
 
+    That may be the whole person, or arms, legs or face only.
     `places` (A, J, 3), metres, are where the joints of A people are predicted, to `sigma_m` (A, J).
     """
     mirror, part = np.array(skeleton.mirror), paired_parts(skeleton)
@@ -68,9 +68,7 @@ def with_sides_held(found: Detections, places: Array, sigma_m: Array, rig: Rig, 
 
 @cache
 def paired_parts(skeleton: Skeleton) -> Index:
-    """(J,) which part of the body each joint is of, whose sides may be exchanged by itself: arms, legs, face; 0 for
-    joints in the middle.
-    """
+    """(J,) number of the part (arms, legs, face) that each joint belongs to; 0 for joints in the middle."""
     top = np.arange(len(skeleton))
     for level in skeleton.tree_levels[1:]:
         for j in level.tolist():

@@ -17,8 +17,8 @@ _FAR_M = 0.12
 FARTHEST_M = 0.5
 """Most of that, however uncertain the prediction, m."""
 _REACH_M = 0.8
-"""Farthest distance of a detection from a predicted joint of arms and legs, m; of a lost joint from its neighbour on
-the skeleton. A foot that kicks at 150 m/s² goes so far in 0.1 s: affinities tell whose it is."""
+"""Farthest distance of a detection from a predicted joint of arms and legs, m; of a lost joint, from its neighbour
+on the skeleton. A foot that kicks at 150 m/s² goes so far in 0.1 s: affinities tell whose it is."""
 _PASSES = 2
 """How often the choice is made again with the affinities to what the last one chose."""
 _ODDS = 5.0
