@@ -452,7 +452,7 @@ class OnlineReconstructor:
             return
         at_s = slot.given.time_s.copy()
         at_s[view] = time_s
-        both = joined([slot.given.detections, detections])
+        both = joined([slot.given.detections, thinned(detections, self.rig, self._config.candidates)[0]])
         dark = tuple(each for each in slot.given.rig.dark if each != view)
         rig = replace(self._state.rig.at(at_s), dark=dark, doubted=slot.given.rig.doubted)
         slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)

@@ -85,19 +85,24 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
     for a in range(people):
         for v in range(views):
             depths[v] = _mean_depth(mean[a], cameras[v])
+        trunk = 0
+        for j in range(joints):
+            for v in range(views if not sight.swings[j] else 0):
+                d = candidate[a, j, v]
+                trunk += d >= 0 and _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
         for j in range(joints):
             seen, near, at[0], at[1], at[2] = 0, 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             for v in range(views):
                 d, sigma_px[v], inlier[j, v] = candidate[a, j, v], 0.0, False
                 if d >= 0 and confident[d] > 0:
-                    x, y, depth = project(cameras[v], mean[a, j])
-                    apart_px = np.sqrt((x - xy[d, 0]) ** 2 + (y - xy[d, 1]) ** 2)
-                    near += apart_px * depth < trust.rho_2d_m * focal[v]
+                    near += _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
+                    depth = project(cameras[v], mean[a, j])[2]
                     depth = depth if depth >= MIN_DEPTH_M else depths[v]
                     depth = fixed_m if fixed_m > 0 else depth
                     px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
                     sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
-            if seen >= 2 and (lost[a, j] or near == 0):
+            swings = near == 0 and sight.swings[j] and trunk >= MIN_SEEN_TWICE
+            if seen >= 2 and (lost[a, j] or swings):
                 for v in range(views):
                     d = candidate[a, j, v]
                     sure[v] = sight.confidence[d] if d >= 0 else 0.0
@@ -131,6 +136,13 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
                     in_view += 1
             most = max(most, in_view)
         evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
+
+
+@part
+def _apart_m(place, camera, focal, xy):
+    """Distance of a detection from a projected place, metres at its depth."""
+    x, y, depth = project(camera, place)
+    return np.sqrt((x - xy[0]) ** 2 + (y - xy[1]) ** 2) * depth / focal
 
 
 @part

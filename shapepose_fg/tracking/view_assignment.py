@@ -13,12 +13,15 @@ _NEAR_M = 0.06
 """How closeness to the predicted joint falls off where the prediction is exact: sigma of a Gaussian, as a length
 at the joint's depth."""
 _FAR_M = 0.12
-"""Distance, beside twice the prediction's sigma, up to which a detection of the trunk or head is taken, m."""
+"""Distance, beside twice the prediction's sigma, up to which a detection is near, m."""
 FARTHEST_M = 0.5
 """Most of that, however uncertain the prediction, m."""
 _REACH_M = 0.8
 """Farthest distance of a detection from a predicted joint of arms and legs, m; of a lost joint, from its neighbour
-on the skeleton. A foot that kicks at 150 m/s² goes so far in 0.1 s: affinities tell whose it is."""
+on the skeleton. What is not near must be tied by affinities to a person whose trunk the view sees near. A foot
+that kicks at 150 m/s² goes so far in 0.1 s."""
+_TRUNK_JOINTS = 2
+"""Joints of trunk and head that a view must see near, for those of arms and legs to be far."""
 _PASSES = 2
 """How often the choice is made again with the affinities to what the last one chose."""
 _ODDS = 5.0
@@ -149,9 +152,17 @@ def _assign(
     for e in range(count):
         a, j = person[e], of_joint[detection[e]]
         sought[e] = lost[a, j]
-        within = sought[e] or sight.swings[j] or distance_m[e] < gate_m[a, j]
-        nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2)) if within else -np.inf
-    for _ in range(1 + _PASSES):
+        nearness[e] = -np.inf
+        if sought[e] or distance_m[e] < gate_m[a, j]:
+            nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2))
+    for n in range(1 + _PASSES):
+        for e in range(count if n > 0 else 0):
+            a, j, v = person[e], of_joint[detection[e]], sight.of_view[detection[e]]
+            if sight.swings[j] and not sought[e] and not distance_m[e] < gate_m[a, j]:
+                trunk = 0
+                for k in range(joints):
+                    trunk += before[a, k, v] >= 0 and not sight.swings[k]
+                nearness[e] = 0.0 if trunk >= _TRUNK_JOINTS else -np.inf
         claim(
             begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied, score,
             possible, key, queue, taken, chosen,

@@ -12,7 +12,7 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.keyframes import bodies_between, keyframes, spaced, with_rows_between
+from shapepose_fg.pipeline.keyframes import bodies_between, keyframes, spaced, strays_m, with_rows_between
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -63,6 +63,21 @@ def test_between_keyframes_is_what_the_model_of_motion_says():
         np.testing.assert_allclose(found.covariance[n, 0], left[0, 0] * np.eye(3), rtol=1e-6)
         np.testing.assert_allclose(found.velocity_covariance[n, 0], left[1, 1] * np.eye(3), rtol=1e-6)
     assert found.known.tolist() == [[Known.SEEN], [Known.MOTION], [Known.MOTION], [Known.SEEN]]
+
+
+def test_how_far_a_joint_strays_between_keyframes_is_told_by_the_states_at_both():
+    """Of swings, 20 cm to and fro, the error of the cubic; what goes straight on, or falls, does not stray."""
+    time_s, joint = np.arange(31) * 0.1, np.zeros((31, 1, 3))
+    steady, falling = joint + time_s[:, None, None], joint - 4.9 * time_s[:, None, None] ** 2
+    assert strays_m(steady, np.ones_like(steady), time_s).max() < 1e-9
+    assert strays_m(falling, -9.8 * time_s[:, None, None] + joint, time_s).max() < 0.03
+    for frequency_hz, far in ((0.5, False), (3.0, True)):
+        turn = 2 * np.pi * frequency_hz * np.array([1.0, 0.0, 0.0])
+        swing, velocity = (
+            0.2 * np.sin(time_s[:, None, None] * turn),
+            0.2 * turn * np.cos(time_s[:, None, None] * turn),
+        )
+        assert (strays_m(swing, velocity, time_s).mean() > 0.03) == far
 
 
 def test_bodies_turn_evenly_between_keyframes():

@@ -44,6 +44,7 @@ DEFAULTS = {
     "reach_m": 0.8,
     "overlap_m": 0.025,
     "passes": 2,
+    "trunk_joints": 2,
 }
 """What is documented, so that another default is noticed."""
 
@@ -82,7 +83,7 @@ def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.
     owned: list[set[int]] = [set() for _ in places]
     chosen = np.full((*lost.shape, len(rig)), -1)
     for _ in range(1 + config.passes):
-        offers, shared = [], []
+        offers, shared, before = [], [], chosen.copy()
         for person in range(len(places)):
             for row in range(len(crowded)):
                 view, joint = int(crowded.view[row]), int(crowded.joint[row])
@@ -95,11 +96,13 @@ def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.
                 if np.isnan(px):
                     px = metres = np.inf
                 sure = sigma[person, joint]
-                score = np.exp(-0.5 * metres**2 / (config.near_m**2 + sure**2))
+                gate = min(config.far_m + 2 * sure, config.farthest_m)
+                near_enough = lost[person, joint] or metres < gate
+                score = np.exp(-0.5 * metres**2 / (config.near_m**2 + sure**2)) if near_enough else 0.0
                 score += affinity if joints else config.least_affinity
-                within = min(config.far_m + 2 * sure, config.farthest_m)
-                if lost[person, joint] or joint in SWINGS:
-                    within = config.reach_m
+                trunk = sum(j not in SWINGS for j in np.flatnonzero(before[person, :, view] >= 0).tolist())
+                free = lost[person, joint] or (joint in SWINGS and trunk >= config.trunk_joints)
+                within = config.reach_m if free else gate
                 if lost[person, joint]:
                     likely = bool(joints) and affinity >= config.least_affinity
                 else:
@@ -124,7 +127,7 @@ def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"passes": 1, "overlap_m": 0.3, "reach_m": 0.4}, {"least_affinity": 0.0}]
+    "settings", [{}, {"passes": 1, "overlap_m": 0.3, "reach_m": 0.4}, {"least_affinity": 0.1}]
 )
 def test_detections_are_taken_best_first_by_nearness_and_affinity(
     settings, predicted, crowded, five_cameras, settle
