@@ -136,6 +136,17 @@ def turned(rig: Rig, view: int, degrees: float, axis: Array) -> Rig:
     return _changed(rig, (view,), lambda camera: replace(camera, wTc=camera.wTc @ turn))
 
 
+def moved(rig: Rig, view: int, metres: float, way: Array) -> Rig:
+    """One camera moved along `way` (3,) of its own, looking as it did."""
+    by = np.zeros((4, 4))
+
+    def change(camera: Camera) -> Camera:
+        by[:3, 3] = camera.wTc[:3, :3] @ way * metres / np.linalg.norm(way)
+        return replace(camera, wTc=camera.wTc + by)
+
+    return _changed(rig, (view,), change)
+
+
 def exchanged(rig: Rig, first: int, second: int) -> Rig:
     """Two cameras under each other's names."""
     a, b = rig.cameras[first], rig.cameras[second]
