@@ -117,7 +117,12 @@ class Refinement:
             for view, camera in enumerate(self.given.cameras)
         ]
         held_out = {"before_px": round(self.before_px, 3), "after_px": round(self.after_px, 3)}
-        about = {"better": self.better, "probability": round(self.probability, 4), "stature_m": round(self.stature_m, 3), "notes": list(self.notes)}
+        about = {
+            "better": self.better,
+            "probability": round(self.probability, 4),
+            "stature_m": round(self.stature_m, 3),
+            "notes": list(self.notes),
+        }
         return {"cameras": cameras, "held_out": held_out, **about}
 
 
@@ -165,9 +170,8 @@ def refine(
     notes = tuple(_undetermined(found[0], freedom, counts))
     sure = 1.0
     if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
-        usual = freedom.sigmas
-        usual = np.concatenate([usual[TURN], usual[MOVE], usual[CENTRE], usual[FOCAL]])  # as `PARAMETERS` of the check
-        sure = Problem.of(diagnosis.given).off(usual, reference)
+        order = [*range(6), 7, 8, 6]  # in which the check has the parameters
+        sure = Problem.of(diagnosis.look).off(freedom.sigmas[order], reference)
     return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature, sure)
 
 

@@ -14,6 +14,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import triangulate
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q
+from shapepose_fg.setup_check.matching import median_over
 
 LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
 """Sigmas of a lasting bias of a joint of a person in a view, parts of the person's size. Real detectors have 0.005
@@ -42,7 +43,7 @@ class Marginal:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Detections of N people of single frames, J joints, V cameras; P different people in K parts of a recording."""
+    """Detections of N people of single frames, J joints, V cameras; P different people, K parts of a recording."""
 
     xy: Array
     """(N, J, V, 2) undistorted pixels; 0 where there is none."""
@@ -104,8 +105,10 @@ class Residuals:
         return [each for level in LEVELS for each in self._marginals(information, level)]
 
     def _rows(self, views: Views) -> Array:
-        """(N, J, 2 V, n) derivatives by cameras, the joint's bias, the enlargement, and residuals: weighted, without
-        what moves along with the joint's place."""
+        """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the enlargement, and residuals.
+
+        All are weighted, and without what moves along with the joint's place.
+        """
         N, J, V = self.weight.shape
         points, root = self.points, np.sqrt(self.weight)[..., None, None]
         for _ in range(3):
@@ -148,14 +151,14 @@ class Residuals:
         """One for each of `COMMON`."""
         P, J, _, V = *information.shape[:3], self.size_px.shape[1]
         C = V * (Q - 3 + 3 * self.parts)
-        # In their order: biases that people have in common, cameras, single people's shifts and enlargements, residual.
-        common, cameras = 2 * V * J, slice(2 * V * J, 2 * V * J + C)
+        # In this order: what people have in common, cameras, single people's shifts and enlargements, residual.
+        common = 2 * V * J
         total, log = np.zeros((common + C + 3 * V * P + 1, common + C + 3 * V * P + 1)), 0.0
         prior = np.repeat([(SHIFT * level) ** -2, (LARGER * level) ** -2], [2 * V, V])
         for person in range(P):
             own = slice(C, C + 2 * V)
-            O, of_own = information[person][:, own, own], information[person][:, own]
-            known = O + np.eye(2 * V) / level**2
+            of_own = information[person][:, own]
+            known = of_own[:, :, own] + np.eye(2 * V) / level**2
             left = information[person] - of_own.swapaxes(1, 2) @ np.linalg.solve(known, of_own)
             log -= 0.5 * float(np.linalg.slogdet(known * level**2)[1].sum())
             # A joint's bias is the person's own, the shift of the whole person, and what all people have.
@@ -189,16 +192,8 @@ def _count(number: Index) -> int:
 
 
 def _seen(points: Array, views: Views) -> tuple[Array, Array, Array]:
-    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and their derivatives."""
+    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and derivatives."""
     at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
     at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])
     xy = np.einsum("vab,njvb->njva", views.K[:, :2], at / at[..., 2:])
     return xy, at, (views.K[:, :2] - xy[..., None] * views.K[:, None, 2]) / at[..., 2, None, None]
-
-
-def median_over(values: Array) -> Array:
-    """(...) median over the first axis, without NaN; 0 where there is nothing else."""
-    ordered = np.sort(values, axis=0)  # NaN last
-    count = np.isfinite(values).sum(axis=0)
-    middle = [np.take_along_axis(ordered, np.maximum(count - k, 0)[None] // 2, axis=0)[0] for k in (0, 1)]
-    return np.where(count > 0, (middle[0] + middle[1]) / 2, 0.0)

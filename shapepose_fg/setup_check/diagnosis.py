@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
@@ -19,15 +19,14 @@ from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.belief import trust_of
-from shapepose_fg.setup_check.biases import median_over
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
-from shapepose_fg.setup_check.fit import difference, possible_matches
+from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
-from shapepose_fg.setup_check.matching import GATE, distances, least_of_each, median_of, same_frame
+from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted
-from shapepose_fg.setup_check.small import Problem, followed
+from shapepose_fg.setup_check.small import Problem
 
 _SAME_PX = 0.6
 """Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""
@@ -224,9 +223,10 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
         findings = _with_late(findings, view, int(look.lag[view] - before))
         remaining = lags(refined := replace(look, views=problem.relaxed()))
     known = {view for finding in findings for view in finding.cameras}
+    unfit = _unfit(look, known)
+    known |= {view for finding in unfit for view in finding.cameras}
     small, biased = _small_findings(problem, known)
-    findings += small
-    findings += _unfit(look, known | {view for finding in biased for view in finding.cameras})
+    findings += [*(small if look.cameras_used > 2 else []), *unfit]
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
     findings += order or _of_people(build, rig)  # joints that are others say nothing of unit and up
@@ -328,25 +328,8 @@ def _unfit(look: Look, known: set[int]) -> list[Finding]:
         fits = look.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
         return [] if fits else [Finding(Kind.UNFIT, everybody, float(look.scores[0]))]
     bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
-    bad = tuple(view for view in bad if view not in known and _beside_biases(look, view) < _UNFIT)
+    bad = tuple(view for view in bad if view not in known and look.beside_biases(view) < _UNFIT)
     return [Finding(Kind.UNFIT, bad, float(look.scores[list(bad)].min()))] if bad else []
-
-
-def _beside_biases(look: Look, view: int) -> float:
-    """How well a camera fits the others' people, as `Match.score`, where the detector's errors last."""
-    others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
-    person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw)
-    near = least_of_each(person, error)
-    near = near[error[near] < 2 * GATE]
-    person, sighting = person[near], sighting[near]
-    at = others.points[person] @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
-    away = (seen.xy[sighting] - at[..., :2] / at[..., 2:]) / seen.size_px[sighting][:, None, None]
-    who = followed(others.frame, others.points)[person]
-    for each in np.unique(who).tolist():
-        away[who == each] -= median_over(away[who == each])
-    miss = np.linalg.norm(away, axis=-1)
-    left = np.maximum(1 - median_of(miss, ~np.isnan(miss)) / GATE, 0.0)
-    return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
 
 
 def _of_people(build: Build, rig: Rig) -> list[Finding]:

@@ -15,7 +15,18 @@ from shapepose_fg.core.pieces import add_view, project, solved
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
-from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    Groups,
+    Pairs,
+    Sightings,
+    centres_of,
+    distances,
+    followed,
+    least_of_each,
+    median_of,
+    median_over,
+)
 
 _STEPS = 6
 """Gauss-Newton steps of a robust triangulation; errors fall under a hundredth of a pixel in four."""
@@ -311,6 +322,22 @@ class Look:
         if self.cameras_used < 3:
             return np.full(self.view_count, self._pair_score)
         return np.array([match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views])
+
+    def beside_biases(self, view: int) -> float:
+        """How well a camera fits the others' people, as `Match.score`, where the detector's errors last."""
+        others, seen, camera = self.others(view), self.seen_by(view), self.camera(view)
+        person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw)
+        near = least_of_each(person, error)
+        near = near[error[near] < 2 * GATE]
+        person, sighting = person[near], sighting[near]
+        at = others.points[person] @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
+        away = (seen.xy[sighting] - at[..., :2] / at[..., 2:]) / seen.size_px[sighting][:, None, None]
+        who = followed(others.frame, others.points)[person]
+        for each in np.unique(who).tolist():
+            away[who == each] -= median_over(away[who == each])
+        miss = np.linalg.norm(away, axis=-1)
+        left = np.maximum(1 - median_of(miss, ~np.isnan(miss)) / GATE, 0.0)
+        return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
 
     @property
     def _pair_score(self) -> float:

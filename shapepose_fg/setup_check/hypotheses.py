@@ -223,7 +223,8 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
         poses += [change for view in (0, 1) for change in _in_mirror(look, view)]
         found += [(change.score - look.total, change) for change in poses]
     best = max((gain for gain, _ in found), default=0.0) + look.total
-    if len(weak) > look.view_count / 2 and best < _EXPLAINED:
+    poor = [view for view in weak if look.beside_biases(view) < GOOD]
+    if len(poor) > look.view_count / 2 and best < _EXPLAINED:
         few = replace(look, evidence=look.evidence.thinned(_FEW))
         found += [
             (change.score - few.total, replace(change, look=replace(change.look, evidence=look.evidence)))

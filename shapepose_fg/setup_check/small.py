@@ -1,7 +1,7 @@
-"""Small errors of cameras, and biases of single people: which of them explain the residuals, with its probability.
+"""Small errors of cameras, and biases of single people: which explain the residuals, with probabilities.
 
-All explanations are compared with none at all, by the likelihood of `biases`: whatever biases the detector has, and
-wherever the joints are.
+All explanations are compared with each other and with none, by the likelihood of `biases`: whatever biases the
+detector has, and wherever the joints are.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,13 +12,12 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.biases import Marginal, Residuals
 from shapepose_fg.setup_check.evidence import Look, observed
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
-from shapepose_fg.setup_check.matching import Groups
+from shapepose_fg.setup_check.matching import Groups, followed
 
 ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL, Kind.PRINCIPAL_POINT: CENTRE}
 """What one camera alone may have wrong."""
@@ -30,7 +29,7 @@ _EVERY = np.deg2rad(0.5)
 BIAS = 0.1
 """An unusual bias on one person, part of the size (one sigma)."""
 _WRONG = 0.5
-"""The probability beforehand that some camera has a small mistake; that one person is seen with an unusual bias."""
+"""The probability beforehand that some camera has a small mistake; that some person has an unusual bias."""
 _PARTS = 8
 """Parts of a recording at whose ends a camera may be bumped."""
 _MOST_PEOPLE = 160
@@ -40,9 +39,6 @@ _TURN_DEG = 1.0
 """A camera that is moved and turned by more is called turned."""
 _NOTABLE_DEG = 0.25
 """Smaller shifts of one of several cameras are not named."""
-_REACH, _FORGOTTEN = 1.4, 40
-"""A person is followed from frame to frame over so many times the spread of the joints (two thirds of a metre),
-and sought for so many frames."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +125,7 @@ class Problem:
         return Cause(finding, likely if finding is None else likely + self._rare(), views)
 
     def explained(self, view: int, starts: Mapping[Kind, Views]) -> list[Cause]:
-        """What one camera alone may have wrong; `starts` have it already as it is after that mistake, or nearly."""
+        """What one camera alone may have wrong; `starts` have it as it is after that mistake, or nearly."""
         found = []
         for kind, views in starts.items():
             which, sigma = ONE[kind], self._usual(view)[ONE[kind]]
@@ -195,7 +191,7 @@ class Problem:
         return changed(self.given, change)
 
     def off(self, usual: Array, reference: int | None = None) -> float:
-        """The probability that cameras, but `reference`, are off by about `usual` (Q,), which was 0.5 beforehand."""
+        """The probability that cameras, but `reference`, are off by about `usual` (Q,); 0.5 beforehand."""
         which = np.flatnonzero(usual).tolist()
         views = [view for view in range(len(self.given)) if view != reference]
         directions = [self.residuals.camera(view, which) for view in views]
@@ -249,32 +245,3 @@ def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
         return Finding(kind, (view,), degrees, ((x, y),))
     turn, moved = difference(given.cTw[view], views.cTw[view])
     return Finding(Kind.TURNED if turn > _TURN_DEG else kind, (view,), turn, moved=moved)
-
-
-def followed(frame: Index, points: Array) -> Index:
-    """(P,) who people (P, J, 3) at some frames are: each is the nearest of the frame before, if that is near."""
-    middle = _middle(points)
-    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
-    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
-    who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
-    for now in np.unique(frame).tolist():
-        here = np.flatnonzero(frame == now)
-        away = np.linalg.norm(middle[here, None] - middle[last], axis=-1)
-        before, after = least_cost_pairs(np.minimum(np.nan_to_num(away, nan=np.inf), reach).T)
-        near = away[after, before] < reach
-        who[here[after[near]]] = who[last[before[near]]]
-        new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
-        if len(new) == len(lost) == 1:  # the only one who can have come back, after a cut for example
-            who[new], lost = who[lost], lost[:0]
-        else:
-            who[new] = count + np.arange(len(new))
-            count += len(new)
-        gone = lost[frame[lost] > now - _FORGOTTEN]
-        last = np.concatenate([here, gone])
-    return who
-
-
-def _middle(points: Array) -> Array:
-    """(N, n) mean of those `points` (N, J, n) that there are; 0 where there are none."""
-    there = ~np.isnan(points[..., :1])
-    return np.asarray(np.where(there, points, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
