@@ -299,14 +299,14 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
         of_cameras = [each.finding for each in problem.causes if each.finding is not None and each.person < 0]
         of_people = [each for each in problem.causes if each.finding is not None and each.person >= 0]
         guilt = sum(each.sure for each in of_cameras)
-        if nothing + guilt > SURE or nothing > 1 - SURE or len(biased) == _MOST_BIASED:
+        if guilt > SURE * (1 - nothing) or nothing > 1 - SURE or len(biased) == _MOST_BIASED:
             break
         bias, camera = of_people[0], one_of(of_cameras)
         instead = tuple(each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE)
         biased.append(replace(bias.finding, sure=1 - guilt - nothing, instead=instead))
         problem = replace(problem, biased=(*problem.biased, (bias.person, bias.finding.cameras[0])))
     of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
-    if guilt <= SURE or len(of_cameras) == 0:
+    if guilt <= max(SURE * (1 - nothing), nothing) or len(of_cameras) == 0:
         return [], biased
     found = one_of(of_cameras)
     size, least = (

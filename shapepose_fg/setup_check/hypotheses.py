@@ -265,7 +265,7 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         of_camera = problem.explained(view, starts)
     told = probable([problem.as_they_are(None, look.views), *problem.biases(), *of_camera])
     guilt = sum(each.sure for each in told if each.finding is not None and each.person < 0)
-    if guilt < SURE:
+    if guilt < SURE:  # of gross mistakes nobody is in doubt
         return _likeliest(look, [each for each in found if each[1].finding.cameras != best.finding.cameras])
     if best.fitted is not None:
         share = sum(each.finding.sure for each in rivals) / guilt

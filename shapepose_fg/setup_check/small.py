@@ -30,6 +30,8 @@ BIAS = 0.1
 """An unusual bias on one person, part of the size (one sigma)."""
 _WRONG = 0.5
 """The probability beforehand that some camera has a small mistake; that some person has an unusual bias."""
+_KNOCKED = 3
+"""Cameras are turned or moved so many times as often as anything else happens to them."""
 _PARTS = 8
 """Parts of a recording at whose ends a camera may be bumped."""
 _MOST_PEOPLE = 160
@@ -122,7 +124,7 @@ class Problem:
     def as_they_are(self, finding: Finding | None, views: Views) -> Cause:
         """That cameras are as in `views`, which a finding puts right; None for nothing."""
         likely, _ = self._likelihood(self.residuals.camera(0, []), np.zeros(0), views)
-        return Cause(finding, likely if finding is None else likely + self._rare(), views)
+        return Cause(finding, likely if finding is None else likely + self._rare(finding.kind), views)
 
     def explained(self, view: int, starts: Mapping[Kind, Views]) -> list[Cause]:
         """What one camera alone may have wrong; `starts` have it as it is after that mistake, or nearly."""
@@ -134,7 +136,7 @@ class Problem:
                 before = _between(self.given, views, view)[which]
                 likely, change = self._likelihood(directions, sigma, views, before)
                 views = _moved(views, view, which, change)
-            found.append(Cause(named(kind, view, self.given, views), likely + self._rare(), views))
+            found.append(Cause(named(kind, view, self.given, views), likely + self._rare(kind), views))
         return found
 
     def biases(self) -> Iterator[Cause]:
@@ -164,7 +166,7 @@ class Problem:
             likely, turn = self._likelihood(self.residuals.camera(view, TURN, share), np.full(3, _TURN))
             finding = Finding(kind, (view,), float(np.rad2deg(np.linalg.norm(turn))), frames=frames)
             count = 2 if kind == Kind.DRIFTING else 2 * K - 2
-            yield Cause(finding, likely + self._rare() - np.log(count), self.given)
+            yield Cause(finding, likely + self._rare(kind) - np.log(count), self.given)
 
     def _of_several(self) -> list[Cause]:
         """Principal points of all cameras that are off, each in its own way."""
@@ -179,7 +181,7 @@ class Problem:
             return []
         shifts = tuple((float(x), float(y)) for x, y in change[rest])
         finding = Finding(Kind.PRINCIPAL_POINT, tuple(rest), float(degrees.max()), shifts)
-        return [Cause(finding, likely + np.log(_WRONG), self.given)]
+        return [Cause(finding, likely + self._rare(Kind.PRINCIPAL_POINT), self.given)]
 
     def relaxed(self) -> Views:
         """The cameras with the small errors that they all probably have."""
@@ -205,9 +207,10 @@ class Problem:
         depth = float(np.median(self.residuals.points[seen] @ cTw[:3] + cTw[3])) if seen.any() else 1.0
         return np.array([_TURN] * 3 + [_MOVE * depth] * 3 + [_TURN * self.given.focal_px[view]] * 2 + [_FOCAL])
 
-    def _rare(self) -> float:
+    def _rare(self, kind: Kind) -> float:
         """The logarithm of the probability of one kind of mistake of one camera, beforehand."""
-        return float(np.log(_WRONG / (len(self.given) * (len(ONE) + 2))))
+        often = _KNOCKED if kind in (Kind.TURNED, Kind.MOVED) else 1
+        return float(np.log(_WRONG * often / (len(self.given) * (len(ONE) + 2 * _KNOCKED))))
 
 
 def probable(causes: list[Cause]) -> list[Cause]:
