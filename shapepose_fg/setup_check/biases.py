@@ -6,6 +6,7 @@ eliminated from the linearised residuals (Schur complements): what remains is in
 likely the residuals are, for each of several sizes of biases.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +18,13 @@ from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q
 from shapepose_fg.setup_check.matching import median_over
 
 LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
-"""Sigmas of a lasting bias of a joint of a person in a view, parts of the person's size. Real detectors have 0.005
-to 0.02 (scripts/measure_biases.py)."""
+"""Sigmas of a lasting bias of a joint of a person in a view, parts of the person's size. On four recordings real
+detectors have 0.0025 to 0.02 (scripts/measure_biases.py)."""
 COMMON = (0.1, 1.0)
 """Sigma of a bias that all people have in common over that of one person's."""
-SHIFT, LARGER = 1.0, 2.0
-"""Sigmas of the shift of a whole person, and of the enlargement (a part of 1), over that of a joint."""
+SHIFT, LARGER = 1.0, 3.0
+"""Sigmas of the shift of a whole person, and of the enlargement (a part of 1), over that of a joint; real ones are
+0.3 to 3."""
 _INDEPENDENT = 0.1
 """Joints of one person, and of frames that follow each other, err alike: of ten detections one is independent."""
 _WEAK = 1e-6
@@ -99,10 +101,12 @@ class Residuals:
         cameras = np.zeros((V * (Q - 3 + 3 * self.parts), 3))
         return np.concatenate([cameras, directions.reshape(-1, 3)])
 
-    def marginals(self, views: Views) -> list[Marginal]:
-        """What is said against the cameras `views`, for each size of biases."""
+    def marginals(
+        self, views: Views, levels: Sequence[float] = LEVELS, shift: float = SHIFT, larger: float = LARGER
+    ) -> list[Marginal]:
+        """What is said against the cameras `views`, for each size of biases: `levels`, and in each `COMMON`."""
         information = self._information(views)
-        return [each for level in LEVELS for each in self._marginals(information, level)]
+        return [each for n in levels for each in self._marginals(information, n, shift * n, larger * n)]
 
     def _rows(self, views: Views) -> Array:
         """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the enlargement, and residuals.
@@ -147,14 +151,14 @@ class Residuals:
             found[person][:, at[:, None], at] += mine.swapaxes(1, 2) @ mine
         return found
 
-    def _marginals(self, information: Array, level: float) -> list[Marginal]:
-        """One for each of `COMMON`."""
+    def _marginals(self, information: Array, level: float, shift: float, larger: float) -> list[Marginal]:
+        """One for each of `COMMON`, of biases with these sigmas."""
         P, J, _, V = *information.shape[:3], self.size_px.shape[1]
         C = V * (Q - 3 + 3 * self.parts)
         # In this order: what people have in common, cameras, single people's shifts and enlargements, residual.
         common = 2 * V * J
         total, log = np.zeros((common + C + 3 * V * P + 1, common + C + 3 * V * P + 1)), 0.0
-        prior = np.repeat([(SHIFT * level) ** -2, (LARGER * level) ** -2], [2 * V, V])
+        prior = np.repeat([shift**-2, larger**-2], [2 * V, V])
         for person in range(P):
             own = slice(C, C + 2 * V)
             of_own = information[person][:, own]
