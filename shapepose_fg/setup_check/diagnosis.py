@@ -295,16 +295,16 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
     """Small errors of cameras that are surer than no error, and than a detector's bias; and such biases."""
     biased = list[Finding]()
     while True:
-        nothing = next(each.sure for each in problem.causes if each.finding is None)
-        of_cameras = [each.finding for each in problem.causes if each.finding is not None and each.person < 0]
-        of_people = [each for each in problem.causes if each.finding is not None and each.person >= 0]
+        told = [(each.person, each.finding) for each in problem.causes if each.finding is not None]
+        of_cameras = [finding for person, finding in told if person < 0]
         guilt = sum(each.sure for each in of_cameras)
+        nothing = 1 - sum(finding.sure for _, finding in told)
         if guilt > SURE * (1 - nothing) or nothing > 1 - SURE or len(biased) == _MOST_BIASED:
             break
-        bias, camera = of_people[0], one_of(of_cameras)
+        (person, bias), camera = next(each for each in told if each[0] >= 0), one_of(of_cameras)
         instead = tuple(each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE)
-        biased.append(replace(bias.finding, sure=1 - guilt - nothing, instead=instead))
-        problem = replace(problem, biased=(*problem.biased, (bias.person, bias.finding.cameras[0])))
+        biased.append(replace(bias, sure=1 - guilt - nothing, instead=instead))
+        problem = replace(problem, biased=(*problem.biased, (person, *bias.cameras)))
     of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
     if guilt <= max(SURE * (1 - nothing), nothing) or len(of_cameras) == 0:
         return [], biased

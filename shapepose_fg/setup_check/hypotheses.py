@@ -264,15 +264,15 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         starts = {each.fitted: each.look.views for each in reversed(rivals) if each.fitted is not None}
         of_camera = problem.explained(view, starts)
     told = probable([problem.as_they_are(None, look.views), *problem.biases(), *of_camera])
-    guilt = sum(each.sure for each in told if each.finding is not None and each.person < 0)
-    if guilt < SURE:  # of gross mistakes nobody is in doubt
+    guilty = [(each.finding, each.views) for each in told if each.finding is not None and each.person < 0]
+    guilt = sum(finding.sure for finding, _ in guilty)
+    if guilt < SURE:
         return _likeliest(look, [each for each in found if each[1].finding.cameras != best.finding.cameras])
     if best.fitted is not None:
         share = sum(each.finding.sure for each in rivals) / guilt
         fitted = [
-            replace(best, finding=replace(f, sure=f.sure * share), look=replace(look, views=each.views))
-            for each in told
-            if (f := each.finding) is not None and each.person < 0
+            replace(best, finding=replace(f, sure=f.sure * share), look=replace(look, views=views))
+            for f, views in guilty
         ]
         changes = fitted + [each for each in changes if each not in rivals]
     return replace(changes[0], finding=one_of([each.finding for each in changes]))

@@ -55,8 +55,6 @@ class Cause:
     """The cameras after it is put right."""
     person: int = -1
     """Whose bias it is."""
-    sure: float = 0.0
-    """Its probability among others."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Problem:
     """(N,) frame of each person."""
     given: Views
     """The cameras as they are without any explanation."""
-    biased: tuple[tuple[int, int], ...] = ()
+    biased: tuple[tuple[int, ...], ...] = ()
     """People and views with an unusual bias, which explains nothing any more."""
 
     @classmethod
@@ -110,7 +108,9 @@ class Problem:
             best = np.linalg.solve(known, g - done)
             likely = each.log + 0.5 * float((g - done) @ best - done @ done - np.linalg.slogdet(known)[1])
             found.append((likely, best[: len(sigma)] * sigma))
-        logs = np.array([likely for likely, _ in found])
+        logs = np.nan_to_num(
+            [likely for likely, _ in found], nan=-np.inf
+        )  # people behind a camera that is far off
         return float(np.logaddexp.reduce(logs)), found[int(np.argmax(logs))][1]
 
     @cached_property
@@ -219,8 +219,7 @@ def probable(causes: list[Cause]) -> list[Cause]:
     told = list[Cause]()
     for each in sorted(causes, key=lambda each: -each.log):
         sure = float(np.exp(each.log - total))
-        finding = None if each.finding is None else replace(each.finding, sure=sure)
-        told.append(replace(each, finding=finding, sure=sure))
+        told.append(replace(each, finding=None if each.finding is None else replace(each.finding, sure=sure)))
     return told
 
 
