@@ -250,7 +250,7 @@ class Served:
     def client(self) -> socket.socket:
         for _ in range(200):
             try:
-                return socket.create_connection(("127.0.0.1", self.port), timeout=20)
+                return socket.create_connection(("127.0.0.1", self.port), timeout=60)
             except ConnectionRefusedError:
                 time.sleep(0.05)
         raise TimeoutError
@@ -265,7 +265,7 @@ class Served:
         assert any(words in each for each in self.notes), self.notes
 
     def _wait(self, until: Callable[[], bool]) -> None:
-        last = time.monotonic() + 20
+        last = time.monotonic() + 60
         while not until() and time.monotonic() < last:
             time.sleep(0.01)
 
@@ -290,7 +290,7 @@ def test_a_client_s_rubbish_is_named_and_the_others_go_on(five_cameras):
             assert once_good.recv(1) == b""
         served.wait_for(26)
         assert all("127.0.0.1:" in each and "line" in each for each in served.notes)
-    served.thread.join(timeout=20)
+    served.thread.join(timeout=60)
     assert not served.thread.is_alive()
 
 
@@ -309,7 +309,7 @@ def test_idle_connections_make_room_and_clients_may_come_again(five_cameras):
     with served.client() as again:
         again.sendall(lines[3])
     served.wait_for(4)
-    served.thread.join(timeout=20)  # although the idle ones are still there
+    served.thread.join(timeout=60)  # although the idle ones are still there
     assert not served.thread.is_alive()
     for each in idle:
         each.close()
@@ -328,7 +328,7 @@ def test_what_is_refused_because_of_others_cuts_nobody_off(five_cameras):
     with served.client() as good:
         good.sendall(b"\n".join([*lines_of(five_cameras, 31), b""]))
         served.wait_for(1)
-    served.thread.join(timeout=20)
+    served.thread.join(timeout=60)
 
 
 def test_readers_are_bounded(monkeypatch):
@@ -339,14 +339,14 @@ def test_readers_are_bounded(monkeypatch):
     listening = sockets.listen("tcp://:0")
     port = listening.getsockname()[1]
     with outputs._Listeners(listening, notes.append) as listeners:
-        first = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(3)]
-        listeners.send("a\n")
-        late = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(3)]
+        # Nothing is sent yet: far more than the system would let wait are answered at once.
+        clients = [socket.create_connection(("127.0.0.1", port), timeout=60) for _ in range(300)]
+        first, late = clients[:3], clients[3:]
+        assert [each.recv(1) for each in late] == [b""] * 297
         for _ in range(400):
             listeners.send("b" * 100_000 + "\n")
             first[0].recv(2**20)
-        assert [each.recv(1) for each in late] == [b""] * 3
-    assert sum("sent away" in each for each in notes) == 3
+    assert sum("sent away" in each for each in notes) == 297
     assert sum("too slow" in each for each in notes) == 2
-    for each in (*first, *late):
+    for each in clients:
         each.close()
