@@ -306,6 +306,7 @@ REFUSED = [
     ("a.mat", b"MATLAB 5.0", "a MATLAB file, which has no layout of its own; write"),
     ("a.pkl", b"\x80\x04", "a Python pickle, which could run code and is not opened; write"),
     ("a.slp", b"\x89HDF\r\n\x1a\n", r"a SLEAP project; export the analysis HDF5: sio export FILE\.slp"),
+    ("mediapipe_body_3d_xyz.csv", b"frame,x,y,z\n", "FreeMoCap's table of points in 3D.*pixelXY"),
     ("a.npy", b"\x93NUMPY", "a NumPy array, and only FreeMoCap's"),
 ]
 

@@ -115,7 +115,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
     the results; those that are there already where they are `kept`, of a run that goes on.
     """
     asked, file = known.request, known.output / CLOCKS
-    if not asked.synchronise or asked.fps is None:
+    if not asked.synchronise:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")

@@ -32,6 +32,10 @@ _BLAZEPOSE = 33
 """MediaPipe's points of the body come first; hands and face follow."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _HDF5 = "an HDF5 file, and only SLEAP's analysis files and DeepLabCut's tables are known here; give the CSV"
+_FREEMOCAP_3D = (
+    "FreeMoCap's table of points in 3D, and its 2D points are needed; give the recording's folder, or"
+    " output_data/raw_data/..._pixelXY.npy in it"
+)
 _OTHERS = {
     ".npy": "a NumPy array, and only FreeMoCap's of (cameras, frames, points, 2 or 3) pixels is known here",
     ".npz": "a NumPy archive, which has no layout of its own",
@@ -43,13 +47,16 @@ _OTHERS = {
     ".hdf5": _HDF5,
     ".parquet": "a Parquet table, which has no layout of its own",
     ".c3d": "a C3D file of points in 3D, and 2D detections are needed",
+    "_3d_xyz.csv": _FREEMOCAP_3D,
+    "freemocap_data_by_frame.csv": _FREEMOCAP_3D,
     ".trc": "a TRC file of points in 3D, and 2D detections are needed",
 }
 
 
 def what_it_is(path: Path) -> str | None:
     """What a file is that cannot be read, and how to bring its content; None where its ending tells nothing."""
-    if (known := _OTHERS.get(path.suffix.lower())) is None:
+    known = next((what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None)
+    if known is None:
         return None
     cure = "" if ";" in known else "; write what it holds as <camera>.json, COCO's keypoint results"
     return f"{known}{cure}"
