@@ -146,7 +146,7 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
     known = table.ndim == 1 and not table.dtype.hasobject and "index" in (table.dtype.names or ())
     if not known or any(len(row) not in (3, 4) for row in columns):
         raise InputError(f"{path}: {what_it_is(path)}")
-    joints, picked = body_parts(path, ((row[1] if len(row) == 4 else "", *row[-2:]) for row in columns))
+    joints, picked = body_parts(path, ((row[1] if len(row) == 4 else "", row[-2], row[-1]) for row in columns))
     _check_size(path, table.size * table.dtype.itemsize / 8, table.shape)
     rows = table[:]
     frame, *blocks = (np.asarray(rows[name]) for name in ("index", *names))
@@ -175,7 +175,7 @@ def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
     kind = attributes.get_id(name)
     if kind.dtype.kind != "S" or kind.shape != () or kind.dtype.itemsize > _LONGEST_LIST:
         raise ValueError(f"{name} is no plain text")
-    known, rows, row, last = dict[str, str](), list[list[str]](), list[str](), ""
+    known, rows, row, last = dict[Any, str](), list[list[str]](), list[str](), ""
     for operation, value, _ in pickletools.genops(bytes(attributes[name])):
         match operation.name:
             case "MARK":
