@@ -127,6 +127,7 @@ def test_detections_come_and_people_go_by_sockets(tmp_path, cameras, five_camera
     assert "cut off" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_people):
     pytest.importorskip("mcap_ros2", reason='needs pip install "shapepose-fg[ros]"')
     from mcap.reader import make_reader

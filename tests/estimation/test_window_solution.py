@@ -140,6 +140,7 @@ def test_factors_of_ones_own_are_in_it(people, scene):
         np.testing.assert_allclose(at, solution.joints[:, WRIST], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_solved_graph_is_written_and_read_back(people, scene, tmp_path):
     solution = solutions(people, scene)[0]
     save_graph(tmp_path / "person.json", solution.graph, solution.values)

@@ -273,6 +273,7 @@ def test_a_trajectory_of_another_clock_is_refused(drifted):
         refine_trajectories(drifted.recording, rig, times=TIMES)
 
 
+@pytest.mark.slow
 def test_pictures_outside_the_trajectory_are_not_used(drifted):
     short = drifted.true
     early = short.time_s < TIMES.time_s[40]

@@ -162,6 +162,7 @@ def test_factors_that_were_typed_somewhere_are_the_same_with_workers():
     assert run.stdout == "4 True\n", run.stderr
 
 
+@pytest.mark.slow
 def test_progress_counts_frames(scene, recording):
     seen = []
     reconstruct(
@@ -228,6 +229,7 @@ def test_factors_of_one_s_own_reach_every_person(scene, recording):
     np.testing.assert_allclose(apart, 0.5, atol=0.005)
 
 
+@pytest.mark.slow
 def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, recording):
     def throw(window, keys):
         far = np.array([1000.0, 0.0, 0.0])
