@@ -537,6 +537,7 @@ def test_processes_are_this_machine_s_or_the_cluster_s(recording, pipeline, caps
     assert (pipeline["workers"], pipeline["cluster"]) == (2, "local")
 
 
+@pytest.mark.slow
 def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     assert run(*recording, "--chunk-frames", "200", "--cluster", "tcp://host:8786") == 0
     assert (pipeline["chunk_frames"], pipeline["cluster"]) == (200, "tcp://host:8786")
@@ -600,6 +601,7 @@ def three(recording, tmp_path) -> list[str]:
     return recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", [["--without", "behind"], ["--cameras", "right, left"]])
 def test_some_of_the_cameras(three, pipeline, tmp_path, choice):
     """Whoever films with fewer cameras than were calibrated says which; a run that goes on has the same ones."""

@@ -34,6 +34,7 @@ def lines(rig, people, frames: int) -> str:
     return "\n".join(written) + "\n"
 
 
+@pytest.mark.slow
 def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
     (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 8))
     given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]

@@ -85,6 +85,7 @@ def test_a_kernel_is_compiled_anew_when_a_file_has_changed_that_it_calls_into(pr
     assert program()[:2] == (21.0, [1, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ending", "content"),
     [

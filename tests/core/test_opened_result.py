@@ -76,6 +76,7 @@ def same(found: Reconstruction, expected: Reconstruction) -> None:
         np.testing.assert_array_equal(getattr(found.observations, name), getattr(expected.observations, name))
 
 
+@pytest.mark.slow
 def test_frames_and_people_are_those_of_the_whole(folder, result):
     whole = Reconstruction.load(folder)
     same(whole, result)

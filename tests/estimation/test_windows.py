@@ -198,6 +198,7 @@ def test_a_joint_with_a_factor_of_one_s_own_stays_where_that_leaves_it(walk, fiv
     assert np.linalg.norm((plain.joints - kept.joints)[rows[-10:], WRIST], axis=-1).mean() > 0.03
 
 
+@pytest.mark.slow
 def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_people):
     observations, truth = walk
     alone = solve(observations, five_cameras, BesideFitter(two_people[0]), temporal=False)
@@ -366,6 +367,7 @@ def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_peo
     assert {each.row for each in found.rows(np.array([row])).problems} == {0}
 
 
+@pytest.mark.slow
 def test_factors_that_make_no_sense_end_no_run(walk, five_cameras, two_people):
     """A factor that is not a number: a status for that person, the other is solved."""
     observations, truth = walk

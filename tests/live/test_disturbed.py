@@ -143,7 +143,7 @@ def shifted(metres: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pose", [shifted(1e9), *slow(np.eye(4), shifted(9e5), 2 * np.eye(4))])
-@pytest.mark.parametrize("which", [0, 31], ids=["the first", "a later"])
+@pytest.mark.parametrize("which", [0, *slow(31)], ids=["the first", "a later"])
 def test_one_pose_for_a_camera_that_stands_still(live, five_cameras, seen, which, pose):
     given = list(views(five_cameras, seen, range(40)))
     given.insert(which, [*given[which], pose])
@@ -214,6 +214,7 @@ def test_a_file_of_which_no_line_is_taken_is_refused(tmp_path, five_cameras):
         fed(tmp_path, five_cameras, b"\n".join(lines_of(five_cameras, 20)), push)
 
 
+@pytest.mark.slow
 def test_a_line_without_end_takes_no_memory(tmp_path, five_cameras):
     with (tmp_path / "in.jsonl").open("wb") as stream:
         stream.write(b"\n".join([*lines_of(five_cameras, 4), b""]))

@@ -136,6 +136,7 @@ def test_a_view_that_comes_late_joins_its_frame(start, dance):
     assert (again[0].given.detections.view == 2).sum() == len(late) and live.report().late == 1
 
 
+@pytest.mark.slow
 def test_a_saved_state_goes_on_as_if_nothing_had_been(start, dance, tmp_path):
     one = start()
     for frame in range(15):

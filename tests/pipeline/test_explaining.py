@@ -93,6 +93,7 @@ def test_no_view_and_one_view(people, scene):
     assert first(one) == (Cause.ONE_VIEW, (scene.rig.names[cameras[0]],))
 
 
+@pytest.mark.slow
 def test_a_detection_where_nobody_is(people, scene):
     """Half a metre off, straight up in the picture."""
     person, _, cameras = seen_by_many(people)
@@ -104,6 +105,7 @@ def test_a_detection_where_nobody_is(people, scene):
     assert found.views[cameras[0]].share == 0
 
 
+@pytest.mark.slow
 def test_somebody_elses_detection(people, scene):
     person, _, cameras = seen_by_many(people)
     table, view = people.observations, None
@@ -164,6 +166,7 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     assert not done & {(each.cause, *each.cameras[:1]) for each in untouched.findings}
 
 
+@pytest.mark.slow
 def test_views_that_the_body_contradicts(people, scene):
     """All views put the elbow 60 cm above itself."""
     person, _, cameras = seen_by_many(people)

@@ -116,6 +116,7 @@ def test_it_goes_through_export_and_explain_of_the_shell(joined, scene, tmp_path
     assert "solved with factors of Box" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_the_errors_of_two_people_correlate_as_the_graph_says(joined, scene):
     graphs = list(window_solutions(joined, scene.rig, extra_factors=Box(scene)))
     assert [len(each.together) for each in graphs] == [2, 2]

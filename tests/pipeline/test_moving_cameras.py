@@ -120,6 +120,7 @@ def refined(drifted) -> Rig:
     return refine_trajectories(drifted.recording, drifted.rig, times=TIMES)
 
 
+@pytest.mark.slow
 def test_people_correct_the_odometry_and_say_how_surely(drifted, refined):
     before, after = camera_error(drifted, drifted.rig), camera_error(drifted, refined)
     rms = [np.sqrt((each**2).mean(axis=0)) for each in (before, after)]

@@ -69,7 +69,6 @@ def test_items_are_taken_as_they_are_needed():
 _TYPED = """
 import os
 from shapepose_fg.pipeline.workers import workers
-from tests.marks import slow
 print("begins")
 base, here = 10, os.getpid()
 def power(shared, item):
@@ -110,6 +109,7 @@ def is_killed(_: int, item: int) -> int:
 
 
 @posix
+@pytest.mark.slow
 def test_a_worker_that_is_killed_from_outside_is_told_of():
     """As the system does where memory is short; what was done before it comes through."""
     with pytest.raises(WorkLost, match="a worker process was killed"), workers(2, 10, ahead=1) as pool:
@@ -121,8 +121,6 @@ def test_a_worker_that_is_killed_from_outside_is_told_of():
 _ENDLESS = """
 import os, time
 from shapepose_fg.pipeline.workers import workers
-from tests.marks import slow
-from tests.marks import slow
 def endless(_, item):
     os.write(1, b"%d\\n" % os.getpid())  # in one piece
     time.sleep(600)
@@ -132,7 +130,7 @@ with workers(2, None) as pool:
 
 
 @posix
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGKILL, *slow(signal.SIGINT, signal.SIGTERM)])
 def test_workers_end_with_the_process_that_started_them_whatever_ends_it(how):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     run = subprocess.Popen([sys.executable, "-c", _ENDLESS], stdout=subprocess.PIPE, stderr=subprocess.PIPE,

@@ -189,6 +189,7 @@ def test_a_wrong_unit_is_named(recording, room, factor, words):
     assert words in sentence(found, rig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", ["y", *slow("-z", "-x")])
 def test_a_wrong_up_axis_is_named(recording, room, axis):
     found = only_finding(recording, Rig(room.cameras, axis))
@@ -292,6 +293,7 @@ def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part)
     )
 
 
+@pytest.mark.slow
 def test_adults_are_not_taken_for_children(recording, room):
     assert check_setup(recording, room).notes == ()
 

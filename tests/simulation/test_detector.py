@@ -242,6 +242,7 @@ def test_whom_others_hide_is_missed_as_a_whole(seen: float, hidden_by: int):
         assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / 960)
 
 
+@pytest.mark.slow
 def test_people_are_lost_as_wholes():
     rig, joints = crowd(12)
     table = drawing(
@@ -379,6 +380,7 @@ def test_faces_are_not_found_from_behind():
     assert count[0] > 0.85 * 240 and count[1] < 0.2 * 240
 
 
+@pytest.mark.slow
 def test_larger_and_smaller_knobs_err_more_and_less(scene: Scene):
     def mean_error(noise: float) -> float:
         found = simulate(scene, replace(PLAIN, noise=noise, misses=0.0), frames=[0])[0]

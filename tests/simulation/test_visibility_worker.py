@@ -85,6 +85,7 @@ def test_an_error_in_a_worker_is_raised_here(worker: VisibilityWorker, people: l
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_no_endless_wait(worker: VisibilityWorker, people: list[FramePeople]):
     with closing(worker.all(people * 9, 2)) as seen:
         next(seen)

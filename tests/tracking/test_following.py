@@ -105,6 +105,7 @@ def test_rows_begin_and_end_with_detections(followed, five_cameras, walking, nob
     assert rows.frame.tolist() == np.arange(14, 31).repeat(2).tolist() and len(identities(rows, truth)) == 2
 
 
+@pytest.mark.slow
 def test_who_enters_late_leaves_early_and_comes_back_is_the_same_person(
     followed, five_cameras, seen_exactly, walking
 ):
@@ -246,6 +247,7 @@ def test_the_memory_of_a_long_recording_is_that_of_a_block_and_the_look_ahead(tr
     assert longest <= 5 * (BLOCK_S + 1.0) + 1 and state.people.ids.tolist() == [0, 1] and state.next_id == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopped", [12, *slow(44)])
 def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(tracker, five_cameras, walking, stopped):
     """10 frames a second: within the first block, and after it while the second is open."""
