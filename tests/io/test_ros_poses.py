@@ -12,8 +12,8 @@ from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.calibration import with_trajectories
 from shapepose_fg.io.ros.definitions import definition
 from shapepose_fg.io.ros.mcap_files import read_views
-from shapepose_fg.io.ros.poses import Frames
 from shapepose_fg.io.ros.messages import Message, header
+from shapepose_fg.io.ros.poses import Frames
 from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.simulation.scene import ring_of_cameras
 
