@@ -17,10 +17,12 @@ from shapepose_fg.io.lenses import lenses_of
 
 COCO = SKELETONS["COCO_17"]
 FRAMES = 6
-NAMES: list[str] = (
-    "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist"
-    " right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle"
-).split()
+NAMES: tuple[str, ...] = tuple(
+    (
+        "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist"
+        " right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle"
+    ).split()
+)
 
 
 @pytest.fixture

@@ -191,6 +191,7 @@ class _Run:
         task, asked, skeleton = self.task, self.known.request, self.recording.skeleton
         frames, times, cuts = task.whole()
         return {
+            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "inputs": self.inputs,
             "configuration": asdict(task.config),
             "frames": [frames.start, frames.stop],
@@ -201,7 +202,6 @@ class _Run:
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
-            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "versions": versions(),
             "program": program_digest(),
         }
