@@ -17,7 +17,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Run the linter and the fast tests: some minutes on two cores.
+## Run the linter and the fast tests.
 test: lint
 	$(PYTEST) -m "not slow"
 
