@@ -14,7 +14,7 @@ _ALIASES = {
     "COCO_23": "coco23 cocofoot",
     "COCO_133": "coco133 coco133wrist cocowholebody wholebody wholebodywrist ubody ubody2d ubody3d h3wb halpe",
     "HALPE_26": "halpe halpe26 bodywithfeet body26",
-    "HALPE_68": "halpe halpe68",
+    "HALPE_68": "halpe halpe68 halpe68noface",
     "HALPE_136": "halpe halpe136",
     "H36M_17": "h36m h36m17 human36m",
     "MPI_INF_3DHP_17": "mpiinf3dhp 3dhp",

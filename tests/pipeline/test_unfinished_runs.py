@@ -258,6 +258,21 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     assert_same_files(out, tmp_path / "whole")
 
 
+@pytest.mark.parametrize(("before", "after"), [((), ("--without", "cam1")), (("--cameras", "cam0,cam2"), ())])
+def test_a_run_does_not_go_on_with_other_cameras(command, tmp_path, capsys, monkeypatch, before, after):
+    def stop(*_: object, **__: object) -> None:
+        raise Stopped(signal.SIGTERM)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shapepose_fg.cli.reconstruct.run.reconstruct_parts", stop)
+        assert finished(command, "--output", str(tmp_path), *before) == 143
+    monkeypatch.setattr("shapepose_fg.pipeline.runs.manifest.Parts", lambda kept: _Done())
+    capsys.readouterr()
+    for more, said in (((), "go on with --resume"), (("--resume",), "had another set of cameras")):
+        assert finished(command, "--output", str(tmp_path), *after, *more) == 2
+        assert said in capsys.readouterr().err
+
+
 EARLY = """
 import os, signal, sys
 import shapepose_fg.__main__ as begin
@@ -376,6 +391,7 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     assert (tmp_path / "parts" / "wheel.stl").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_named(scene, recording, tmp_path):
     kept = Interrupted(tmp_path / "parts", 3, behind=False)
     with pytest.raises(Stopped):

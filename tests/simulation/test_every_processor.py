@@ -12,6 +12,7 @@ import pytest
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import sequence
+from tests.conftest import pytest_configure
 from tests.marks import slow
 
 ROOT = Path(__file__).parents[2]
@@ -47,7 +48,8 @@ def parts(scene: Scene, seed: int) -> dict[str, np.ndarray]:
 
 
 def save(mocap: str, output: str) -> None:
-    """What another process runs."""
+    """What another process runs: with the same draws as here."""
+    pytest_configure()
     np.savez(output, **recordings(Path(mocap)))  # type: ignore[arg-type]
 
 
@@ -56,6 +58,7 @@ def here(tiny_mocap_file: Path) -> dict[str, np.ndarray]:
     return recordings(tiny_mocap_file)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names kernels of x86-64")
 @pytest.mark.parametrize("processor", PROCESSORS, ids=" ".join)
 def test_the_same_seed_gives_the_same_recording_on_every_processor(
