@@ -144,8 +144,8 @@ def test_how_long_somebody_must_be_seen_is_a_matter_of_seconds(step_s, seconds, 
 @pytest.mark.parametrize("step_s", [1 / 60, 1 / 10])
 @pytest.mark.parametrize("length_s", [0.2, 0.4, 2.0])
 def test_in_a_short_recording_little_evidence_is_enough(step_s, length_s):
-    """A person seen in one place of four has 0.14 s of evidence a second and is probably there (79 %), however short
-    the recording; one seen so in every other frame has none."""
+    """A person seen in one place of four has 0.14 s of evidence a second and is probably there (79 %), however
+    short the recording; one seen so in every other frame has none."""
     T = round(length_s / step_s)
     chosen = evidence_of(([ANNA] * T, 0), ([BERT[:1]] * T, 0), step_s=step_s)
     assert stretches(chosen) == [(0, 0, T), (1, 0, T)]
