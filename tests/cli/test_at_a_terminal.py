@@ -123,7 +123,12 @@ def work(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"columns": 24}, {"NO_COLOR": "1"}, {"TERM": "dumb"}, {"TERM": "xterm"}, {"PYTHONIOENCODING": "ascii"}],
+    [
+        {},
+        *slow(
+            {"columns": 24}, {"NO_COLOR": "1"}, {"TERM": "dumb"}, {"TERM": "xterm"}, {"PYTHONIOENCODING": "ascii"}
+        ),
+    ],
     ids=["colours", "narrow", "without colours", "dumb", "few colours", "ascii"],
 )
 def test_a_bar_is_drawn_and_taken_away(work, settings):
@@ -137,12 +142,14 @@ def test_a_bar_is_drawn_and_taken_away(work, settings):
     assert "looking through" not in words and "0/40" not in words, "the bar is taken away"
 
 
+@pytest.mark.slow
 def test_a_bar_is_taken_away_where_an_error_ends_the_work(work):
     seen = at_terminal(sys.executable, work, "error")
     assert seen.code == 2 and seen.rubbish() == []
     assert "looking through" not in "".join(seen.lines) and seen.lines[-1].startswith("error: frame 30")
 
 
+@pytest.mark.slow
 def test_a_bar_is_taken_away_where_it_is_stopped(work):
     seen = at_terminal(sys.executable, work, "stopped", stop_at="from a library")
     assert seen.code == 130 and seen.rubbish() == []

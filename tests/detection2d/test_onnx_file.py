@@ -10,6 +10,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.onnx_file import read_onnx
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from tests.detection2d.conftest import blob, node, onnx_file, onnx_model, varint
+from tests.marks import slow
 
 WEIGHTS = np.ones((3, 3, 8, 8), dtype=np.float32)
 
@@ -95,8 +96,7 @@ def test_spellings_that_no_program_writes_are_refused(tmp_path, content):
     "content",
     [
         blob(7, blob(5, b"\x25" + bytes(4)) * 2**20),
-        blob(7, (b"\x0a\x00") * 2**22),
-        b"\x08\x01" * 2**22,
+        *slow(blob(7, (b"\x0a\x00") * 2**22), b"\x08\x01" * 2**22),
     ],
     ids=["numbers one by one", "empty nodes", "versions"],
 )
@@ -127,6 +127,7 @@ def test_a_file_that_looks_like_onnxruntime_s_own_format_is_read_as_onnx(tmp_pat
     assert OnnxNetwork.open(file).run(given)[0].ravel().tolist() == [192.0] * 3
 
 
+@pytest.mark.slow
 def test_weights_within_are_read_in_every_spelling(tmp_path):
     """Numbers as bytes, packed, and one by one; a length in more bytes than needed; a place that says: here."""
     halves = np.full(3, 0.5, dtype="<f4")

@@ -71,6 +71,7 @@ def test_frames_are_what_all_cameras_saw_at_one_time(scene, together, apart, tmp
     assert any("frames that another camera has no picture for were left out" in note for note in recording.notes)
 
 
+@pytest.mark.slow
 def test_cameras_may_have_different_numbers_of_frames(scene, apart, tmp_path):
     """The last frames of camera 1, which are of later than the others, taken out of its file."""
     for file in apart.iterdir():

@@ -130,6 +130,7 @@ def run(*arguments: object) -> int:
     return int(caught.value.code or 0)
 
 
+@pytest.mark.slow
 def test_tracks_solves_anew_who_changed(scene, people, tmp_path, capsys):
     folder = saved(people, scene, tmp_path / "results")
     whole = (folder / "people.npz").read_bytes()

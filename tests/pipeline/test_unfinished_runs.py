@@ -391,6 +391,7 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     assert (tmp_path / "parts" / "wheel.stl").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_named(scene, recording, tmp_path):
     kept = Interrupted(tmp_path / "parts", 3, behind=False)
     with pytest.raises(Stopped):

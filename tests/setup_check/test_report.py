@@ -159,6 +159,7 @@ def test_frames_as_spans():
     assert spans_of([]) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
 def test_speeds_need_identities(recording, room, temporal):
     """Frame by frame numbers of people are no identities: whoever is number 0 next may stand anywhere."""

@@ -58,6 +58,7 @@ def here(tiny_mocap_file: Path) -> dict[str, np.ndarray]:
     return recordings(tiny_mocap_file)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names kernels of x86-64")
 @pytest.mark.parametrize("processor", PROCESSORS, ids=" ".join)
 def test_the_same_seed_gives_the_same_recording_on_every_processor(
