@@ -17,7 +17,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Run the linter and the fast tests: some minutes on two cores.
+## Run the linter and the fast tests.
 test: lint
 	$(PYTEST) -m "not slow"
 
@@ -41,7 +41,7 @@ benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
 
 # Of what is installed, what is imported is compiled then, a quarter of it.
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt $(PIP_ARGS)
+INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt $(PIP_ARGS)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
