@@ -62,8 +62,8 @@ _SIDED = {
 """Joints on both sides: the body's name without its side, and what others call it."""
 _MIDDLE = {
     "Nose": "nose",
-    "Neck": "neck neckbase baseneck shoulder shoulders thorax sternum",
-    "MidHip": "hip hips pelvis root",
+    "Neck": "neck neckbase baseneck shoulder shoulders thorax sternum spineshoulder",
+    "MidHip": "hip hips pelvis root spinebase basespine",
     "Head": "head headtop tophead topofhead vertex",
     "head": "upperneck headbottom neckupper neckbase necknose noseneck",
     "spine1": "spine1 belly abdomen navel spinenavel spinenaval",
@@ -119,7 +119,7 @@ def body_points(names: Sequence[str]) -> list[str]:
     split = [_side_and_part(words) for words in every]
     parts = {part for _, part in split}
     middle = {word: part for part, words in _MIDDLE.items() for word in words.split()}
-    if "thorax" in parts or "sternum" in parts:  # Human3.6M's, MPII's: what is called neck is the upper end
+    if parts & {"thorax", "sternum", "spineshoulder"}:  # Human3.6M's, MPII's: what is called neck is the upper end
         middle |= {"neckbase": "head", "neck": "neck"}
     else:
         middle |= {"neckbase": "Neck"}
