@@ -214,6 +214,7 @@ def test_the_command_compiles_all_ahead():
     )
 
 
+@pytest.mark.slow
 def test_a_reconstruction_calls_kernels_with_the_types_that_they_name():
     """Each is compiled once: for one more layout of an array it would be compiled again, for seconds."""
 

@@ -88,6 +88,7 @@ def test_a_box_between_two_people_is_held_and_both_wrists_are_nearer_to_the_trut
     assert tied < 0.8 * alone
 
 
+@pytest.mark.slow
 def test_its_share_is_explained_and_the_sum_is_one(joined, scene):
     one, other = ends_of(joined, scene.keypoints, 5)
     who, whom = int(joined.person[one]), int(joined.person[other])
@@ -106,6 +107,7 @@ def test_its_share_is_explained_and_the_sum_is_one(joined, scene):
     assert untied.factors == () and untied.missing_factors == ()
 
 
+@pytest.mark.slow
 def test_it_goes_through_export_and_explain_of_the_shell(joined, scene, tmp_path, capsys):
     joined.save(tmp_path)
     who = int(joined.person[ends_of(joined, scene.keypoints, 5)[0]])
