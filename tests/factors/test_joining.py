@@ -18,6 +18,7 @@ from factors import (
     odometry_factors,
     reported_factor,
 )
+from tests.marks import slow
 
 K = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]])
 LENS, T, STEP_S, NOISE_PX = make_calibration(K), 25, 0.2, 8.0
@@ -151,7 +152,7 @@ def cholesky() -> gtsam.ISAM2:
     return gtsam.ISAM2(gtsam.ISAM2Params())
 
 
-@pytest.mark.parametrize("seed", range(6880, 6885))
+@pytest.mark.parametrize("seed", [6880, *slow(*range(6881, 6885))])
 def test_people_and_slam_together_are_better_than_either_alone(seed):
     made = world(seed)
     slam = run(made, cholesky(), people=False)
