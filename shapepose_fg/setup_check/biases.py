@@ -20,7 +20,7 @@ from shapepose_fg.setup_check.matching import median_over
 LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
 """Sigmas of a lasting bias of a joint of a person in a view, parts of the person's size. On four recordings real
 detectors have 0.0025 to 0.02 (scripts/measure_biases.py)."""
-COMMON = (0.1, 1.0)
+COMMON = (0.1, 1.0, 10.0)
 """Sigma of a bias that all people have in common over that of one person's."""
 SHIFT, LARGER = 1.0, 3.0
 """Sigmas of the shift of a whole person, and of the enlargement (a part of 1), over that of a joint; real ones are

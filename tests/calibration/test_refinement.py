@@ -159,9 +159,10 @@ def test_two_cameras(rig, recording):
     seen = Recording(recording.skeleton, [each.only(each.view < 2) for each in recording.frames])
     wrong = disturbed(two, 0)
     found = refine(seen, wrong, TIMES, range(250))
-    assert found.better and found.after_px < 3
+    # Of two cameras half of what is wrong shows: here a bias of the detector is no good explanation, but one.
+    assert found.after_px < min(3, found.before_px) and found.probability > 0.5
     # How they look at each other is found; along the line between them they may both turn.
-    assert off_by(found.rig, two)[0].max() < off_by(wrong, two)[0].max()
+    assert off_by(found.adjusted.rig, two)[0].max() < off_by(wrong, two)[0].max()
 
 
 @pytest.mark.slow
