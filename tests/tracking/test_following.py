@@ -183,7 +183,7 @@ def test_who_is_found_on_the_way_forwards_is_followed_back_in_the_same_world(tra
     """A world that begins with nobody in the first frame has two people, and both in every frame."""
     frames = [Input(t, np.full(5, t / 30), each, five_cameras) for t, each in enumerate(found_late)]
     none = np.zeros((0, len(tracker.skeleton), 5), dtype=np.intp)
-    found = follow_worlds(tracker, frames, [Seed(0, Tracks.none(tracker.skeleton), none, births=True)], 0)
+    found = follow_worlds(tracker, frames, [Seed(0, Tracks.none(tracker.skeleton), none)], 0)
     assert found.there.shape == (2, len(frames)) and found.there.all()
     seen = (found.candidate >= 0).sum(axis=(2, 3))
     assert (seen[0] == 5 * 25).all() and (seen[1, 12:] == 5 * 25).all() and (seen[1, :12] == 5 * 22).all()
