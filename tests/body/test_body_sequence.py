@@ -66,7 +66,7 @@ def some(targets: JointTargets, rows: np.ndarray) -> JointTargets:
     return JointTargets(targets.xyz[rows], targets.information[rows])
 
 
-@pytest.fixture(scope="module", params=FITTERS)
+@pytest.fixture(scope="module", params=["learned", *slow("plain")])
 def fitter(request) -> SmplFitter:
     return FITTERS[request.param]()
 

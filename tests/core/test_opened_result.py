@@ -76,6 +76,7 @@ def same(found: Reconstruction, expected: Reconstruction) -> None:
         np.testing.assert_array_equal(getattr(found.observations, name), getattr(expected.observations, name))
 
 
+@pytest.mark.slow
 def test_frames_and_people_are_those_of_the_whole(folder, result):
     whole = Reconstruction.load(folder)
     same(whole, result)
@@ -109,6 +110,7 @@ def test_snippets_for_a_result_in_memory_hold_for_an_open_one(folder, result):
             _ = opened.colour
 
 
+@pytest.mark.slow
 def test_rows_in_the_middle_take_the_memory_of_these_rows(folder, result):
     """All rows are over 30 MB; ten of them may take what is unpacked at a time, 4 MB."""
     big = Reconstruction.concatenate(

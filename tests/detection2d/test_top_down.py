@@ -299,7 +299,9 @@ def test_detected_feet_are_reconstructed_feet(rolled_rig, tmp_path, capsys, monk
         with pytest.raises(SystemExit) as end:
             main(shlex.split(line))
         assert not end.value.code
-    seen = json.loads(Path("found/a.json").read_text())
+    written = json.loads(Path("found/a.json").read_text())
+    seen = written["instance_info"]
+    assert written["meta_info"] == {"dataset_name": "HALPE_26"}
     assert [frame["frame_id"] for frame in seen] == list(range(frames))
     assert np.shape(seen[0]["instances"][0]["keypoints"]) == (26, 2)
     people = Reconstruction.load(tmp_path / "results")

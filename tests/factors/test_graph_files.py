@@ -123,6 +123,7 @@ def test_what_would_not_come_back_is_refused_by_name(tmp_path):
     assert not (tmp_path / "graph.json").exists()
 
 
+@pytest.mark.slow
 def test_a_file_of_somebody_is_read_or_refused_in_one_sentence(tmp_path):
     file = tmp_path / "graph.json"
     save_graph(file, *every_kind())

@@ -111,6 +111,7 @@ def test_every_row_gets_its_own_body():
         assert bodies.filled("joints", found, whose, before) is found
 
 
+@pytest.mark.slow
 def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     """240 frames at 25 a second in three stretches against one: the same person, without a step at the borders."""
     scene = built_in_scene(people=1, frames=240)

@@ -70,6 +70,7 @@ def test_bodies_stay_above_the_floor(dance):
     assert (bodies @ floor["normal"]).min() > floor["height_m"] - 0.02
 
 
+@pytest.mark.slow
 def test_frames_alone_have_neither():
     scene = built_in_scene(frames=2)
     people = reconstruct(simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False))

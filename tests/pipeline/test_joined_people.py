@@ -70,6 +70,7 @@ def errors(people: Reconstruction, truth: np.ndarray) -> tuple[float, float]:
     return float(each), float(np.linalg.norm([other - one for one, other in off], axis=-1).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
 def test_a_box_between_two_people_is_held_and_both_wrists_are_nearer_to_the_truth(temporal):
     config, found = replace(PipelineConfig(), temporal=temporal), []
@@ -88,6 +89,7 @@ def test_a_box_between_two_people_is_held_and_both_wrists_are_nearer_to_the_trut
     assert tied < 0.9 * alone
 
 
+@pytest.mark.slow
 def test_its_share_is_explained_and_the_sum_is_one(joined, scene):
     one, other = ends_of(joined, scene.keypoints, 5)
     who, whom = int(joined.person[one]), int(joined.person[other])
@@ -106,6 +108,7 @@ def test_its_share_is_explained_and_the_sum_is_one(joined, scene):
     assert untied.factors == () and untied.missing_factors == ()
 
 
+@pytest.mark.slow
 def test_it_goes_through_export_and_explain_of_the_shell(joined, scene, tmp_path, capsys):
     joined.save(tmp_path)
     who = int(joined.person[ends_of(joined, scene.keypoints, 5)[0]])
@@ -116,6 +119,7 @@ def test_it_goes_through_export_and_explain_of_the_shell(joined, scene, tmp_path
     assert "solved with factors of Box" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_the_errors_of_two_people_correlate_as_the_graph_says(joined, scene):
     graphs = list(window_solutions(joined, scene.rig, extra_factors=Box(scene)))
     assert [len(each.together) for each in graphs] == [2, 2]
@@ -135,6 +139,7 @@ def test_the_errors_of_two_people_correlate_as_the_graph_says(joined, scene):
         assert 0.95 * max(both) < wide < 1.05 * sum(both)  # one may be wider one way, the other another
 
 
+@pytest.mark.slow
 def test_people_are_named_where_a_result_is_solved_anew(joined, scene):
     """`window.track` is the result's person then; another's factors are on the same graph."""
     one, other = (int(joined.person[row]) for row in ends_of(joined, scene.keypoints, 5))
@@ -167,6 +172,7 @@ def test_keyframes_have_the_factor_and_worker_processes_give_the_same(scene):
     assert errors(here, scene.keypoints)[1] < 0.03
 
 
+@pytest.mark.slow
 def test_functions_whose_factors_do_nothing_are_said(scene):
     def of_nobody(window, keys):
         return [gtsam.RangeFactor3(1, 2, 1.0, isotropic(1, 1)) for other in window.partners if other.track > 50]

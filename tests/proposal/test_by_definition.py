@@ -38,6 +38,7 @@ def links(candidates, crowded) -> Links:
     return link(candidates, crowded, GrowthConfig())
 
 
+@pytest.mark.slow
 def test_points_are_the_pairs_whose_rays_meet(points, crowded, five_cameras):
     """Least squares of x P_3 - P_1 and y P_3 - P_2; kept within 7 cm of both, in front, 3 degrees apart."""
     normalised = five_cameras.normalise(crowded.view, crowded.xy)

@@ -11,6 +11,7 @@ from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import Tracks
 from shapepose_fg.tracking.worlds import Seed, follow_worlds
+from tests.marks import slow
 
 
 def who(rows, truth):
@@ -104,6 +105,7 @@ def test_rows_begin_and_end_with_detections(followed, five_cameras, walking, nob
     assert rows.frame.tolist() == np.arange(14, 31).repeat(2).tolist() and len(identities(rows, truth)) == 2
 
 
+@pytest.mark.slow
 def test_who_enters_late_leaves_early_and_comes_back_is_the_same_person(
     followed, five_cameras, seen_exactly, walking
 ):
@@ -116,7 +118,7 @@ def test_who_enters_late_leaves_early_and_comes_back_is_the_same_person(
     assert all(len(own) == 1 for own in identities(rows, truth).values())
 
 
-@pytest.mark.parametrize("fps", [5, 30, 60])
+@pytest.mark.parametrize("fps", [5, *slow(30, 60)])
 def test_identities_last_over_the_border_of_a_block(followed, five_cameras, seen_exactly, two_people, fps):
     """4.2 s before three cameras: a block ends after 3 s, and no frame of anybody is missing or twice."""
     times = np.arange(round(4.2 * fps)) / fps
@@ -246,7 +248,8 @@ def test_the_memory_of_a_long_recording_is_that_of_a_block_and_the_look_ahead(tr
     assert state.next_id == 2
 
 
-@pytest.mark.parametrize("stopped", [12, 44])
+@pytest.mark.slow
+@pytest.mark.parametrize("stopped", [12, *slow(44)])
 def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(tracker, five_cameras, walking, stopped):
     """10 frames a second: within the first block, and after it while the second is open."""
     frames = [walking[0][t // 2] for t in range(60)]

@@ -142,6 +142,18 @@ def test_how_long_somebody_must_be_seen_is_a_matter_of_seconds(step_s, seconds, 
     assert (len(evidence_of((frames, 0), step_s=step_s)) == 1) == there
 
 
+@pytest.mark.parametrize("step_s", [1 / 60, 1 / 10])
+@pytest.mark.parametrize("length_s", [0.2, 0.4, 2.0])
+def test_in_a_short_recording_little_evidence_is_enough(step_s, length_s):
+    """A person seen in one place of four has 0.14 s of evidence a second and is probably there (79 %), however
+    short the recording; one seen so in every other frame has none."""
+    T = round(length_s / step_s)
+    chosen = evidence_of(([ANNA] * T, 0), ([BERT[:1]] * T, 0), step_s=step_s)
+    assert stretches(chosen) == [(0, 0, T), (1, 0, T)]
+    seldom = [BERT[:1] if t % 2 == 0 else NONE for t in range(T)]
+    assert stretches(evidence_of(([ANNA] * T, 0), (seldom, 0), step_s=step_s)) == [(0, 0, T)]
+
+
 def test_on_trial_a_quarter_of_what_is_asked_for_is_enough():
     """0.2 s of all places, less two ends at 0.03 s each; six frames later, a frame that is half seen is nobody."""
     frames = [None] * 5 + [ANNA] * 2 + [None] * 6 + [ANNA[:2]] + [None] * 6
