@@ -59,7 +59,7 @@ def two_people_are_there(live, at_s: float) -> None:
     assert people.time_s[0] == pytest.approx(at_s, abs=1.5 / HZ)
 
 
-@pytest.mark.parametrize("hz", [60, *slow(5, 24, 30, 120, 200)])
+@pytest.mark.parametrize("hz", [60, *slow(5, 24, 200)])
 def test_no_picture_is_dropped_at_any_rate(live, five_cameras, seen, hz):
     for frame in range(8):
         for view, name in enumerate(five_cameras.names):
@@ -68,7 +68,7 @@ def test_no_picture_is_dropped_at_any_rate(live, five_cameras, seen, hz):
     assert (live.report().frames, live.report().dropped, live.report().late) == (8, 0, 0)
 
 
-@pytest.mark.parametrize("shift_s", [-3.0, *slow(YEAR_S, 9e11, 3.0, -YEAR_S)])
+@pytest.mark.parametrize("shift_s", [-3.0, *slow(9e11, 3.0, -YEAR_S)])
 @pytest.mark.parametrize("which", [0, 31], ids=["the first", "a later"])
 def test_one_time_that_is_wrong_moves_nobody_s_clock(live, five_cameras, seen, which, shift_s):
     given = list(views(five_cameras, seen))
