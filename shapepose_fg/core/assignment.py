@@ -9,8 +9,8 @@ def least_cost_pairs(cost: Array) -> tuple[Index, Index]:
     """Rows, rising, and columns of the pairs, each row or column once, whose costs (R, C) have the least sum.
 
     As many pairs as can be. ValueError where costs are not finite. Shortest augmenting paths: Jonker and
-    Volgenant, "A Shortest Augmenting Path Algorithm for Dense and Sparse Linear Assignment Problems", Computing 38,
-    1987.
+    Volgenant, "A Shortest Augmenting Path Algorithm for Dense and Sparse Linear Assignment Problems", Computing
+    38, 1987.
     """
     if not np.isfinite(cost).all():
         raise ValueError("costs must be finite")
