@@ -141,10 +141,12 @@ def test_what_one_of_two_cameras_sees_goes_on(followed, five_cameras, seen_exact
     rows = followed(two, seen, np.arange(len(seen)) / fps)
     assert rows.frame.tolist() == list(range(len(seen))) and len(np.unique(rows.track)) == 1
     assert (rows.candidate[blind][..., 0] >= 0).mean() > 0.9 and (rows.candidate[blind][..., 1] < 0).all()
-    if fps == 30:
-        pytest.xfail("joints that are over 0.5 m off along the ray do not get the second view's detections again")
     both = np.setdiff1d(rows.frame, blind)
-    assert np.linalg.norm(rows.initial - truth[:, 0], axis=-1)[both].max() < 0.1
+    assert np.nanmax(np.linalg.norm(rows.initial - truth[:, 0], axis=-1)[both]) < 0.1
+    again = rows.candidate[blind[-1] + 1 :, :, 1] >= 0
+    assert again.any()
+    if not again.all():
+        pytest.xfail("joints that are over 0.5 m off along the ray do not get the second view's detections again")
 
 
 def test_the_order_of_detections_does_not_matter(followed, five_cameras, walking):
