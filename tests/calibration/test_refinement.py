@@ -138,27 +138,6 @@ def test_what_motion_does_not_determine_is_said(rig, recording):
     assert any("camera cam3: sees" in each and "it stays" in each for each in found.notes)
 
 
-@pytest.mark.slow
-def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
-    write_openpose(recording, rig, tmp_path / "seen")
-    write_rig(disturbed(rig, 4), tmp_path / "rig.json")
-    base = ["refine-calibration", "--calibration", tmp_path / "rig.json", "--detections", tmp_path / "seen"]
-    page = ["--report", tmp_path / "page.html"]
-    code, out, _ = run([*base, "--fps", 25, "--output", tmp_path / "new.json", *page], capsys)
-    drawn = json.loads((tmp_path / "page.html").read_text().split('id="scene-data">')[1].split("</script>")[0])
-    for part, used in (("before", "rig.json"), ("cameras", "new.json")):
-        centres = [each["centre"] for each in drawn[part]]
-        np.testing.assert_allclose(centres, read_rig(tmp_path / used).centres, atol=1e-6)
-    assert code == 0 and "next: shapepose-fg reconstruct" in out and "px before" in out and "±" in out
-    assert off_by(read_rig(tmp_path / "new.json"), rig)[0].max() < 0.25
-    code, out, _ = run([*base, "--fps", 25, "--json", "--output", tmp_path / "new.json"], capsys)
-    told = json.loads(out)
-    assert told["better"] and len(told["cameras"]) == 4 and told["held_out"]["after_px"] < 8
-    for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
-        code, _, error = run([*base, *more, "--output", tmp_path / "new.json"], capsys)
-        assert code == 2 and said in " ".join(error.split())
-
-
 def pose2sim_project(rig, recording, folder):
     """A project with our own rig file as its calibration."""
     (folder / "calibration").mkdir(parents=True)
@@ -179,9 +158,26 @@ def test_places_and_names_are_looked_at_first(rig, recording, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_cameras_of_a_pose2sim_project(rig, recording, tmp_path, capsys):
+def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
+    """Of a Pose2Sim project, and of its files one by one."""
     project, new = pose2sim_project(disturbed(rig, 4), recording, tmp_path / "walk"), tmp_path / "new.json"
-    code, out, error = run(["refine-calibration", "--project", project, "--output", new], capsys)
+    page = ["--report", tmp_path / "page.html"]
+    code, out, error = run(["refine-calibration", "--project", project, "--output", new, *page], capsys)
     assert code == 0 and "25 frames a second, as Config.toml says" in " ".join(error.split())
-    assert f"reconstruct --calibration {new} --project {project}" in " ".join(out.split())
+    said = " ".join(out.split())
+    assert f"next: shapepose-fg reconstruct --calibration {new} --project {project}" in said
+    assert "px before" in said and "±" in said
+    drawn = json.loads((tmp_path / "page.html").read_text().split('id="scene-data">')[1].split("</script>")[0])
+    given = project / "calibration" / "rig.json"
+    for part, used in (("before", given), ("cameras", new)):
+        centres = [each["centre"] for each in drawn[part]]
+        np.testing.assert_allclose(centres, read_rig(used).centres, atol=1e-6)
     assert off_by(read_rig(new), rig)[0].max() < 0.25
+    base = ["refine-calibration", "--calibration", given, "--detections", project / "pose", "--fps", 25]
+    code, out, _ = run([*base, "--json", "--output", tmp_path / "again.json"], capsys)
+    told = json.loads(out)
+    assert code == 0 and told["better"] and len(told["cameras"]) == 4 and told["held_out"]["after_px"] < 8
+    np.testing.assert_allclose(read_rig(tmp_path / "again.json").centres, read_rig(new).centres, atol=1e-6)
+    for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
+        code, _, error = run([*base, *more, "--output", new], capsys)
+        assert code == 2 and said in " ".join(error.split())

@@ -156,7 +156,8 @@ COMMON = round((10.78 - 4.0) * FPS)
     [
         "synchronise --calibration rig.json --detections detection --most 8 --output same.csv",
         "calibrate --calibration rig.json --detections detection --most 8 --times same.csv --output new.json",
-        "reconstruct --calibration rig.json --detections detection --synchronise --output results --no-report",
+        "reconstruct --calibration rig.json --detections detection --synchronise --output results --no-report"
+        " --preset fast",
     ],
 )
 def test_files_of_unequal_length_keep_all_common_footage(as_detected, command, capsys):
@@ -167,7 +168,7 @@ def test_files_of_unequal_length_keep_all_common_footage(as_detected, command, c
     assert ended.value.code == 0, error
     for line in (each for each in out.splitlines() if each.startswith("next: ")):
         with pytest.raises(SystemExit) as ended:
-            main([*shlex.split(line)[2:], "--no-report", "--no-check"])
+            main([*shlex.split(line)[2:], "--no-report", "--no-check", "--preset", "fast"])
         assert ended.value.code == 0, capsys.readouterr().err
     people = Reconstruction.load("results")
     assert abs(len(np.unique(people.frame)) - COMMON) <= 2

@@ -156,6 +156,7 @@ def test_a_bar_is_taken_away_where_it_is_stopped(work):
     assert "looking through" not in "".join(seen.lines) and "stopped: " in seen.lines[-1]
 
 
+@pytest.mark.slow
 def test_a_log_has_lines_now_and_then(work, tmp_path):
     often = WORK.replace(
         "import sys,", "from shapepose_fg.cli import terminal; terminal._EVERY_S = 0.3\nimport sys,"

@@ -11,7 +11,6 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise
-from tests.marks import slow
 
 CONFIG = ObservationConfig(kernel="none")
 POSE = gtsam.Pose3(gtsam.Rot3.Ypr(0.7, 0.2, -0.1), np.array([1.0, -0.5, 0.3]))
@@ -57,7 +56,8 @@ def test_nothing_is_added_where_cameras_stand_still(five_cameras, two_people):
     assert not added(on_robot(five_cameras, 5), two_people).any()
 
 
-@pytest.mark.parametrize("first", [4, *slow(2)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [2, 4])
 def test_of_fixed_cameras_and_a_robot_it_is_what_poses_drawn_from_their_covariance_make(
     five_cameras, two_people, first
 ):

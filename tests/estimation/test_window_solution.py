@@ -44,6 +44,7 @@ def alike(found: list[PersonGraph]) -> float:
     return float((np.abs(np.concatenate([ratios(each) for each in found]) - 1) < 0.05).mean())
 
 
+@pytest.mark.slow
 def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(people, scene):
     found = solutions(people, scene)
     assert len(found) == len(np.unique(people.person))

@@ -24,6 +24,7 @@ from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.simulation.scene import UP, look_at
+from tests.marks import slow
 
 FPS = 25.0
 FRAMES = 30
@@ -148,7 +149,7 @@ def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, tw
 def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras, two_people, views_left):
     """From frame 5 on no view sees the first wrist, or one does: it drifts towards what the body says without it,
     aside or along the ray. With `keep_limbs` it goes towards the body's joint, and its forearm gets its length
-    where a ray leaves it open; nothing else moves, and covariances stay.
+    where a ray leaves it open; nothing else moves, and others' covariances stay.
     """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
@@ -173,7 +174,8 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     assert np.flatnonzero(changed.any(axis=0)).tolist() == [WRIST]
     # Lengths are kept for 0.1 s around, three frames.
     assert not changed[(observations.track == 1) | (observations.frame < 2)].any()
-    np.testing.assert_array_equal(kept.covariance, carried.covariance)
+    # The wrist's knows where it may hide, which depends on its place.
+    np.testing.assert_array_equal(*(np.delete(each.covariance, WRIST, axis=1) for each in (kept, carried)))
 
 
 @pytest.mark.slow
@@ -483,8 +485,8 @@ def far_apart(window, keys):
 
 @pytest.mark.parametrize(
     ("factors", "calls"),
-    [(nothing, 0), (steady, 1), (box, 1), (far_apart, 1)],
-    ids=["no factors", "a chain", "two joints tied", "frames far apart tied"],
+    [(nothing, 0), *slow((steady, 1), (far_apart, 1)), (box, 1)],
+    ids=["no factors", "a chain", "frames far apart tied", "two joints tied"],
 )
 def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, monkeypatch, factors, calls):
     """A wrist lost twice, frames missing, one person in fewer frames, a joint that no view sees: the same numbers,

@@ -21,8 +21,8 @@ MOST_S = 5.0
 """No small file may take longer to read; most take a millisecond."""
 
 
-HEAVY = {"ONNX", "MCAP of detections", "lines of live", "state of live"}
-HEAVY |= {name for name in READERS if name.startswith(("result ", "run ", "parts ")) and name != "run on its way"}
+HEAVY = {"ONNX", "MCAP of detections", "MCAP of poses", "lines of live", "state of live"}
+HEAVY |= {name for name in READERS if name.startswith(("result ", "run ", "parts "))}
 
 
 @pytest.mark.parametrize("name", [*sorted(READERS.keys() - HEAVY), *slow(*sorted(HEAVY))])

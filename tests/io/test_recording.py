@@ -60,6 +60,7 @@ def sets(seen: Detections) -> tuple[np.ndarray, np.ndarray]:
     return (each[np.lexsort(each.T)] for each in (rows, links))
 
 
+@pytest.mark.slow
 def test_frames_are_what_all_cameras_saw_at_one_time(scene, together, apart, tmp_path):
     recording, times = read_recording(apart, scene.rig, None, tmp_path / "kept")
     assert len(recording) == FRAMES - LATE and times is not None

@@ -59,7 +59,7 @@ def two_people_are_there(live, at_s: float) -> None:
     assert people.time_s[0] == pytest.approx(at_s, abs=1.5 / HZ)
 
 
-@pytest.mark.parametrize("hz", [60, *slow(5, 24, 30, 120, 200)])
+@pytest.mark.parametrize("hz", [60, *slow(5, 24, 200)])
 def test_no_picture_is_dropped_at_any_rate(live, five_cameras, seen, hz):
     for frame in range(8):
         for view, name in enumerate(five_cameras.names):
@@ -68,7 +68,7 @@ def test_no_picture_is_dropped_at_any_rate(live, five_cameras, seen, hz):
     assert (live.report().frames, live.report().dropped, live.report().late) == (8, 0, 0)
 
 
-@pytest.mark.parametrize("shift_s", [-3.0, *slow(YEAR_S, 9e11, 3.0, -YEAR_S)])
+@pytest.mark.parametrize("shift_s", [-3.0, *slow(9e11, 3.0, -YEAR_S)])
 @pytest.mark.parametrize("which", [0, 31], ids=["the first", "a later"])
 def test_one_time_that_is_wrong_moves_nobody_s_clock(live, five_cameras, seen, which, shift_s):
     given = list(views(five_cameras, seen))
@@ -97,7 +97,8 @@ def test_a_camera_whose_clock_is_set_is_left_out_and_named(live, five_cameras, s
     two_people_are_there(live, (2 * FRAMES - 1) / HZ)
 
 
-@pytest.mark.parametrize("shift_s", [5.0, *slow(YEAR_S, -YEAR_S, -5.0)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_s", [YEAR_S, -YEAR_S, 5.0, -5.0])
 def test_cameras_whose_clocks_are_set_together_go_on(live, five_cameras, seen, shift_s):
     play(live, views(five_cameras, seen))
     names = set(live.people().person.tolist())
@@ -123,7 +124,8 @@ def test_most_cameras_decide_which_clock_is_right(live, five_cameras, seen):
     two_people_are_there(live, (4 * FRAMES - 1) / HZ + 3600)
 
 
-@pytest.mark.parametrize("shift_s", [YEAR_S, *slow(-YEAR_S)])
+@pytest.mark.slow
+@pytest.mark.parametrize("shift_s", [YEAR_S, -YEAR_S])
 def test_whole_frames_of_another_time_are_survived(live, five_cameras, seen, shift_s):
     for frame in range(8):
         live.push(seen, frame / HZ)
@@ -142,8 +144,9 @@ def shifted(metres: float) -> np.ndarray:
     return pose
 
 
-@pytest.mark.parametrize("pose", [shifted(1e9), *slow(np.eye(4), shifted(9e5), 2 * np.eye(4))])
-@pytest.mark.parametrize("which", [0, *slow(31)], ids=["the first", "a later"])
+@pytest.mark.slow
+@pytest.mark.parametrize("pose", [np.eye(4), shifted(1e9), shifted(9e5), 2 * np.eye(4)])
+@pytest.mark.parametrize("which", [0, 31], ids=["the first", "a later"])
 def test_one_pose_for_a_camera_that_stands_still(live, five_cameras, seen, which, pose):
     given = list(views(five_cameras, seen, range(40)))
     given.insert(which, [*given[which], pose])
@@ -291,7 +294,7 @@ def test_a_client_s_rubbish_is_named_and_the_others_go_on(five_cameras):
             once_good.sendall(b"\n".join([lines[30], *[b"x"] * 10, b""]))
             assert once_good.recv(1) == b""
         served.wait_for(26)
-        assert all("127.0.0.1:" in each and "line" in each for each in served.notes)
+        assert all(each.count("127.0.0.1:") == 1 and "line" in each for each in served.notes)
     served.thread.join(timeout=60)
     assert not served.thread.is_alive()
 

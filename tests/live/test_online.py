@@ -164,7 +164,13 @@ def test_a_state_of_something_else_is_refused_in_a_sentence(start, dance, tmp_pa
     with pytest.raises(InputError, match="saved with other cameras, joints, settings or lag"):
         OnlineReconstructor.load(file, dance.scene.rig, lag_s=0.5, workers=1)
     arrays = dict(np.load(file))
-    for name, value in (("identity", arrays["identity"][1:]), ("candidate", arrays["candidate"] + 10**6)):
+    for name, value in (
+        ("identity", arrays["identity"][1:]),
+        ("candidate", arrays["candidate"] + 10**6),
+        ("covariance", arrays["covariance"] * 0),
+        ("before.view", arrays["before.view"].astype(float)),
+        ("seen.pairs", np.repeat(arrays["seen.pairs"][:1], len(arrays["seen.pairs"]), axis=0)),
+    ):
         np.savez(file, **arrays | {name: value})
         with pytest.raises(InputError, match=r"state\.npz: .*begin without it"):
             OnlineReconstructor.load(file, dance.scene.rig, workers=1)

@@ -12,7 +12,6 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from tests.conftest import STANDING, detect_exactly
-from tests.marks import slow
 
 ALONE = PipelineConfig(temporal=False)
 ARM, LEG = (3, 4), (13, 14, 19, 20, 21)
@@ -68,7 +67,8 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
     assert (squared < 7.81).mean() > 0.88
 
 
-@pytest.mark.parametrize(("name", "most_mm"), [("time", 18.0), *slow(("fast", 27.0))])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "most_mm"), [("time", 18.0), ("fast", 27.0)])
 def test_a_recorded_jump_kick(shared_data, name, most_mm):
     """Five cameras, 30 frames a second; frame by frame the mean error is 16.8 mm."""
     folder = shared_data.parent / "cases" / "jumpkick"

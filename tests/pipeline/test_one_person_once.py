@@ -15,7 +15,6 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
-from tests.marks import slow
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +36,9 @@ def twice(found: Detections, again: np.ndarray) -> Detections:
     )
 
 
-@pytest.mark.parametrize("temporal", [*slow(True), False], ids=["over time", "frame by frame"])
-@pytest.mark.parametrize("how", ["in all views", *slow("in some views", "in some frames", "at random")])
+@pytest.mark.slow
+@pytest.mark.parametrize("temporal", [True, False], ids=["over time", "frame by frame"])
+@pytest.mark.parametrize("how", ["in all views", "in some views", "in some frames", "at random"])
 def test_people_whom_a_detector_finds_twice_are_there_once(scene, how, temporal):
     rng, frames = np.random.default_rng(0), list[Detections]()
     for number, found in enumerate(simulate(scene)):
@@ -98,7 +98,7 @@ def solved(shared_data: Path, name: str, config: PipelineConfig):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("temporal", [True, *slow(False)])
+@pytest.mark.parametrize("temporal", [True, False])
 def test_a_detector_without_suppression_of_doubles(shared_data, temporal):
     found, figures = solved(shared_data, "duplicates", PipelineConfig(temporal=temporal))
     assert len(found) == 240

@@ -215,6 +215,7 @@ LIGHT = {
 }
 
 
+@pytest.mark.slow
 def test_nothing_of_this_loads_torch():
     """One after the other, in one process."""
     lines = [

@@ -56,12 +56,13 @@ def test_nothing_is_said_where_nothing_is_wrong(recording, room):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("views", [[0, 1], [0, 2, 3], [0, 1, 2, 4]])
+@pytest.mark.parametrize("views", [[0, 1], [0, 1, 2, 4]])
 def test_nothing_is_said_of_fewer_cameras(recording, room, views):
     assert diagnose(*some_cameras(recording, room, views)).findings == ()
 
 
-@pytest.mark.parametrize("degrees", [5, *slow(1, 30, 180)])
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [1, 5, 180])
 def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     found = only_finding(recording, turned(room, 2, degrees, np.array([0.3, 1.0, 0.2])))
     # A degree is hardly told from a shift of the principal point, and the sentence says both.
@@ -71,7 +72,7 @@ def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frames", [10, *slow(3, 6, -8, 15)])
+@pytest.mark.parametrize("frames", [3, -8, 15])
 def test_a_late_camera_is_named_with_its_frames(recording, room, frames):
     found = only_finding(delayed(recording, 1, frames), room)
     assert (found.kind, found.cameras) == (Kind.LATE, (1,))
@@ -92,7 +93,7 @@ def test_mistakes_of_one_camera_are_told_apart(recording, room):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("right", "down"), [(0.08, 0.0), *slow((0.0, 0.05), (-0.07, 0.07))])
+@pytest.mark.parametrize(("right", "down"), [(0.08, 0.0), (-0.07, 0.07)])
 def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, down):
     shift = right, down
     diagnosis = diagnose(biased(recording, room, 2, people, 1, shift), room)
@@ -104,7 +105,7 @@ def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, d
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pixels", [100.0, *slow(25.0)])
+@pytest.mark.parametrize("pixels", [100.0, 25.0])
 def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, pixels):
     found = only_finding(recording, shifted(room, 3, pixels, 0.0))
     assert (found.kind, found.cameras) == (Kind.PRINCIPAL_POINT, (3,))
@@ -112,7 +113,7 @@ def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of", ["turned", *slow("shifted")])
+@pytest.mark.parametrize("of", ["turned", "shifted"])
 def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recording, room, of):
     # 0.6 degrees are 10 px here. A turn sideways is a shift of the picture, but for its perspective.
     rig = turned(room, 2, 0.6, np.array([0.0, 1.0, 0.0])) if of == "turned" else shifted(room, 2, 10.0, 0.0)
@@ -190,7 +191,7 @@ def test_a_wrong_unit_is_named(recording, room, factor, words):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", ["y", *slow("-z", "-x")])
+@pytest.mark.parametrize("axis", ["y", "-z"])
 def test_a_wrong_up_axis_is_named(recording, room, axis):
     found = only_finding(recording, Rig(room.cameras, axis))
     assert (found.kind, found.axis) == (Kind.UP, "z")
@@ -282,7 +283,7 @@ def test_groups_of_frames_below_zero_are_those_of_any_others():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", [0.4, 0.5, 0.6])
+@pytest.mark.parametrize("part", [0.4, 0.6])
 def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part):
     """Joints of 0.7 to 1 m tall people fit children, and adults in a rig that is too small: both are said."""
     report = check_setup(look_at(room, people * part), room)
@@ -299,6 +300,6 @@ def test_adults_are_not_taken_for_children(recording, room):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.1, 0.2, 2.0])
+@pytest.mark.parametrize("factor", [0.1, 2.0])
 def test_lengths_of_nobody_are_the_calibration_s(recording, room, factor):
     assert only_finding(recording, scaled(room, factor)).kind == Kind.UNIT

@@ -11,7 +11,6 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.findings import Kind
 from shapepose_fg.setup_check.report import check_setup
-from tests.marks import slow
 
 SIDES = [(joint, "L" + joint[1:]) for joint in BODY_25.joints if joint[0] == "R"]
 ARMS, LEGS = ("Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle")
@@ -55,7 +54,8 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("wrong", ["elbow and wrist", *slow(*sorted(WRONG.keys() - {"elbow and wrist"}))])
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", WRONG)
 def test_other_names_are_found_from_how_bodies_look(dance, wrong):
     pairs, said = WRONG[wrong]
     (words,) = order_findings(called_otherwise(dance.recording, pairs), dance.scene.rig)

@@ -35,6 +35,7 @@ def run(arguments, capsys):
     return ended.value.code, said.out, said.err
 
 
+@pytest.mark.slow
 def test_figures_of_a_good_set_up(recording, room):
     report = check_setup(recording, room)
     assert report.findings == () and report.warnings == ()

@@ -16,7 +16,6 @@ from shapepose_fg.simulation.detector import Detector
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.visibility import FACE, Visibility, facing
 from shapepose_fg.viz.rendering import look_at
-from tests.marks import slow
 
 LIMBS = np.array(BODY_25.limbs)
 MIRROR = np.array(BODY_25.mirror)
@@ -109,7 +108,8 @@ def test_candidates_come_in_no_order_that_tells_people_apart(scene: Scene):
     assert 0.6 < np.mean(person[1:] != person[:-1]) < 0.9
 
 
-@pytest.mark.parametrize(("seen", "state"), [(1.0, 0), *slow((0.0, 1))])
+@pytest.mark.slow
+@pytest.mark.parametrize(("seen", "state"), [(1.0, 0), (0.0, 1)])
 def test_misses_and_confidences_are_as_measured(seen: float, state: int):
     rig, joints = crowd(12)
     frames = looks(rig, joints, everything_seen(rig, 12, seen), PLAIN, 60)
@@ -257,7 +257,7 @@ def test_people_are_lost_as_wholes():
     # 960 people in views: four standard errors, and as much again since single joints are missed by chance too.
     assert abs((missed > 0.5).mean() - 0.2) < 0.1
     assert abs((missed > 0.8).mean() - 0.1) < 0.08
-    assert np.median(missed) <= 0.04 + 1e-9  # one joint
+    assert np.median(missed) < missed.mean() / 2  # joints that are lost one by one would make them equal
 
 
 @pytest.mark.slow

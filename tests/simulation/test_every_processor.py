@@ -13,17 +13,13 @@ from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import sequence
 from tests.conftest import pytest_configure
-from tests.marks import slow
 
 ROOT = Path(__file__).parents[2]
 NO_VECTORS = {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3"}
 """NumPy's functions as on a processor from before 2013."""
 PROCESSORS = [
-    {"OPENBLAS_CORETYPE": "Prescott"} | NO_VECTORS,
-    *slow(
-        {"OPENBLAS_CORETYPE": "Nehalem"},
-        {"OPENBLAS_CORETYPE": "Prescott", "NUMBA_CPU_NAME": "generic"} | NO_VECTORS,
-    ),
+    {"OPENBLAS_CORETYPE": "Nehalem"},
+    {"OPENBLAS_CORETYPE": "Prescott", "NUMBA_CPU_NAME": "generic"} | NO_VECTORS,
 ]
 """Variables that choose kernels of other processors, all of which an x86-64 with AVX2 can run."""
 
