@@ -41,12 +41,13 @@ benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
 
 # Of what is installed, what is imported is compiled then, a quarter of it.
-INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt $(PIP_ARGS)
+FETCH := install -qq --disable-pip-version-check --no-compile $(PIP_ARGS)
+INSTALL := $(BIN)/python -m pip $(FETCH) -c constraints.txt
 
 $(VENV)/installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	# Older ones take twice as long to find out what to install.
-	-$(INSTALL) --upgrade pip
+	test -x $(BIN)/python || $(PYTHON) -m venv --without-pip $(VENV)
+	# The newest pip: older ones take twice as long to find out what to install.
+	$(PYTHON) -m pip --python $(BIN)/python $(FETCH) pip || $(BIN)/python -m ensurepip
 	$(INSTALL) -e ".[dev]"
 	# Done at the first start otherwise, or at every one where nothing can be written.
 	$(BIN)/python -m compileall -q -j $(JOBS) shapepose_fg factors

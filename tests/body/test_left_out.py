@@ -162,7 +162,8 @@ def test_few_joints_are_left_out_one_by_one(fitter, people):
     both = fit.ok & again.ok
     assert np.abs(again.prior_xyz - fit.prior_xyz)[both, kept[0]].max() < 1e-6
     inside = mahalanobis((fit.prior_xyz - truth)[fit.ok][:, kept], fit.prior_covariance[fit.ok][:, kept]) < 7.81
-    assert inside.mean() > 0.8
+    # A row's four joints are right or wrong together: of 40 rows with 85 % three standard errors are 17 %.
+    assert inside.mean() > 0.68
 
 
 def test_a_long_window_s_shape_is_agreed_upon_by_rows_spread_over_it(fitter):

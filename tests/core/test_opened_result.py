@@ -154,7 +154,8 @@ def test_a_file_that_was_changed_is_one_sentence(folder, tmp_path, result):
     for place in range(len(content) // 8, len(content) // 2, 997):
         content[place] ^= 0x55
     (tmp_path / "people.npz").write_bytes(bytes(content))
-    with Reconstruction.open(tmp_path) as opened, pytest.raises(InputError, match=r"^.*people\.npz: ") as caught:
+    # A column whose head is damaged is found when the file is opened.
+    with pytest.raises(InputError, match=r"^.*people\.npz: ") as caught, Reconstruction.open(tmp_path) as opened:
         opened.frames(390, 400)
     assert "\n" not in str(caught.value)
     result.rows(np.arange(5)).save(tmp_path)

@@ -149,7 +149,7 @@ def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, tw
 def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras, two_people, views_left):
     """From frame 5 on no view sees the first wrist, or one does: it drifts towards what the body says without it,
     aside or along the ray. With `keep_limbs` it goes towards the body's joint, and its forearm gets its length
-    where a ray leaves it open; nothing else moves, and covariances stay.
+    where a ray leaves it open; nothing else moves, and others' covariances stay.
     """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
@@ -174,7 +174,8 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     assert np.flatnonzero(changed.any(axis=0)).tolist() == [WRIST]
     # Lengths are kept for 0.1 s around, three frames.
     assert not changed[(observations.track == 1) | (observations.frame < 2)].any()
-    np.testing.assert_array_equal(kept.covariance, carried.covariance)
+    # The wrist's knows where it may hide, which depends on its place.
+    np.testing.assert_array_equal(*(np.delete(each.covariance, WRIST, axis=1) for each in (kept, carried)))
 
 
 @pytest.mark.slow

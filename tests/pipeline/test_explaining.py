@@ -210,7 +210,7 @@ def test_a_camera_that_was_turned(people, scene):
     found = asked(solved(people, spoiled), spoiled, person)
     assert first(found) == (Cause.WRONG_CAMERA, (scene.rig.names[view],))
     turn, sigma = turned_by(found)
-    assert abs(turn - 2.0) < 3 * sigma < 6.0
+    assert abs(turn - 2.0) < 3 * sigma and sigma < 3.0  # 5 before anything was seen
 
 
 @pytest.mark.slow
@@ -227,8 +227,10 @@ def test_a_camera_of_which_hardly_anything_was_taken(scene):
     told = explain(found, rig, person=person, joint="LElbow", frame=5, detections=recording)
     assert first(told) == (Cause.WRONG_CAMERA, (rig.names[3],))
     turn, sigma = turned_by(told)
-    assert abs(turn - 4.0) < 3 * sigma < 6.0
-    assert all(each.cause != Cause.WRONG_CAMERA for each in asked(found, rig, person).findings)
+    assert abs(turn - 4.0) < 3 * sigma and sigma < 3.0  # 5 before anything was seen
+    # Without the detections it is not known, or little; no other camera is.
+    others = [each.cameras for each in asked(found, rig, person).findings if each.cause == Cause.WRONG_CAMERA]
+    assert set(others) <= {(rig.names[3],)}
 
 
 def test_what_the_set_up_check_left_out_is_said(people, scene):

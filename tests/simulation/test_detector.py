@@ -257,7 +257,7 @@ def test_people_are_lost_as_wholes():
     # 960 people in views: four standard errors, and as much again since single joints are missed by chance too.
     assert abs((missed > 0.5).mean() - 0.2) < 0.1
     assert abs((missed > 0.8).mean() - 0.1) < 0.08
-    assert np.median(missed) <= 0.04 + 1e-9  # one joint
+    assert np.median(missed) < missed.mean() / 2  # joints that are lost one by one would make them equal
 
 
 @pytest.mark.slow
