@@ -82,7 +82,12 @@ def _text(text: str, rng: random.Random) -> str:
             return "".join(lines)
     if len(found) == 0:
         return text
-    chosen = rng.choice(found)
+    chosen, number = rng.choice(found), rng.random()
+    if (
+        chosen[0][-1].isdigit() and number < 0.4
+    ):  # one that could be meant: another of the file, or nearly the same
+        near = float(chosen[0]) * rng.choice((-1, 0.999, 1.1, 10, 1000))
+        new = rng.choice(found)[0] if number < 0.2 else f"{near:.9g}"
     return text[: chosen.start()] + new + text[chosen.end() :]
 
 

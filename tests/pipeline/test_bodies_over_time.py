@@ -49,8 +49,21 @@ def fitter() -> SmplFitter:
     return made
 
 
+def of_unlike_people() -> Scene:
+    """Two people whose first number of the shape, mostly stature, is far from the mean, and one far from both.
+
+    Average people cannot be recognised: that number is known to 0.2, and many adults are like them.
+    """
+    for seed in range(1000):
+        first = built_in_scene(seed, people=3, frames=0).motion.betas[:, 0]
+        if np.abs(first[:2]).min() > 1.4 and np.abs(first[2] - first[:2]).min() > 1:
+            return built_in_scene(seed, people=3, frames=48)
+    raise AssertionError("none of 1,000 scenes has such people")
+
+
 @pytest.mark.slow
-def test_people_keep_their_names_and_strangers_get_free_ones(scene, fitter):
+def test_people_keep_their_names_and_strangers_get_free_ones(fitter):
+    scene = of_unlike_people()
     first = with_bodies_over_time(seen(scene, slice(0, 24), 0), fitter).shapes
     assert first.names.tolist() == ["0", "1", "2"]
     # In the next recording they have other numbers, and one of them was not in the first.
