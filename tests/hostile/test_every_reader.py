@@ -51,7 +51,15 @@ def test_changed_files_are_read_or_refused(tmp_path, name):
     assert any(refused)
 
 
-@pytest.mark.parametrize("case", sorted(FOUND.glob("*/*")), ids=lambda case: f"{case.parent.name}-{case.name}")
+CASES = sorted(FOUND.glob("*/*"))
+OF_LIVE = [case for case in CASES if "live" in case.parent.name]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [*(case for case in CASES if case not in OF_LIVE), *slow(*OF_LIVE)],
+    ids=lambda case: f"{case.parent.name}-{case.name}",
+)
 def test_what_fuzzing_found_stays_mended(tmp_path, case):
     name = next(name for name in READERS if re.sub(r"\W+", "_", name) == case.parent.name)
     trial = Trial(READERS[name], tmp_path, 0)

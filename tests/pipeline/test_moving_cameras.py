@@ -255,6 +255,7 @@ def test_factors_of_your_own_on_poses_count(drifted):
     assert np.linalg.norm(camera_error(drifted, rig)[30, 3:]) < 0.004
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_trajectories(refined):
     kept = InMemory()
     assert kept_rig(kept, refined) is None
