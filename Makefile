@@ -5,6 +5,8 @@ PIP_ARGS ?=
 BIN := $(VENV)/bin
 # With more processes than this, the solvers' own threads fight over the cores.
 JOBS ?= 2
+# What Python and pytest make of the sources is kept, or each process of the tests makes it anew.
+export PYTHONDONTWRITEBYTECODE :=
 # One thread each, too. A file's tests share what they have made: one process runs them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
@@ -15,7 +17,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Run the linter and the fast tests: some minutes on two cores.
+## Run the linter and the fast tests.
 test: lint
 	$(PYTEST) -m "not slow"
 
@@ -38,13 +40,18 @@ format: $(VENV)/installed
 benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
 
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PIP_ARGS)
+# Of what is installed, what is imported is compiled then, a quarter of it.
+FETCH := install -qq --disable-pip-version-check --no-compile $(PIP_ARGS)
+INSTALL := $(BIN)/python -m pip $(FETCH) -c constraints.txt
 
 $(VENV)/installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/python || $(PYTHON) -m venv --without-pip $(VENV)
+	# The newest pip: older ones take twice as long to find out what to install.
+	$(PYTHON) -m pip --python $(BIN)/python $(FETCH) pip || $(BIN)/python -m ensurepip
 	$(INSTALL) -e ".[dev]"
-	# Done at the first start otherwise, or at every one where Python may write nothing beside the sources.
-	$(BIN)/python -m compileall -q shapepose_fg factors
+	# Done at the first start otherwise, or at every one where nothing can be written.
+	$(BIN)/python -m compileall -q -j $(JOBS) shapepose_fg factors
+	-$(BIN)/shapepose-fg compile
 	touch $@
 
 $(VENV)/installed-all: $(VENV)/installed

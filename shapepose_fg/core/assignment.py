@@ -8,9 +8,12 @@ from shapepose_fg.core.arrays import Array, Index
 def least_cost_pairs(cost: Array) -> tuple[Index, Index]:
     """Rows, rising, and columns of the pairs, each row or column once, whose costs (R, C) have the least sum.
 
-    As many pairs as can be; costs are finite. Shortest augmenting paths: Jonker and Volgenant, "A Shortest
-    Augmenting Path Algorithm for Dense and Sparse Linear Assignment Problems", Computing 38, 1987.
+    As many pairs as can be. ValueError where costs are not finite. Shortest augmenting paths: Jonker and
+    Volgenant, "A Shortest Augmenting Path Algorithm for Dense and Sparse Linear Assignment Problems", Computing
+    38, 1987.
     """
+    if not np.isfinite(cost).all():
+        raise ValueError("costs must be finite")
     if len(cost) > cost.shape[1]:
         columns, rows = least_cost_pairs(cost.T)
         order = np.argsort(rows, kind="stable")

@@ -14,7 +14,7 @@ _ALIASES = {
     "COCO_23": "coco23 cocofoot",
     "COCO_133": "coco133 coco133wrist cocowholebody wholebody wholebodywrist ubody ubody2d ubody3d h3wb halpe",
     "HALPE_26": "halpe halpe26 bodywithfeet body26",
-    "HALPE_68": "halpe halpe68",
+    "HALPE_68": "halpe halpe68 halpe68noface",
     "HALPE_136": "halpe halpe136",
     "H36M_17": "h36m h36m17 human36m",
     "MPI_INF_3DHP_17": "mpiinf3dhp 3dhp",
@@ -62,8 +62,8 @@ _SIDED = {
 """Joints on both sides: the body's name without its side, and what others call it."""
 _MIDDLE = {
     "Nose": "nose",
-    "Neck": "neck neckbase baseneck shoulder shoulders thorax sternum",
-    "MidHip": "hip hips pelvis root",
+    "Neck": "neck neckbase baseneck shoulder shoulders thorax sternum spineshoulder",
+    "MidHip": "hip hips pelvis root spinebase basespine",
     "Head": "head headtop tophead topofhead vertex",
     "head": "upperneck headbottom neckupper neckbase necknose noseneck",
     "spine1": "spine1 belly abdomen navel spinenavel spinenaval",
@@ -72,7 +72,14 @@ _MIDDLE = {
 }
 """Joints in the middle, the same way."""
 _PART_OF_SIDE = {word: part for part, words in _SIDED.items() for word in words.split()}
-_LEFT_OUT = {"mid", "middle", "center", "centre", "joint", "c", "of", "the", "keypoint", "landmark"}
+_BONES = {
+    **dict.fromkeys(("upleg", "thigh", "upperleg"), "Hip"),
+    **dict.fromkeys(("leg", "calf", "shin", "lowerleg"), "Knee"),
+    **dict.fromkeys(("arm", "upperarm"), "Shoulder"),
+    **dict.fromkeys(("forearm", "lowerarm"), "Elbow"),
+}
+"""Where joints are called after the bones that begin there: Apple's, Mixamo's."""
+_LEFT_OUT = {"mid", "middle", "center", "centre", "joint", "jc", "c", "of", "the", "keypoint", "landmark"}
 """Words that say nothing: in the middle is what has no side."""
 _SIDES = {"l": "L", "left": "L", "r": "R", "right": "R"}
 
@@ -87,7 +94,7 @@ def _side_and_part(words: Sequence[str]) -> tuple[str, str]:
     words = [word for word in words if word not in _LEFT_OUT]
     sides = [word for word in words if word in _SIDES]
     if len(sides) == 1:
-        return _SIDES[sides[0]], "".join(word for word in words if word not in _SIDES)
+        return _SIDES[sides[0]], "".join(word for word in words if word not in _SIDES and word != "1")
     plain = "".join(words)
     for side in ("left", "right", "l", "r"):  # lshoulder, shoulderleft
         for rest in (plain.removeprefix(side), plain.removesuffix(side) if len(side) > 1 else plain):
@@ -101,7 +108,7 @@ def body_points(names: Sequence[str]) -> list[str]:
 
     Case, separators and where the side is written do not count. Where a name means one thing beside some others
     and another alone, the others tell: a foot is the ankle where no ankle is named, and a head the top of the head
-    where no top is.
+    where no top is. Bones mean the joint at which they begin where a thigh is named.
     """
     short = (name[:_LONGEST] for name in names)
     every = [_words(re.sub(r"\(.*?\)", "", name) or name) for name in short]
@@ -112,7 +119,7 @@ def body_points(names: Sequence[str]) -> list[str]:
     split = [_side_and_part(words) for words in every]
     parts = {part for _, part in split}
     middle = {word: part for part, words in _MIDDLE.items() for word in words.split()}
-    if "thorax" in parts or "sternum" in parts:  # Human3.6M's, MPII's: what is called neck is the upper end
+    if parts & {"thorax", "sternum", "spineshoulder"}:  # Human3.6M's, MPII's: what is called neck is the upper end
         middle |= {"neckbase": "head", "neck": "neck"}
     else:
         middle |= {"neckbase": "Neck"}
@@ -121,6 +128,8 @@ def body_points(names: Sequence[str]) -> list[str]:
     sided = dict(_PART_OF_SIDE)
     sided |= {} if parts & {"ankle", "ank"} else {"foot": "Ankle"}
     sided |= {} if parts & {"wrist", "wri"} else {"hand": "Wrist"}
+    sided |= _BONES if parts & {"upleg", "thigh", "upperleg"} else {}
+    sided |= {"shoulder": "collar"} if parts & {"upleg", "thigh"} and parts & {"arm", "upperarm"} else {}
     found, used = list[str](), set[str]()
     own = {"Head", "head"} <= set(names)  # the body's own names, which differ by their case alone
     for name, (side, part) in zip(names, split, strict=True):

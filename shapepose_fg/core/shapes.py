@@ -15,6 +15,8 @@ from shapepose_fg.core.storage.npz import read_npz, write_npz
 from shapepose_fg.core.storage.schema import Column, Table
 
 _COLUMNS = ("names", "betas", "information", "body")
+_LEAST, _MOST = 1e-6, 1e12
+"""Least and most information about a shape: that of the prior over adults alone is 1."""
 _CURE = "give a file that `--shapes` has written"
 
 
@@ -44,8 +46,10 @@ class SubjectShapes(Table):
             raise ValueError(f"betas and information must be finite, those of {whose!r} are not")
         largest = float(np.abs(self.information).max(initial=0.0))
         symmetric = np.allclose(self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest)
-        if not symmetric or (len(self) > 0 and (np.linalg.eigvalsh(self.information) <= 0).any()):
+        if not symmetric or (len(self) > 0 and (np.linalg.eigvalsh(self.information) < _LEAST).any()):
             raise ValueError("information must be symmetric and positive definite, for each of the people")
+        if max(largest, np.abs(self.betas).max(initial=0.0)) > _MOST:
+            raise ValueError(f"betas and information must be at most {_MOST:g}")
 
     @classmethod
     def empty(cls, body: str) -> "SubjectShapes":

@@ -91,7 +91,7 @@ class TopDownNetwork:
     """(N,) which of the skeleton's K keypoints each joint of the network is, -1 for none."""
     boxes: BoxNetwork | None
     """What finds people; None where the network is shown whole pictures."""
-    suffix, tail = ".json", "\n]\n"
+    suffix, tail = ".json", "\n]}\n"
 
     @classmethod
     def of(
@@ -131,8 +131,11 @@ class TopDownNetwork:
         return {"network": said[0], "detection": {"boxes": said[1]}}
 
     def head(self, frames: int) -> str:
-        """The beginning of MMPose's JSON of a video."""
-        return "["
+        """The beginning of MMPose's JSON of a video, with the joints' layout unless it was only guessed."""
+        alike = [each for each in SKELETONS.values() if each.keypoint_count == self.skeleton.keypoint_count]
+        named = self.form.skeleton in SKELETONS or alike == [self.skeleton]
+        meta = {"dataset_name": self.skeleton.name} if named else {}
+        return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
         """Frame `number` in it: `People`, None where there was no picture. Joints that were not seen are 0 0 0."""

@@ -100,7 +100,9 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)
-    before = undo(Reconstruction.load(folder / UNCORRECTED), Reconstruction.load(folder), edits)
+    original, current = Reconstruction.load(folder / UNCORRECTED), Reconstruction.load(folder)
+    with naming(folder, _CURE):
+        before = undo(original, current, edits)
     people = before.people if solve is None else solve_anew(before, solve)
     _write(folder, people, edits[:-1])
     return edits[-1], people

@@ -10,6 +10,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.io.camera_names import listing
+from shapepose_fg.io.detections.reading import camera_names
 from shapepose_fg.io.footage.placement import read_used_footage
 
 _NARROWEST, _WIDEST = 5.0, 150.0
@@ -64,26 +65,6 @@ def _camera(name: str, size: tuple[int, int], degrees: float) -> Camera:
     f = width / 2 / np.tan(np.radians(degrees) / 2)
     K = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
     return Camera(name, K, np.eye(4), size)
-
-
-def camera_names(detections: Path) -> list[str]:
-    """What cameras are called whose detections are in a folder: by its folders, text files or JSON files."""
-    if not detections.is_dir():
-        raise InputError(f"{detections}: there is no such folder; check the path of the detections")
-    folder = detections / "detection" if (detections / "detection").is_dir() else detections
-    entries = sorted(each for each in folder.iterdir() if not each.name.startswith("."))
-    kinds = (
-        [each.name.removesuffix("_json") for each in entries if each.is_dir()],
-        [each.stem for each in entries if each.suffix == ".txt"],
-        [each.stem for each in entries if each.suffix == ".json" and each.name != "footage.json"],
-    )
-    names = next((each for each in kinds if len(each) > 0), [])
-    if len(names) == 0:
-        raise InputError(
-            f"{folder}: no detections here, only {listing([each.name for each in entries])}; give the folder with"
-            " a file or folder for each camera"
-        )
-    return names
 
 
 def _given(fields: Sequence[str], names: Sequence[str]) -> dict[str, str]:

@@ -23,6 +23,8 @@ from shapepose_fg.tracking.worlds import PLACED_M
 
 ON_TRIAL = -1
 """The identity of who has too little evidence yet."""
+_SEARCH_S = 0.1
+"""Interval between searches for new people, seconds."""
 _SURE = 0.3
 """Evidence a second of a new person who is shown at once: a probability of 0.97 (`presence.probability`)."""
 _WAITS_S = 1.0
@@ -125,7 +127,7 @@ class Filter:
         now = replace(before, tracks=replace(tracks, time_s=time_s))
         now, candidate = self._weighed(now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S))
         now, candidate = self._without_ended(now, candidate)
-        if not abs(time_s - now.sought_s) < self.tracker.config.search_s:
+        if not abs(time_s - now.sought_s) < _SEARCH_S:
             now, candidate = self._with_newcomers(now, candidate, given)
         return self._with_names(now), candidate
 

@@ -6,8 +6,10 @@ any other is a file or a pipe of lines.
 """
 
 import json
+import selectors
 import socket
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +29,8 @@ Publish = Callable[[str, Reconstruction], None]
 """Of a kind, `now` or `settled`, and its rows."""
 _MOST_WAITING = 2**23
 """Bytes that a client may be behind with."""
+_LOOK_S = 0.2
+"""So long the end may have to wait for the thread that lets readers in, seconds."""
 _LAST_S = 2.0
 """So long all clients together are waited for at the end, seconds."""
 
@@ -112,11 +116,18 @@ class _Listeners:
         self._listening, self._note = listening, note
         self._waiting: dict[socket.socket, deque[memoryview]] = {}
         """By client: what it has still to get. Lines are in memory once, whoever they wait for."""
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._wait_for_readers, daemon=True)
 
     def __enter__(self) -> "_Listeners":
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._listening.close()
         until_s = time.monotonic() + _LAST_S
         for client, waiting in self._waiting.items():
             with client:
@@ -126,7 +137,6 @@ class _Listeners:
                         client.sendall(each)
                 except OSError:
                     continue
-        self._listening.close()
 
     def send(self, line: str) -> None:
         """Send a line, and what waits before it, as far as each client takes it now."""
@@ -148,18 +158,31 @@ class _Listeners:
             if sum(map(len, waiting)) > _MOST_WAITING:
                 self._part(client, "a reader is too slow, and cut off")
 
-    def _welcome(self) -> None:
-        """Take in who came since."""
+    def _wait_for_readers(self) -> None:
+        """Let in who comes while there is nothing to send, in a thread: the system lets only some wait."""
+        with selectors.DefaultSelector() as ready:
+            ready.register(self._listening, selectors.EVENT_READ)
+            while not self._ended.is_set():
+                if ready.select(_LOOK_S) and not self._welcome():
+                    self._ended.wait(1.0)
+
+    def _welcome(self) -> bool:
+        """Take in who came since; whether the system had room for them."""
         try:
-            while (found := accept(self._listening)) is not None:
-                client, name = found
-                if len(self._waiting) < MOST_CLIENTS:
-                    self._waiting[client] = deque()
-                else:
-                    client.close()
-                    self._note(f"{name} is sent away, as {MOST_CLIENTS} read already")
+            with self._lock:
+                for _ in range(MOST_CLIENTS):  # and then a line again, however many come
+                    if (found := accept(self._listening)) is None:
+                        break
+                    client, name = found
+                    if len(self._waiting) < MOST_CLIENTS:
+                        self._waiting[client] = deque()
+                    else:
+                        client.close()
+                        self._note(f"{name} is sent away, as {MOST_CLIENTS} read already")
         except OSError as error:
             self._note(f"nobody else can read ({error.strerror})")
+            return False
+        return True
 
     def _part(self, client: socket.socket, why: str) -> None:
         self._note(why)

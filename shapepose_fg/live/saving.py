@@ -38,6 +38,8 @@ _POSES = ("time_s", "wTb", "covariance")
 """The columns of poses of cameras that move, beside the carrier's name."""
 _MOST_PIXELS, _MOST_APART_M, _MOST_AFFINITY = 1e9, 1e3, 10
 """Largest coordinate of a detection, px, distance of a camera from the others, m, and affinity."""
+_LEAST_VARIANCE = 1e-12
+"""Least variance of a place in any direction, m²: its inverse is a number."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """The counts of a state."""
 _COLUMNS = {
@@ -153,6 +155,8 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
     asymmetric = np.abs(covariance - covariance.mT).max(axis=(-2, -1), initial=0.0) > small
     if asymmetric.any() or (np.linalg.eigvalsh(covariance)[..., 0] < -small).any():
         raise ValueError("covariances of its tracks must be symmetric, with no negative eigenvalue")
+    if (np.linalg.eigvalsh(covariance[..., :3, :3])[..., 0] < _LEAST_VARIANCE).any():
+        raise ValueError(f"no place of its tracks is known to {_LEAST_VARIANCE:g} m² or less")
     if not all((found[name] >= 0).all() for name in ("peak_s", "length_m", "count")):
         raise ValueError("bones and the most evidence of its tracks must not be negative")
     if not (np.abs(found["times"][:, 0] - found["time_s"].mean(axis=1)) < 1e-3).all():
@@ -201,6 +205,9 @@ def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
     )
     if not within or (candidate.size > 0 and (candidate.min() < -1 or candidate.max() >= len(seen))):
         raise ValueError("its detections are of other cameras, joints or people")
+    first, second = seen.pairs.T
+    if (seen.view[first] != seen.view[second]).any() or len(np.unique(seen.pairs, axis=0)) < len(seen.pairs):
+        raise ValueError("its affinities must be of two detections of a camera, of each two once")
     person, joint, view = np.nonzero(candidate >= 0)
     own = candidate[person, joint, view]
     if (seen.joint[own] != joint).any() or (seen.view[own] != view).any():
@@ -269,7 +276,9 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     apart_m, heard_s, code, last_s = arrays["cameras"]
     seen = {}
     for name in ("waiting", "before"):
-        seen[name] = Detections(**{each: arrays[f"{name}.{each}"] for each in _DETECTIONS})
+        sizes, own = dict[str, int](), {each: arrays[f"{name}.{each}"] for each in _DETECTIONS}
+        own = {each: _COLUMNS[f"seen.{each}"].checked(f"{name}.{each}", own[each], sizes) for each in own}
+        seen[name] = Detections(**own)
         _check(seen[name], np.zeros((0, len(skeleton), V), dtype=np.int64), V, len(skeleton))
     waiting = {
         view: (seen["waiting"].only(seen["waiting"].view == view), float(arrays["waiting_s"][view]))

@@ -16,7 +16,7 @@ from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.following import FollowingConfig
 from shapepose_fg.tracking.stitching import StitchingConfig
-from shapepose_fg.tracking.tracker import SEARCH_S, TrackingConfig
+from shapepose_fg.tracking.tracker import TrackingConfig
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,7 @@ class PipelineConfig(Settings):
     @property
     def tracking(self) -> TrackingConfig:
         """People over time: how they are followed from frame to frame."""
-        own, every_third_s = self.people, 3 * self.windows.keyframe_s
-        return TrackingConfig(own.min_new_joints, own.patience_s, max(SEARCH_S, every_third_s))
+        return TrackingConfig(self.people.min_new_joints, self.people.patience_s)
 
     @property
     def window_graph(self) -> WindowGraphConfig:

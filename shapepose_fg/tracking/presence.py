@@ -34,7 +34,7 @@ seconds: people are where they were, and nobody comes out of nothing."""
 _WORLDS = 8
 """How many worlds are tried as those that come first, the most promising ones."""
 LEAST_S = 0.1
-"""Least evidence of a person, seconds; of less than 0.4 seconds of frames a quarter of their time."""
+"""Minimum evidence of a person, seconds; less in short recordings (`_EVEN`)."""
 _ON_TRIAL = 0.25
 """Share of `APPEARS_S` and `LEAST_S` that is enough for people who are followed again: who is with them in one
 world may leave them more."""
@@ -43,6 +43,9 @@ _SCALE, _PRIOR = 13.7, -0.6
 somebody once more, in simulated crowds, crossings and pairs before two to four cameras. How long somebody is there
 says nothing more. Of 364 others, said to be 0.74 / 0.87 / 0.96 / 0.996, 8 of 11, 19 of 20, 70 of 70 and 263 of 263
 were there."""
+_EVEN = -_PRIOR / _SCALE
+"""Evidence a second at which a person is as probable as not: who is seen by one view at a time, behind others, has
+hardly more, and a recording of half a second has no time to gather `LEAST_S` of it."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +241,7 @@ class Account:
         weights = np.where(candidate >= 0, weight, np.float32(0)).reshape(shape)
         place, weights = place.astype(np.int32, copy=False), weights.astype(np.float32, copy=False)
         seen = np.append(np.flatnonzero(counts), 0)
-        span, least_s = (int(seen[0]), int(seen.max())), min(LEAST_S, 0.25 * float(lasts_s.sum()))
+        span, least_s = (int(seen[0]), int(seen.max())), min(LEAST_S, _EVEN * float(lasts_s.sum()))
         return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
 
     def choose(self, world: Index) -> Chosen:

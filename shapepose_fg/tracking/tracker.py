@@ -36,8 +36,6 @@ _APART_M = 0.25
 """A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
 _MOST_PEOPLE = 64
 """Where stage I finds as many as it may (`ProposalConfig.most_people`), nobody is sought among the rest."""
-SEARCH_S = 0.1
-"""New people are sought so often, where frames are followed one by one."""
 _BIRTH_SIGMA_M = 0.04
 """Sigma of a new person's joints as stage I places them."""
 
@@ -50,9 +48,6 @@ class TrackingConfig(Settings):
     """Core joints that two views must see, by detections that no track has, for a new person."""
     patience_s: Seconds = 0.5
     """A track without evidence for longer has ended."""
-    search_s: Seconds = SEARCH_S
-    """New people are sought so often among what those who are followed leave, and followed back from there; and
-    every 0.33 s, or half as often as that, among all detections (`worlds.follow_worlds`)."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ in one world in the frames in which they are seen best, and followed from there 
 take each other's detections.
 """
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -23,9 +23,10 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
 
-_KEY_S = 0.33
-"""People are sought among all detections so often, seconds: in some frame everybody is seen well. With 0.67 crowds
-before three cameras at 10 to 20 frames a second lose half as many rows more (seven seeds, simulated)."""
+_SEARCH_S = 0.3
+"""Interval between searches for new people in each world, seconds; twice that between the frames in which people
+are sought among all detections. In a world that lacks somebody the others take that person's detections, so new
+people are sought in all of them: crowds before three cameras gain two to six people of a hundred."""
 _TWINS_S = 0.1
 """So often it is looked whether two worlds have become one, seconds."""
 _RESTART_S = 1.3
@@ -104,7 +105,7 @@ class Seed:
     """Whether they are followed forwards."""
     backwards: bool = True
     """And backwards."""
-    births: bool = False
+    births: bool = True
     """Whether others are sought beside them."""
 
 
@@ -114,7 +115,7 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
     `carried` are the people of the frame before; `keep` is the index of the frame from which they are carried on.
     """
     times, unseen = times_of(frames), np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1)
-    on = Seed(-1, carried, unseen, backwards=False, births=True)
+    on = Seed(-1, carried, unseen, backwards=False)
     found = follow_worlds(tracker, frames, [on], keep)
     if len(frames) == 1 or _plain(found, times):
         return found, found.account.choose(found.world)
@@ -142,7 +143,7 @@ def with_sides_held(tracker: Tracker, frames: Sequence[Input], carried: Tracks) 
             tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
             alive = tracker.alive(tracks)
             tracks, candidate = tracks.rows(alive), candidate[alive]
-        if time_s - sought_s >= _KEY_S:
+        if time_s - sought_s >= _SEARCH_S:
             sought_s = time_s
             places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
             if len(places) > 0:
@@ -180,9 +181,8 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     """Worlds beside the one that goes on: people met on the way back, and those seen in single frames."""
     times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
-    back = Seed(len(frames) - 1, nobody, none, forwards=False, births=True)
-    apart_s = max(_KEY_S, 2 * tracker.config.search_s)
-    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / apart_s)))
+    back = Seed(len(frames) - 1, nobody, none, forwards=False)
+    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * _SEARCH_S))))
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
     return [back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
@@ -196,18 +196,10 @@ def _newcomers(
     return tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
 
 
-def _seed(
-    tracker: Tracker,
-    frames: Sequence[Input],
-    key: int,
-    places: Array,
-    candidate: NDArray[np.intp],
-    *,
-    births: bool = False,
-) -> Seed:
+def _seed(tracker: Tracker, frames: Sequence[Input], key: int, places: Array, candidate: NDArray[np.intp]) -> Seed:
     """A world of people at `places` (A, J, 3) with their detections in a frame."""
     zero = np.zeros(len(places), dtype=np.intp)
-    return Seed(key, tracker.at(places, zero, zero, float(frames[key].time_s.mean())), candidate, births=births)
+    return Seed(key, tracker.at(places, zero, zero, float(frames[key].time_s.mean())), candidate)
 
 
 def _restarts(
@@ -226,7 +218,7 @@ def _restarts(
         who = chosen.hypothesis[there[:, key]]
         if len(who) > 0:
             own = found.candidate[who, key].astype(np.intp)
-            seeds.append(_seed(tracker, frames, key, found.places[who, key], own, births=True))
+            seeds.append(_seed(tracker, frames, key, found.places[who, key], own))
     return seeds
 
 
@@ -282,13 +274,13 @@ def _follow(
         if abs(time_s - looked_s) < _TWINS_S:
             continue
         looked_s = time_s
-        gone, same = _twins(tracks, candidate, births)
+        gone, same = _twins(tracks, candidate)
         if len(gone) > 0:
             log.twins.append((slice(t + 1, None) if forwards else slice(0, t), tracks.ids[gone], tracks.ids[same]))
             births = {world: since for world, since in births.items() if world not in tracks.world[gone]}
             rest = np.setdiff1d(np.arange(len(tracks)), gone)
             tracks, candidate = tracks.rows(rest), candidate[rest]
-        if abs(time_s - sought_s) < tracker.config.search_s:
+        if abs(time_s - sought_s) < _SEARCH_S:
             continue
         sought_s = time_s
         for world in [world for world, since in births.items() if (since <= t if forwards else since >= t)]:
@@ -299,21 +291,19 @@ def _follow(
                     places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s
                 )
                 log.add(t, new, theirs)
-                born.append((world, Seed(t, new, theirs), new.ids))
+                born.append((world, Seed(t, new, theirs, births=False), new.ids))
                 tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
     return born
 
 
-def _twins(
-    tracks: Tracks, candidate: NDArray[np.intp], births: Container[int]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _twins(tracks: Tracks, candidate: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of `tracks` (A) whose whole world is as another one is, and the rows of the same people there.
 
-    Their detections (A, J, V) are the same, and what is placed is in the same places. Worlds with `births` stay.
+    Their detections (A, J, V) are the same, and what is placed is in the same places.
     """
     gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     known, kept = tracks.joints.sigma_m < PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
-    for world in sorted(np.unique(tracks.world).tolist(), key=lambda world: world not in births):
+    for world in np.unique(tracks.world).tolist():
         who = np.flatnonzero(tracks.world == world)
         names = [candidate[row].tobytes() for row in who.tolist()]
         who = who[sorted(range(len(names)), key=names.__getitem__)]

@@ -158,6 +158,7 @@ def test_unfinished_rows_say_so(joints, monkeypatch):
     assert np.isnan(fit.joints[stuck]).all() and not fit.body_pose[stuck].any()
 
 
+@pytest.mark.slow
 def test_alone_in_a_batch_and_in_any_order_is_the_same(fitter, joints):
     noise = np.random.default_rng(2).normal(0, 0.01, joints.shape)
     targets = make_targets(joints + noise, 0.01)

@@ -184,7 +184,7 @@ def test_what_is_no_person_never_becomes_nan(fitter, joints, scale):
     for values in (fit.betas, fit.global_orient, fit.body_pose, fit.transl, fit.joints[fit.ok]):
         assert np.isfinite(values).all()
     clean = fitter.fit(known_to(joints[:4], 0.01)).residual_m
-    assert (fit.residual_m[fit.ok] > 3 * clean.max()).all()  # it says that it does not fit
+    assert (fit.residual_m[fit.ok] > 3 * np.median(clean)).all()  # it says that it does not fit
 
 
 def test_where_the_network_goes_wild_the_plain_optimiser_fits(shipped_weights, joints):

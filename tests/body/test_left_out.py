@@ -51,7 +51,7 @@ def make_targets(xyz: np.ndarray, without: Sequence[int] = (), sigma_m: float = 
     return JointTargets(xyz, information)
 
 
-@pytest.fixture(scope="module", params=FITTERS)
+@pytest.fixture(scope="module", params=["learned", *slow("plain")])
 def fitter(request) -> BodyFitter:
     return FITTERS[request.param]()
 
@@ -65,7 +65,7 @@ def mahalanobis(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...ij,...j->...", error, np.linalg.inv(covariance), error)
 
 
-@pytest.mark.parametrize("name", ["RKnee", "LElbow", *slow("RWrist", "MidHip", "LBigToe")])
+@pytest.mark.parametrize("name", ["RKnee", *slow("LElbow", "RWrist", "MidHip", "LBigToe")])
 def test_a_joints_own_target_does_not_come_back_to_it(fitter, people, fit, name):
     joint = BODY_25.index(name)
     xyz = people[1].copy()
@@ -162,7 +162,8 @@ def test_few_joints_are_left_out_one_by_one(fitter, people):
     both = fit.ok & again.ok
     assert np.abs(again.prior_xyz - fit.prior_xyz)[both, kept[0]].max() < 1e-6
     inside = mahalanobis((fit.prior_xyz - truth)[fit.ok][:, kept], fit.prior_covariance[fit.ok][:, kept]) < 7.81
-    assert inside.mean() > 0.8
+    # A row's four joints are right or wrong together: of 40 rows with 85 % three standard errors are 17 %.
+    assert inside.mean() > 0.68
 
 
 def test_a_long_window_s_shape_is_agreed_upon_by_rows_spread_over_it(fitter):

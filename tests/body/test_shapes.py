@@ -53,6 +53,8 @@ def test_a_newer_shape_takes_the_place_of_the_older():
         ({"betas": np.full((2, 10), np.nan)}, "betas and information must be finite, those of 'Ann' are not"),
         ({"betas": np.zeros((2, 11))}, "betas must be (2, 10), got (2, 11)"),
         ({"information": np.tile(-np.eye(10), (2, 1, 1))}, "information must be symmetric and positive definite"),
+        ({"information": np.tile(1e-9 * np.eye(10), (2, 1, 1))}, "information must be symmetric and positive"),
+        ({"information": np.tile(1e150 * np.eye(10), (2, 1, 1))}, "betas and information must be at most 1e+12"),
         ({"information": np.tile(np.triu(np.ones((10, 10))), (2, 1, 1))}, "information must be symmetric"),
         ({"body": np.zeros(3)}, "these are shapes of another body model"),
         ({"information": None}, "column information is missing"),

@@ -102,6 +102,7 @@ def adjusted(rig, recording):
     return adjust(rig, rig, people, Freedom(20.0, 1.0), 12.0, scaled=True)
 
 
+@pytest.mark.slow
 def test_measured_distances_say_the_scale(adjusted):
     c = adjusted.rig.centres
     away = {(a, b): float(np.linalg.norm(c[a] - c[b])) for a in range(4) for b in range(a)}

@@ -17,7 +17,11 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.diagnosis import build_of
+from shapepose_fg.setup_check.evidence import Look, gather
+from shapepose_fg.setup_check.small import Problem
 from tests.calibration.conftest import FPS, disturbed, off_by
+from tests.marks import slow
+from tests.setup_check.spoiled_setups import biased, lasting
 
 TIMES = FrameTimes.from_fps(FPS, 250)
 
@@ -64,6 +68,36 @@ def test_a_sound_rig_stays_within_its_sigma(rig, recording):
     for off, sigma in ((turn, np.degrees(found.adjusted.sigma(TURN))), (move, found.adjusted.sigma(MOVE))):
         assert (off < 3 * sigma).all() and np.median(off / sigma) < 2
     assert abs(found.after_px / found.before_px - 1) < 0.1
+
+
+@pytest.mark.slow
+def test_a_calibration_by_a_board_is_kept_against_a_detector_s_biases(shared_cases, tmp_path, capsys):
+    """One person's lasting biases fit other cameras better, on frames that were not used as well."""
+    case, new = shared_cases / "caliscope_person", tmp_path / "new.toml"
+    base = [
+        "refine-calibration",
+        "--calibration",
+        case / "camera_array_aniposelib_4cam.toml",
+        "--up",
+        "x",
+        "--focal",
+    ]
+    code, out, _ = run([*base, "--detections", case / "detections", "--fps", 30, "--output", new], capsys)
+    assert code == 0 and "the cameras are left as they were" in " ".join(out.split())
+    given, kept = (read_rig(each, up="x") for each in (base[2], new))
+    np.testing.assert_allclose(kept.centres, given.centres, atol=1e-6)
+    np.testing.assert_allclose(kept.K, given.K, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", [0, *slow(1, 2)])
+def test_more_frames_of_the_same_biases_are_no_more_evidence(rig, recording, people, seed):
+    bias = lasting(np.random.default_rng(seed), 0.02, 0.08, 25, 4)[None]
+    seen = biased(recording, rig, people, np.repeat(bias, 3, axis=0))
+    usual = np.array([*Freedom(1.0, 0.02).sigmas[:6], 0.0, 0.0, 0.02])
+    few, many = (gather(seen, frames, 4) for frames in (range(60), range(250)))
+    for evidence in (few, many):
+        assert Problem.of(Look.given(evidence, rig)).off(usual) < 0.5
+    assert Problem.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual) > 0.5
 
 
 @pytest.mark.slow
@@ -125,9 +159,10 @@ def test_two_cameras(rig, recording):
     seen = Recording(recording.skeleton, [each.only(each.view < 2) for each in recording.frames])
     wrong = disturbed(two, 0)
     found = refine(seen, wrong, TIMES, range(250))
-    assert found.better and found.after_px < 3
+    # Of two cameras half of what is wrong shows: here a bias of the detector is no good explanation, but one.
+    assert found.after_px < min(3, found.before_px) and found.probability > 0.5
     # How they look at each other is found; along the line between them they may both turn.
-    assert off_by(found.rig, two)[0].max() < off_by(wrong, two)[0].max()
+    assert off_by(found.adjusted.rig, two)[0].max() < off_by(wrong, two)[0].max()
 
 
 @pytest.mark.slow
@@ -136,27 +171,6 @@ def test_what_motion_does_not_determine_is_said(rig, recording):
     few = Recording(recording.skeleton, [*frames[:25], *[Detections.empty()] * 225])
     found = refine(few, rig, TIMES, range(25), Freedom(focal=0.02))
     assert any("camera cam3: sees" in each and "it stays" in each for each in found.notes)
-
-
-@pytest.mark.slow
-def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
-    write_openpose(recording, rig, tmp_path / "seen")
-    write_rig(disturbed(rig, 4), tmp_path / "rig.json")
-    base = ["refine-calibration", "--calibration", tmp_path / "rig.json", "--detections", tmp_path / "seen"]
-    page = ["--report", tmp_path / "page.html"]
-    code, out, _ = run([*base, "--fps", 25, "--output", tmp_path / "new.json", *page], capsys)
-    drawn = json.loads((tmp_path / "page.html").read_text().split('id="scene-data">')[1].split("</script>")[0])
-    for part, used in (("before", "rig.json"), ("cameras", "new.json")):
-        centres = [each["centre"] for each in drawn[part]]
-        np.testing.assert_allclose(centres, read_rig(tmp_path / used).centres, atol=1e-6)
-    assert code == 0 and "next: shapepose-fg reconstruct" in out and "px before" in out and "±" in out
-    assert off_by(read_rig(tmp_path / "new.json"), rig)[0].max() < 0.25
-    code, out, _ = run([*base, "--fps", 25, "--json", "--output", tmp_path / "new.json"], capsys)
-    told = json.loads(out)
-    assert told["better"] and len(told["cameras"]) == 4 and told["held_out"]["after_px"] < 8
-    for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
-        code, _, error = run([*base, *more, "--output", tmp_path / "new.json"], capsys)
-        assert code == 2 and said in " ".join(error.split())
 
 
 def pose2sim_project(rig, recording, folder):
@@ -179,9 +193,26 @@ def test_places_and_names_are_looked_at_first(rig, recording, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_cameras_of_a_pose2sim_project(rig, recording, tmp_path, capsys):
+def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
+    """Of a Pose2Sim project, and of its files one by one."""
     project, new = pose2sim_project(disturbed(rig, 4), recording, tmp_path / "walk"), tmp_path / "new.json"
-    code, out, error = run(["refine-calibration", "--project", project, "--output", new], capsys)
+    page = ["--report", tmp_path / "page.html"]
+    code, out, error = run(["refine-calibration", "--project", project, "--output", new, *page], capsys)
     assert code == 0 and "25 frames a second, as Config.toml says" in " ".join(error.split())
-    assert f"reconstruct --calibration {new} --project {project}" in " ".join(out.split())
+    said = " ".join(out.split())
+    assert f"next: shapepose-fg reconstruct --calibration {new} --project {project}" in said
+    assert "px before" in said and "±" in said
+    drawn = json.loads((tmp_path / "page.html").read_text().split('id="scene-data">')[1].split("</script>")[0])
+    given = project / "calibration" / "rig.json"
+    for part, used in (("before", given), ("cameras", new)):
+        centres = [each["centre"] for each in drawn[part]]
+        np.testing.assert_allclose(centres, read_rig(used).centres, atol=1e-6)
     assert off_by(read_rig(new), rig)[0].max() < 0.25
+    base = ["refine-calibration", "--calibration", given, "--detections", project / "pose", "--fps", 25]
+    code, out, _ = run([*base, "--json", "--output", tmp_path / "again.json"], capsys)
+    told = json.loads(out)
+    assert code == 0 and told["better"] and len(told["cameras"]) == 4 and told["held_out"]["after_px"] < 8
+    np.testing.assert_allclose(read_rig(tmp_path / "again.json").centres, read_rig(new).centres, atol=1e-6)
+    for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
+        code, _, error = run([*base, *more, "--output", new], capsys)
+        assert code == 2 and said in " ".join(error.split())

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapepose_fg.calibration import unsynchronised
 from shapepose_fg.calibration.from_people import Undetermined, own_tracks
 from shapepose_fg.calibration.rise_and_fall import offsets_without_poses
 from shapepose_fg.calibration.tracks import next_of, on_one_clock
@@ -45,18 +46,6 @@ def test_moments_of_one_clock():
 
 
 @pytest.mark.slow
-def test_poses_and_times_from_people_alone(rig, late):
-    steps = list[tuple[int, int]]()
-    found, clocks = calibrate_unsynchronised(
-        late, unposed(rig), FPS, range(300), 8.0, progress=lambda *each: steps.append(each)
-    )
-    assert np.abs(clocks.offset_s - LATE_S).max() < 0.005
-    turn, move, _ = off_after_growing(found.rig, rig)
-    assert turn.max() < 0.4 and move.max() < 0.03
-    assert steps[-1][0] == steps[-1][1] and steps == sorted(steps)
-
-
-@pytest.mark.slow
 def test_people_who_stand_are_refused(rig, two_people):
     still = np.repeat(moving(two_people[0], 0.0)[None], 150, axis=0)
     with pytest.raises(Undetermined, match="camera cam0: "):
@@ -64,8 +53,14 @@ def test_people_who_stand_are_refused(rig, two_people):
 
 
 @pytest.mark.slow
-def test_the_command_writes_cameras_times_and_a_page(rig, late, tmp_path, capsys, monkeypatch):
+def test_the_command_finds_poses_and_times_from_people_alone(rig, late, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    steps = list[tuple[int, int]]()
+
+    def watched(*given):
+        return calibrate_unsynchronised(*given[:-1], lambda *each: (steps.append(each), given[-1](*each)))
+
+    monkeypatch.setattr(unsynchronised, "calibrate_unsynchronised", watched)
     write_rig(rig, tmp_path / "lenses.json")
     write_association(late, rig, tmp_path)
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
@@ -78,7 +73,9 @@ def test_the_command_writes_cameras_times_and_a_page(rig, late, tmp_path, capsys
             main([*base, "--output", "new.json", *more])
         out, error = capsys.readouterr()
         assert ended.value.code == code and said in " ".join((out + error).split())
-    assert off_after_growing(read_rig("new.json"), rig)[0].max() < 0.4
+    assert steps[-1][0] == steps[-1][1] and steps == sorted(steps)
+    turn, move, _ = off_after_growing(read_rig("new.json"), rig)
+    assert turn.max() < 0.4 and move.max() < 0.03
     rows = np.array([line.split(",")[1:] for line in Path("times.csv").read_text().splitlines()[1:]], dtype=float)
     assert rows.shape == (300, 4) and np.abs(rows[7] - rows[7, 0] - LATE_S).max() < 0.005
     page = Path("page.html").read_text()

@@ -199,6 +199,7 @@ def test_a_damaged_list_is_named(tmp_path):
             read_standings(file)
 
 
+@pytest.mark.slow
 def test_a_leader_that_fails_says_why_and_one_that_is_killed_is_noticed(tmp_path):
     lost = Assignment("a", Request(calibration=tmp_path / "no.json", detections=tmp_path), tmp_path, "tcp://x")
     leader = Leader(lost)

@@ -137,6 +137,7 @@ def test_options_reach_the_pipeline(recording, pipeline, tmp_path):
     assert config in Reconstruction.load(tmp_path / "out").run["inputs"]
 
 
+@pytest.mark.slow
 def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_path):
     assert run(*recording) == 0
     assert pipeline["times"] is None and pipeline["cuts"] == () and pipeline["shapes"] is None
@@ -211,6 +212,7 @@ def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pip
     assert "scores reach 50" in notes[0] and "COCO_17 has no Neck and no MidHip" in notes[1]
 
 
+@pytest.mark.slow
 def test_what_detect_wrote_is_found_and_kept_with_the_result(recording, pipeline, tmp_path, capsys):
     """Times of 60 a second in microseconds are 60 a second; footage.json goes along, and away with the next."""
     (tmp_path / "times.csv").write_text("frame, time_s\n" + "".join(f"{t}, {t / 60:.6f}\n" for t in range(5)))
@@ -228,6 +230,7 @@ def test_what_detect_wrote_is_found_and_kept_with_the_result(recording, pipeline
     assert not (tmp_path / "out" / "footage.json").exists()
 
 
+@pytest.mark.slow
 def test_a_finished_result_stays_until_it_is_to_be_overwritten(recording, pipeline, tmp_path, capsys):
     """And what was made of it is not taken for the new one's."""
     assert run(*recording, "--fps", "60") == 0
@@ -247,6 +250,7 @@ def test_a_finished_result_stays_until_it_is_to_be_overwritten(recording, pipeli
     assert (tmp_path / "out" / "export-older2" / "joints.csv").read_text() == "of result 2"
 
 
+@pytest.mark.slow
 def test_warnings_are_warnings_unless_they_are_to_be_strict(recording, pipeline, capsys):
     assert run(*recording) == 0
     assert "warning: No camera sees a person" in capsys.readouterr().err
@@ -533,6 +537,7 @@ def test_processes_are_this_machine_s_or_the_cluster_s(recording, pipeline, caps
     assert (pipeline["workers"], pipeline["cluster"]) == (2, "local")
 
 
+@pytest.mark.slow
 def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     assert run(*recording, "--chunk-frames", "200", "--cluster", "tcp://host:8786") == 0
     assert (pipeline["chunk_frames"], pipeline["cluster"]) == (200, "tcp://host:8786")
@@ -596,6 +601,7 @@ def three(recording, tmp_path) -> list[str]:
     return recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", [["--without", "behind"], ["--cameras", "right, left"]])
 def test_some_of_the_cameras(three, pipeline, tmp_path, choice):
     """Whoever films with fewer cameras than were calibrated says which; a run that goes on has the same ones."""

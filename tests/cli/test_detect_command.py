@@ -68,6 +68,7 @@ def film(path: Path, rig, name: str, frames: range, fps: float) -> None:
     writer.release()
 
 
+@pytest.mark.slow
 def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys):
     """Cameras at 50, 25 and 50 a second, the third 4 frames late: its point is where the others' is then."""
     rig = read_rig("calibration.json")
@@ -97,6 +98,7 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
         np.testing.assert_allclose(table[t].xy, expected, atol=5)
 
 
+@pytest.mark.slow
 def test_files_of_unequal_length_are_detected_whole_where_nobody_says_when_they_began(kitchen, capsys):
     """Two are shorter than the time between their starts: no moment would be left of what they share."""
     rig, lengths = read_rig("calibration.json"), (12, 5, 8)

@@ -34,6 +34,7 @@ def lines(rig, people, frames: int) -> str:
     return "\n".join(written) + "\n"
 
 
+@pytest.mark.slow
 def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
     (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 8))
     given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]
@@ -127,6 +128,7 @@ def test_detections_come_and_people_go_by_sockets(tmp_path, cameras, five_camera
     assert "cut off" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_people):
     pytest.importorskip("mcap_ros2", reason='needs pip install "shapepose-fg[ros]"')
     from mcap.reader import make_reader

@@ -90,6 +90,7 @@ def test_stills_of_each_camera_show_people_where_they_are(solved, tmp_path):
         assert np.ptp(patch, axis=1).max() > 40  # colour, where the picture is grey
 
 
+@pytest.mark.slow
 def test_bodies_and_videos_that_are_given(solved, tmp_path, capsys):
     rest = ["--output", tmp_path, "--stills", "1", "--width", "640", "--no-skeletons", "--no-points"]
     assert run(solved / "results", "--bodies", *rest) == 0

@@ -21,3 +21,9 @@ def test_pairs_cost_as_little_as_scipy_s(ties):
         if not ties:  # then it is the only one
             assert np.array_equal(rows, theirs[0])
             assert np.array_equal(columns, theirs[1])
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_costs_that_are_no_numbers_are_refused(wrong):
+    with pytest.raises(ValueError, match="costs must be finite"):
+        least_cost_pairs(np.array([[1.0, wrong], [0.0, 2.0]]))

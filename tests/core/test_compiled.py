@@ -14,7 +14,6 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
-from tests.marks import slow
 
 ROOT = Path(shapepose_fg.__file__).parents[1]
 IMPORT = "from shapepose_fg.core.compiled import kernel, part\n"
@@ -74,6 +73,7 @@ def program(tmp_path) -> Program:
     return Program(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_anew_when_a_file_has_changed_that_it_calls_into(program, tmp_path):
     """Its own file, or one whose part it calls by way of another; else it is read, wherever it stands."""
     assert [program()[:2], program()[:2]] == [(21.0, [0, 0]), (21.0, [1, 1])]
@@ -84,22 +84,22 @@ def test_a_kernel_is_compiled_anew_when_a_file_has_changed_that_it_calls_into(pr
     assert program()[:2] == (21.0, [1, 1])
 
 
-@pytest.mark.parametrize(
-    ("ending", "content"),
-    [
-        (".nbi", b""),
-        (".nbc", "half"),
-        *slow((".nbc", b""), (".nbi", b"cut"), (".nbc", bytes(1000)), (".nbi", "half")),
-    ],
-)
-def test_a_damaged_cache_is_made_anew(program, ending, content):
+@pytest.mark.slow
+def test_a_damaged_cache_is_made_anew(program):
     program()
-    for file in program.files(ending):
-        whole = file.read_bytes()
-        file.write_bytes(whole[: len(whole) // 2] if content == "half" else content)
-    result, _, complaints = program()
-    assert result == 21.0 and "Traceback" not in complaints
-    assert program()[:2] == (21.0, [1, 1])
+    for ending, damage in (
+        (".nbi", lambda whole: b""),
+        (".nbc", lambda whole: b""),
+        (".nbi", lambda whole: whole[: len(whole) // 2]),
+        (".nbc", lambda whole: whole[: len(whole) // 2]),
+        (".nbi", lambda whole: b"cut"),
+        (".nbc", lambda whole: bytes(1000)),
+    ):
+        for file in program.files(ending):
+            file.write_bytes(damage(file.read_bytes()))
+        result, _, complaints = program()
+        assert result == 21.0 and "Traceback" not in complaints
+        assert program()[:2] == (21.0, [1, 1])
 
 
 @pytest.mark.slow
@@ -162,14 +162,23 @@ def test_two_processes_at_the_same_time(program):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="starts each version from one process")
 def test_old_folders_are_removed(program):
-    program.program = (
-        "import own\nfrom shapepose_fg.core.kept_kernels import module_folder\nmodule_folder('own')\n"
-    )
-    program.program += "print(1, 1, 1)"
-    for n in range(20):
-        (program.modules / "own.py").write_text(FILES["own"] + f"# {n}\n")
-        program()
+    program.program = f"""
+import os, pathlib
+from shapepose_fg.core.kept_kernels import module_folder
+import shapepose_fg.core.compiled
+for n in range(20):
+    if os.fork() == 0:
+        file = pathlib.Path({str(program.modules / "own.py")!r})
+        file.write_text(file.read_text() + "# changed")
+        import own
+        module_folder("own")
+        os._exit(0)
+    assert os.wait()[1] == 0
+print(1, 1, 1)
+"""
+    program()
     assert 2 <= len(list(program.cache.glob("shapepose-fg/own-*"))) <= 17
 
 
@@ -213,6 +222,7 @@ def test_the_command_compiles_all_ahead():
     )
 
 
+@pytest.mark.slow
 def test_a_reconstruction_calls_kernels_with_the_types_that_they_name():
     """Each is compiled once: for one more layout of an array it would be compiled again, for seconds."""
 

@@ -44,6 +44,11 @@ def test_what_a_name_means_beside_others():
     assert body_points(["neck", "head", "head_top"]) == ["Neck", "head", "Head"]
     assert body_points(["person1_nose", "person1_left_hip"]) == ["Nose", "LHip"]
     assert body_points(["root", "pelvis"]) == ["MidHip", ""]
+    assert body_points(["left_upLeg_joint", "left_shoulder_1_joint"]) == ["LHip", "LShoulder"]
+    bones = ["LeftUpLeg", "LeftLeg", "LeftFoot", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand"]
+    points = ["LHip", "LKnee", "LAnkle", "left_collar", "LShoulder", "LElbow", "LWrist"]
+    assert body_points(bones) == points
+    assert body_points(["left_arm", "left_leg"]) == ["", ""]
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)

@@ -158,9 +158,12 @@ def yolox_file(path: Path, size: tuple[int, int], seed: int, classes: int = 1, s
         how = {"kernel_shape": [step, step], "strides": [step, step]}
         for part, channels, bias in (
             ("place", 4, [0.5, 0.5, 2.0, 2.0]),
-            ("sure", 1 + classes - suppressed, [-1.5 if suppressed else 1.1]),
+            ("sure", 1 + classes - suppressed, [-0.6 if suppressed else 1.1]),
         ):
             weights[f"{part}{step}"] = rng.normal(0, 1 / (200 * step), (channels, 3, step, step))
+            weights[f"{part}{step}"] -= weights[f"{part}{step}"].mean(
+                axis=(1, 2, 3), keepdims=True
+            )  # grey tells nothing
             weights[f"{part}{step}b"] = np.resize(bias, channels)
             nodes.append(node("Conv", f"x {part}{step} {part}{step}b", f"{part}{step}o", **how))
         nodes.append(node("Sigmoid", f"sure{step}o", f"sure{step}s"))

@@ -60,8 +60,9 @@ def test_a_plateau_is_one_peak_and_the_edge_has_peaks_too():
 def test_two_people_are_linked_to_themselves_alone(name):
     layout = layouts()[name]
     rng = np.random.default_rng(3)
+    # 30 apart and 8 wide: a line to the other's joint runs along no limb, as one between two level limbs would.
     one = np.column_stack(
-        [rng.uniform(6, 24, len(layout.text.joints)), rng.permutation(len(layout.text.joints)) * 1.4 + 2]
+        [rng.uniform(11, 19, len(layout.text.joints)), rng.permutation(len(layout.text.joints)) * 1.4 + 2]
     )
     people = one + np.array([[[0.0, 0.0]], [[30.0, 1.0]]])
     found = decode(people_output(people, layout), layout.text)

@@ -57,6 +57,7 @@ def test_onnxruntime_keeps_to_the_size_that_the_file_fixes(tmp_path):
     assert network.run(np.zeros((32, 64, 3), np.uint8)).shape == (78, 4, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_is_no_such_network_is_said(tmp_path, backend):
     if backend == "onnxruntime":

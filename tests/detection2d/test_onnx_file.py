@@ -91,6 +91,7 @@ def test_spellings_that_no_program_writes_are_refused(tmp_path, content):
             OnnxNetwork.open(file, "opencv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "content",
     [
@@ -127,6 +128,7 @@ def test_a_file_that_looks_like_onnxruntime_s_own_format_is_read_as_onnx(tmp_pat
     assert OnnxNetwork.open(file).run(given)[0].ravel().tolist() == [192.0] * 3
 
 
+@pytest.mark.slow
 def test_weights_within_are_read_in_every_spelling(tmp_path):
     """Numbers as bytes, packed, and one by one; a length in more bytes than needed; a place that says: here."""
     halves = np.full(3, 0.5, dtype="<f4")

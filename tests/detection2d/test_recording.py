@@ -118,6 +118,7 @@ def test_a_stopped_run_goes_on_to_the_same_end(rolled_rig, pictures, tmp_path, p
         assert (parted / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
     def stop(done: int, total: int) -> None:
         raise Stopped

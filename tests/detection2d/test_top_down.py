@@ -224,7 +224,11 @@ def test_a_skeleton_of_one_s_own_goes_on_to_reconstruct(rolled_rig, tmp_path, ca
         'limbs = [["RHip", "RKnee"], ["LHip", "LKnee"], ["MidHip", "Neck"]]\n'
         'mirror = [["RHip", "LHip"], ["RKnee", "LKnee"]]\n'
     )
-    constant_file(Path("pose.onnx"), (96, 192), out=np.random.default_rng(0).uniform(1, 90, (1, 5, 3)))
+    constant_file(
+        Path("pose.onnx"),
+        (96, 192),
+        out=np.array([[[40, 95, 0.9], [55, 95, 0.9], [40, 120, 0.9], [55, 120, 0.9], [48, 70, 0.9]]]),
+    )
     Path("n.toml").write_text('network = "pose.onnx"\nskeleton = "mine.toml"\ndecoding = "coordinates"\n')
     words = "detect --calibration calibration.json --images shots --network n.toml --output found"
     with pytest.raises(SystemExit) as end:
@@ -295,7 +299,9 @@ def test_detected_feet_are_reconstructed_feet(rolled_rig, tmp_path, capsys, monk
         with pytest.raises(SystemExit) as end:
             main(shlex.split(line))
         assert not end.value.code
-    seen = json.loads(Path("found/a.json").read_text())
+    written = json.loads(Path("found/a.json").read_text())
+    seen = written["instance_info"]
+    assert written["meta_info"] == {"dataset_name": "HALPE_26"}
     assert [frame["frame_id"] for frame in seen] == list(range(frames))
     assert np.shape(seen[0]["instances"][0]["keypoints"]) == (26, 2)
     people = Reconstruction.load(tmp_path / "results")

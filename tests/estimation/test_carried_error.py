@@ -56,6 +56,7 @@ def test_nothing_is_added_where_cameras_stand_still(five_cameras, two_people):
     assert not added(on_robot(five_cameras, 5), two_people).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [2, 4])
 def test_of_fixed_cameras_and_a_robot_it_is_what_poses_drawn_from_their_covariance_make(
     five_cameras, two_people, first

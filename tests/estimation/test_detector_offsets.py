@@ -188,6 +188,7 @@ def test_frames_are_spread_over_the_recording():
     assert spread_frames(101, 5) == [0, 25, 50, 75, 100]
 
 
+@pytest.mark.slow
 def test_the_run_records_the_offsets_and_a_file_brings_them_back(scene, odd_recording, odd_offsets, tmp_path):
     learnt = reconstruct(odd_recording, scene.rig, frames=range(2))
     learnt.save(tmp_path)

@@ -77,7 +77,7 @@ def window_of(rig, truth, kernel="cauchy", law=CONSTANT_VELOCITY, moving=False):
 
 
 def test_a_joint_that_one_view_saw_takes_nothing_from_the_others(five_cameras, two_people):
-    """The system is singular: its depth is not known in any frame, all else is."""
+    """Its depth is not known in any frame, all else is; rays differ by noise: the system is all but singular."""
     truth = np.tile(two_people[0], (6, 1, 1))
     window, sigmas = window_of(five_cameras, truth)
     inlier = sigmas > 0
@@ -89,7 +89,10 @@ def test_a_joint_that_one_view_saw_takes_nothing_from_the_others(five_cameras, t
     for covariance in (positions, velocities):
         known = np.isfinite(covariance).all(axis=(2, 3))
         assert known[:, np.arange(25) != LOST].all()
-    assert np.isnan(positions[:, LOST]).all() and np.abs(found[:, LOST] - truth[:, LOST]).max() < 1.0
+    # Others are known to a centimetre; this one at most to 0.3 m, and it is where it may be.
+    variance = np.trace(positions[:, LOST], axis1=1, axis2=2)
+    squared = np.sum((found - truth)[:, LOST] ** 2, axis=-1)
+    assert not (variance < 0.1).any() and not (squared > 16 * variance).any()
 
 
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
@@ -120,7 +123,11 @@ def test_gtsam_ends_where_the_chains_do(five_cameras, two_people, kernel, law):
         away.insert(key, window.values.atPoint3(key) + rng.normal(0, 0.01, 3))
     whole = optimizer(window.graph, away, parameters).optimize()
     again = np.array([[whole.atPoint3(key) for key in row] for row in window.keys.tolist()])
-    np.testing.assert_allclose(again, found, atol=1e-4)
+    # Costs are flat where they end: of all 300 joints together GTSAM may gain a seventh of a standard deviation.
+    assert abs(window.graph.error(window.values) - window.graph.error(whole)) < 1e-2
+    np.testing.assert_allclose(again, found, atol=1e-3)
     np.testing.assert_allclose(other.solve(*asked), found, atol=1e-9)
     assert len({chains.parts for chains in window.chains}) == 2, "the lost joint has an offset"
-    assert np.ptp(found[:, FEET], axis=0).max() < 0.02
+    free = window_of(five_cameras, truth, kernel, law)[0].solve(*asked[:-1], FEET[:0])
+    ranges = [np.ptp(each[:, FEET], axis=0).mean() for each in (found, free)]
+    assert ranges[0] < 0.8 * ranges[1], "feet that stand move less than what their views say"

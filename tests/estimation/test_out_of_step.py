@@ -29,7 +29,7 @@ FPS, LEADS_S = 30.0, np.array([0.0, 0.013, -0.011, 0.006, -0.008])
 def moving() -> tuple[np.ndarray, np.ndarray]:
     """Places (25, 3) at time 0 and velocities (25, 3) of joints, up to 3 m/s."""
     rng = np.random.default_rng(5)
-    return rng.uniform(-0.8, 0.8, (25, 3)) + np.array([0, 0, 1.0]), rng.normal(size=(25, 3))
+    return rng.uniform(-0.8, 0.8, (25, 3)) + np.array([0, 0, 1.0]), rng.uniform(-1.7, 1.7, (25, 3))
 
 
 def seen_at(rig: Rig, moving, time_s: np.ndarray, shutter_s: float = 0.0) -> np.ndarray:
@@ -128,6 +128,11 @@ def test_a_window_places_joints_at_the_frames_time(five_cameras, moving, shutter
         return graph
 
     right = solved(timed, Views.of(rig))
+    print(
+        "OO",
+        np.argwhere(np.abs(right.positions - timed.initial).max(axis=2) > 5e-4),
+        np.abs(right.velocity - moving[1]).max(),
+    )
     assert np.abs(right.positions - timed.initial).max() < 5e-4
     assert np.abs(right.velocity - moving[1]).max() < 0.05
     chained = np.full((*right.states.shape, 3), np.nan)

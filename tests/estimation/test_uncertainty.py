@@ -63,6 +63,7 @@ def test_correlation_is_the_product_along_the_limbs():
     assert correlation(["Tail"], ["Neck", "Tail"]).tolist() == [[0.0, 1.0]]
 
 
+@pytest.mark.slow
 def test_what_one_robot_sees_errs_with_it(scene):
     """A robot carries all cameras: joints of two people, and of two frames, share the error of its pose, and as
     they turn with it their distance is known as well as if it stood still.

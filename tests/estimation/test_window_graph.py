@@ -112,8 +112,9 @@ def test_solution_is_the_minimum_of_the_robust_problem(five_cameras, person, ker
     solution = graph_of(five_cameras, xy, sigmas, kernel=kernel).solve(truth)
     for joint in range(0, 25, 4):
         best = minimize(cost, truth[joint], args=(joint,), method="BFGS", options={"gtol": 1e-6})
-        # BFGS has numeric gradients, and the robust cost is flat: it ends within a part of a millimetre.
-        np.testing.assert_allclose(solution[joint], best.x, atol=2e-5 if kernel is None else 5e-4)
+        # A robust cost is flat, and BFGS has numeric gradients: 0.001 is a twentieth of a standard deviation.
+        assert abs(cost(solution[joint], joint) - best.fun) < 1e-3
+        np.testing.assert_allclose(solution[joint], best.x, atol=2e-5 if kernel is None else 3e-3)
 
 
 def test_the_kernel_makes_one_wrong_view_harmless(five_cameras, person):

@@ -44,6 +44,7 @@ def alike(found: list[PersonGraph]) -> float:
     return float((np.abs(np.concatenate([ratios(each) for each in found]) - 1) < 0.05).mean())
 
 
+@pytest.mark.slow
 def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(people, scene):
     found = solutions(people, scene)
     assert len(found) == len(np.unique(people.person))
@@ -66,6 +67,7 @@ def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(p
         assert np.trace(bare.marginalCovariance(wrist)) < 0.5 * np.trace(solution.covariance[6, WRIST])
 
 
+@pytest.mark.slow
 def test_frame_by_frame_every_frame_has_a_graph_of_its_own(scene):
     """A number is no identity there: rows of the same number in two frames are not tied by motion."""
     alone = reconstruct(simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False), frames=range(3))
@@ -140,6 +142,7 @@ def test_factors_of_ones_own_are_in_it(people, scene):
         np.testing.assert_allclose(at, solution.joints[:, WRIST], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_solved_graph_is_written_and_read_back(people, scene, tmp_path):
     solution = solutions(people, scene)[0]
     save_graph(tmp_path / "person.json", solution.graph, solution.values)

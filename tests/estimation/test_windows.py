@@ -24,6 +24,7 @@ from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.simulation.scene import UP, look_at
+from tests.marks import slow
 
 FPS = 25.0
 FRAMES = 30
@@ -148,7 +149,7 @@ def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, tw
 def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras, two_people, views_left):
     """From frame 5 on no view sees the first wrist, or one does: it drifts towards what the body says without it,
     aside or along the ray. With `keep_limbs` it goes towards the body's joint, and its forearm gets its length
-    where a ray leaves it open; nothing else moves, and covariances stay.
+    where a ray leaves it open; nothing else moves, and others' covariances stay.
     """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
@@ -173,7 +174,8 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     assert np.flatnonzero(changed.any(axis=0)).tolist() == [WRIST]
     # Lengths are kept for 0.1 s around, three frames.
     assert not changed[(observations.track == 1) | (observations.frame < 2)].any()
-    np.testing.assert_array_equal(kept.covariance, carried.covariance)
+    # The wrist's knows where it may hide, which depends on its place.
+    np.testing.assert_array_equal(*(np.delete(each.covariance, WRIST, axis=1) for each in (kept, carried)))
 
 
 @pytest.mark.slow
@@ -198,6 +200,7 @@ def test_a_joint_with_a_factor_of_one_s_own_stays_where_that_leaves_it(walk, fiv
     assert np.linalg.norm((plain.joints - kept.joints)[rows[-10:], WRIST], axis=-1).mean() > 0.03
 
 
+@pytest.mark.slow
 def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_people):
     observations, truth = walk
     alone = solve(observations, five_cameras, BesideFitter(two_people[0]), temporal=False)
@@ -231,6 +234,7 @@ def test_rows_of_a_track_are_one_group_of_the_fitter(walk, five_cameras, two_peo
     assert all(len(np.unique(groups)) == 2 for groups in fitter.groups)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_cameras, two_people):
     """The body is 12 cm beside the joints. A wrist hidden for ten frames stays where it is, not where the body
@@ -296,6 +300,7 @@ def test_frames_may_be_missing(walk, five_cameras, two_people):
     np.testing.assert_allclose(found.joints, truth[kept], atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_foot_that_stands_still_stays_still(walk, five_cameras, two_people):
     """A factor of one's own over time: the same place in two frames, to within a millimetre."""
     observations, _ = walk
@@ -364,6 +369,7 @@ def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_peo
     assert {each.row for each in found.rows(np.array([row])).problems} == {0}
 
 
+@pytest.mark.slow
 def test_factors_that_make_no_sense_end_no_run(walk, five_cameras, two_people):
     """A factor that is not a number: a status for that person, the other is solved."""
     observations, truth = walk
@@ -479,8 +485,8 @@ def far_apart(window, keys):
 
 @pytest.mark.parametrize(
     ("factors", "calls"),
-    [(nothing, 0), (steady, 1), (box, 1), (far_apart, 1)],
-    ids=["no factors", "a chain", "two joints tied", "frames far apart tied"],
+    [(nothing, 0), *slow((steady, 1), (far_apart, 1)), (box, 1)],
+    ids=["no factors", "a chain", "frames far apart tied", "two joints tied"],
 )
 def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, monkeypatch, factors, calls):
     """A wrist lost twice, frames missing, one person in fewer frames, a joint that no view sees: the same numbers,
@@ -547,6 +553,7 @@ def test_a_joint_with_a_factor_of_one_s_own_stays_without_views_and_body(walk, f
     assert np.isfinite(found.covariance[:, [1, 8, 9, WRIST]]).all()
 
 
+@pytest.mark.slow
 def test_somebody_undetermined_takes_nothing_from_anybody_else(walk, five_cameras, two_people):
     """The user says how fast the first person's wrist is, nobody where: it is not known, and all else is."""
     observations, truth = walk

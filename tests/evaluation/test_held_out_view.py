@@ -94,6 +94,7 @@ def test_detections_that_nobody_else_confirms_are_counted(scene, people):
     assert alone.unmatched + len(alone.squared) == len(whole.squared)
 
 
+@pytest.mark.slow
 def test_what_a_camera_saw_lies_where_the_others_say(scene, recording, people):
     found = held_out(recording, scene.rig, 1, people, reconstruct, CONFIG)
     assert len(found.squared) > 10

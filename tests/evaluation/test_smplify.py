@@ -96,6 +96,7 @@ def test_forces_are_the_slope_of_the_energy(scene, exact):
         np.testing.assert_allclose(forces[..., axis], slope / 2, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_smpl_only_is_of_the_same_people_and_detections(scene):
     """Fitted bodies are nearer to the truth than what the same detections are triangulated to."""
     config = replace(PipelineConfig(), temporal=False)

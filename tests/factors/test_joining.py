@@ -151,27 +151,37 @@ def cholesky() -> gtsam.ISAM2:
     return gtsam.ISAM2(gtsam.ISAM2Params())
 
 
-@pytest.mark.parametrize("seed", range(6880, 6885))
-def test_people_and_slam_together_are_better_than_either_alone(seed):
-    made = world(seed)
-    slam = run(made, cholesky(), people=False)
-    both = run(made, cholesky())
-    poses = [slam.atPose3(X(n)) for n in range(T)]
-    alone = run(made, cholesky(), slam=False, poses=poses)
-    before, after = (np.sqrt((camera_errors(made, each) ** 2).mean(axis=0)) for each in (slam, both))
-    assert (after < 0.8 * before).all(), (before, after)
-    assert joint_errors(made, both).mean() < 0.9 * joint_errors(made, alone).mean()
-    assert len(joint_errors(made, both)) == T * 2 * 12
+def test_people_and_slam_together_are_better_than_either_alone():
+    """In the mean of three worlds: by chance either alone may be as good in one."""
+    before, after, people, both_people = [], [], [], []
+    for seed in range(6880, 6883):
+        made = world(seed)
+        slam = run(made, cholesky(), people=False)
+        both = run(made, cholesky())
+        poses = [slam.atPose3(X(n)) for n in range(T)]
+        alone = run(made, cholesky(), slam=False, poses=poses)
+        before.append(camera_errors(made, slam))
+        after.append(camera_errors(made, both))
+        people.append(joint_errors(made, alone).mean())
+        both_people.append(joint_errors(made, both).mean())
+        assert len(joint_errors(made, both)) == T * 2 * 12
+    root = [np.sqrt((np.concatenate(each) ** 2).mean(axis=0)) for each in (before, after)]
+    assert (root[1] < 0.6 * root[0]).all(), root
+    assert np.mean(both_people) < 0.7 * np.mean(people)
 
 
 def test_a_fixed_lag_smoother_holds_what_is_within_its_lag():
-    made = world(6880)
-    smoother = gtsam.IncrementalFixedLagSmoother(1.0)
-    values = run(made, smoother)
-    assert values.size() < 8 * 2 * 12 * 2  # of 25 frames the last five or six
-    slam = camera_errors(made, run(made, cholesky(), people=False))[-1]
-    now = camera_errors(made, values)[-1]
-    assert now[0] < slam[0] and joint_errors(made, values).mean() < 0.03
+    """The cameras' last places, in the mean of three worlds."""
+    before, after = [], []
+    for seed in range(6880, 6883):
+        made = world(seed)
+        smoother = gtsam.IncrementalFixedLagSmoother(1.0)
+        values = run(made, smoother)
+        assert values.size() < 8 * 2 * 12 * 2  # of 25 frames the last five or six
+        before.append(camera_errors(made, run(made, cholesky(), people=False))[-1, 0])
+        after.append(camera_errors(made, values)[-1, 0])
+        assert joint_errors(made, values).mean() < 0.03
+    assert np.mean(after) < np.mean(before)
 
 
 def test_one_camera_and_holes_leave_no_system_singular():

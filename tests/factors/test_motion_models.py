@@ -98,6 +98,7 @@ def test_factors_are_the_gaussian_of_the_step(name):
             np.testing.assert_allclose(blocks[:, 0, :, 0], J.T @ root, rtol=1e-6, atol=1e-6 * np.abs(blocks).max())
 
 
+@pytest.mark.slow
 def test_covariances_hold_on_motion_that_follows_the_model(name):
     """200 walks drawn from the model, seen with 1 cm of noise: 95 % of truths inside, derivatives too."""
     law, keys, rng, q, sigma = LAWS[name], keys_of(LAWS[name]), np.random.default_rng(1), 2.0, 0.01

@@ -42,8 +42,8 @@ class Killing:
 
     @classmethod
     def of(cls, folder: Path, seed: int = 0) -> "Killing":
-        """Two people before three cameras for a second, written into `folder` and reconstructed there."""
-        scene = built_in_scene(seed=seed, people=2, cameras=3, frames=36)
+        """Two people before three cameras for 0.8 s, written into `folder` and reconstructed there."""
+        scene = built_in_scene(seed=seed, people=2, cameras=3, frames=24)
         files = write_simulated(scene, simulate(scene, seed=seed), folder / "recording", "openpose")
         (folder / "settings.toml").write_text(SETTINGS)
         command = ["reconstruct", "--calibration", str(files["cameras"]), "--detections", str(files["detections"])]

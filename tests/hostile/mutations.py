@@ -82,7 +82,12 @@ def _text(text: str, rng: random.Random) -> str:
             return "".join(lines)
     if len(found) == 0:
         return text
-    chosen = rng.choice(found)
+    chosen, number = rng.choice(found), rng.random()
+    if (
+        chosen[0][-1].isdigit() and number < 0.4
+    ):  # one that could be meant: another of the file, or nearly the same
+        near = float(chosen[0]) * rng.choice((-1, 0.999, 1.1, 10, 1000))
+        new = rng.choice(found)[0] if number < 0.2 else f"{near:.9g}"
     return text[: chosen.start()] + new + text[chosen.end() :]
 
 
@@ -204,7 +209,9 @@ def _tensors(content: bytes, rng: random.Random) -> bytes:
 
 
 def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
-    """An array cut, doubled, of another type, or with other values."""
+    """An array cut, doubled, of another type, or with other values; half of them such that only values tell."""
+    if rng.random() < 0.5 and array.size > 0 and array.ndim > 0 and array.dtype.kind in "fiub":
+        return _values(array, rng)
     match rng.randrange(6):
         case 0:
             return array.reshape(-1)[: rng.randrange(array.size + 1)]
@@ -222,6 +229,36 @@ def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
                 array.reshape(-1)[where] = array.reshape(-1)[rng.randrange(array.size)]
             else:
                 array.reshape(-1)[where] = np.array(rng.choice(numbers)).astype(array.dtype)
+    return array
+
+
+def _values(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    """An array of the same shape and type with values that could be meant: little else, exchanged, repeated."""
+    rows, places = rng.sample(range(len(array)), len(array)), np.arange(len(array))
+    one, other = rng.choice(rows), rng.choice(rows)
+    match rng.randrange(7):
+        case 0:
+            return array[rows]
+        case 1:
+            places[one] = other
+            return array[places]
+        case 2:
+            return np.repeat(array[one : one + 1], len(array), axis=0)
+        case 3 if array.ndim > 1:
+            return np.flip(array, axis=rng.randrange(1, array.ndim)).copy()
+        case 4 if array.dtype.kind == "f" and array.shape[-1] == (array.shape[-2] if array.ndim > 1 else 0):
+            scale = rng.choice((1e-300, 1e-9, 1e-3, 10.0, 1e9, 1e150))  # a matrix that stays one of a Gaussian
+            return (array * scale).astype(array.dtype)
+        case 5 if array.dtype.kind == "f":
+            noise = np.random.default_rng(rng.randrange(2**32)).normal(size=array.shape)
+            return (array * (1 + rng.choice((1e-12, 1e-3, 0.3)) * noise)).astype(array.dtype)
+    array = array.copy()
+    if array.dtype.kind == "b":
+        array[one] = ~array[one]
+    elif array.dtype.kind == "f":
+        array[one] *= rng.choice((-1, 0, 0.5, 1.1, 100, 1e6, np.nan))
+    else:
+        array[one] = array[one] + array.dtype.type(rng.choice((1, 2, 7, 100)))
     return array
 
 

@@ -222,7 +222,7 @@ def _motion(folder: Path, seed: int) -> Read:
 
 def _result(folder: Path, seed: int) -> Read:
     results.people([0, 0, 3], seed).save(folder)
-    _unpack(folder / "people.npz")
+    runs.unpack(folder / "people.npz")
     return lambda: Reconstruction.load(folder)
 
 
@@ -259,21 +259,14 @@ def _observations(folder: Path, seed: int) -> Read:
     from tests.core import test_observation_table as tables
 
     tables.table().save(folder / "observations.npz")
-    _unpack(folder / "observations.npz")
+    runs.unpack(folder / "observations.npz")
     return lambda: ObservationTable.load(folder / "observations.npz")
 
 
 def _shapes(folder: Path, seed: int) -> Read:
     runs.shapes(seed).save(folder / "shapes.npz")
-    _unpack(folder / "shapes.npz")
+    runs.unpack(folder / "shapes.npz")
     return lambda: SubjectShapes.load(folder / "shapes.npz", "body")
-
-
-def _unpack(file: Path) -> None:
-    """Without compression, so that changed bytes are changed numbers."""
-    with np.load(file) as archive:
-        columns = dict(archive)
-    np.savez(file, **columns)
 
 
 def _body(pickled: bool) -> Prepare:
@@ -391,6 +384,7 @@ READERS: dict[str, Prepare] = {
     "run in chunks": runs.unfinished(2, chunk_frames=6),
     "run before its bodies": runs.unfinished(4, bodies=True),
     "run before its end": runs.unfinished(99, bodies=True),
+    "result that was corrected": runs.corrected,
     "run with known people": runs.known_people,
     "detections of a run": runs.detections_kept,
     "observations": _observations,

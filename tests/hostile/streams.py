@@ -21,6 +21,7 @@ from shapepose_fg.live.inputs import feed
 from shapepose_fg.live.online import OnlineReconstructor
 from shapepose_fg.live.outputs import line_of
 from tests.estimation.test_windows import NobodyFitter
+from tests.hostile.runs import unpack
 from tests.hostile.trying import Prepare
 
 Read = Callable[[], object]
@@ -198,9 +199,7 @@ def live_state(folder: Path, seed: int) -> Read:
     with _started(seed) as live:
         _push(live, given[:-4])
         live.save(folder / "state.npz")
-    with np.load(folder / "state.npz") as archive:
-        columns = dict(archive)
-    np.savez(folder / "state.npz", **columns)
+    unpack(folder / "state.npz")
 
     def read() -> None:
         other = OnlineReconstructor.load(folder / "state.npz", made.rig, workers=1, fitter=NobodyFitter())

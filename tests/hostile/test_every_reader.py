@@ -21,11 +21,11 @@ MOST_S = 5.0
 """No small file may take longer to read; most take a millisecond."""
 
 
-HEAVY = ("result as amass", "result as glb", "result as rrd", "result for its report", "run before its bodies")
-HEAVY += ("ONNX", "lines of live", "state of live", "result to be explained")
+HEAVY = {"ONNX", "MCAP of detections", "MCAP of poses", "lines of live", "state of live"}
+HEAVY |= {name for name in READERS if name.startswith(("result ", "run ", "parts "))}
 
 
-@pytest.mark.parametrize("name", [*sorted(READERS.keys() - set(HEAVY)), *slow(*HEAVY)])
+@pytest.mark.parametrize("name", [*sorted(READERS.keys() - HEAVY), *slow(*sorted(HEAVY))])
 def test_changed_files_are_read_or_refused(tmp_path, name):
     trial = Trial(READERS[name], tmp_path, 0)
     # Corrections belong to another result.
@@ -51,7 +51,15 @@ def test_changed_files_are_read_or_refused(tmp_path, name):
     assert any(refused)
 
 
-@pytest.mark.parametrize("case", sorted(FOUND.glob("*/*")), ids=lambda case: f"{case.parent.name}-{case.name}")
+CASES = sorted(FOUND.glob("*/*"))
+OF_LIVE = [case for case in CASES if "live" in case.parent.name]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [*(case for case in CASES if case not in OF_LIVE), *slow(*OF_LIVE)],
+    ids=lambda case: f"{case.parent.name}-{case.name}",
+)
 def test_what_fuzzing_found_stays_mended(tmp_path, case):
     name = next(name for name in READERS if re.sub(r"\W+", "_", name) == case.parent.name)
     trial = Trial(READERS[name], tmp_path, 0)

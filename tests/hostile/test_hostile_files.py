@@ -28,6 +28,7 @@ from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation.scene import ring_of_cameras
 from tests.hostile.readers import READERS, tiny_body
+from tests.marks import slow
 
 
 def refused(read, *arguments) -> str:
@@ -305,6 +306,7 @@ def test_cameras_have_bounds(tmp_path, key, value, sentence):
     assert sentence in refused(read_rig, tmp_path / "rig.json")
 
 
+@pytest.mark.slow
 def test_openpose_with_a_key_twice(tmp_path):
     read = READERS["detections of OpenPose"](tmp_path, 1)
     read()
@@ -363,7 +365,9 @@ def test_numbers_by_which_rows_are_chosen_are_numbers(tmp_path, column):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
-@pytest.mark.parametrize(("streams", "code"), [(">&-", 0), (">&- 2>&-", 0), (">/dev/full", 2), ("| true", 1)])
+@pytest.mark.parametrize(
+    ("streams", "code"), [(">/dev/full", 2), *slow((">&-", 0), (">&- 2>&-", 0), ("| true", 1))]
+)
 def test_any_stdout(streams, code):
     command = f"set -o pipefail; {sys.executable} -m shapepose_fg.cli.main --help {streams}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
@@ -372,6 +376,7 @@ def test_any_stdout(streams, code):
     assert "Traceback" not in done.stderr and done.stderr.count("\n") <= 1
 
 
+@pytest.mark.slow
 def test_a_path_that_the_terminal_cannot_write(tmp_path):
     name = os.fsdecode(b"caf\xe9\xff")
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}

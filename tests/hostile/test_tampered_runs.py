@@ -142,6 +142,7 @@ def test_what_has_the_right_digests_and_makes_no_sense_is_refused(parts, task, k
     assert re.search(sentence, text) and file.name in text
 
 
+@pytest.mark.slow
 def test_a_body_whose_shape_is_none_is_refused(task, whole, tmp_path):
     """Found by tests/hostile/fuzz.py: its digests were right."""
     kept = InFolder(shutil.copytree(whole / "parts", tmp_path / "parts"))

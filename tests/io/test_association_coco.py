@@ -69,7 +69,7 @@ def test_random_candidates_come_back_in_order(read, five_cameras):
     """Every pair that a limb of the skeleton joins is kept, of many frames; order as `Detections` has it."""
     rng = np.random.default_rng(0)
     frames = []
-    for _ in range(20):
+    for _ in range(60):
         joint = np.sort(rng.choice([NECK, RHIP, LHIP, *range(18)], rng.integers(0, 40)))
         candidates = [(j, *rng.uniform(10, 400, 2), rng.uniform(0.1, 1)) for j in joint.tolist()]
         links = [

@@ -1,5 +1,6 @@
 """Corrections beside a result: listed, taken back to the last byte, and refused where they do not fit."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -138,6 +139,22 @@ def test_a_result_that_changed_since_is_noticed(folder):
     for action in (lambda: correct(folder, Edit(Action.DROP, 1)), lambda: take_back(folder)):
         with pytest.raises(InputError, match=r"people\.npz is not what these corrections led to"):
             action()
+
+
+def test_a_result_of_other_joints_is_refused_in_a_sentence(folder):
+    """By somebody who knows how its corrections say which people.npz they led to."""
+    correct(folder, Edit(Action.SPLIT, 1, 7, frame=3))
+    correct(folder, Edit(Action.SWAP, 0, 1, frame=5))
+    file, told = folder / "people.npz", folder / "corrections.json"
+    before, columns = file.read_bytes(), dict(np.load(file))
+    columns["joint_names"] = columns["joint_names"][::-1]
+    np.savez(file, **columns)
+    digests = [hashlib.sha256(content).hexdigest() for content in (before, file.read_bytes())]
+    told.write_text(told.read_text().replace(*digests))
+    with pytest.raises(
+        InputError, match="parts must have the same joint_names; copy the files of uncorrected back"
+    ):
+        take_back(folder)
 
 
 def test_tracks_on_the_command_line(folder, capsys):

@@ -95,7 +95,7 @@ def edit(path: Path, index: int, word: str | None) -> None:
 BAD_NUMBERS = [
     ("necks", "-1", "line 6: frame 0 must give the number of candidates of Neck, got -1; a number is missing"),
     ("necks", "1.5", "line 6: frame 0 must give the number of candidates of Neck, got 1.5"),
-    ("x", None, "frame 0 must give the number of candidates of"),
+    ("x", None, " must give the number of candidates of"),
     ("x", "nan", "line 7: 'nan' is not a finite number; write the detections again"),
     ("x", "inf", "line 7: 'inf' is not a finite number"),
     ("x", "0,5", "line 7: '0,5' is not a finite number"),

@@ -1,6 +1,8 @@
 """Detections as MediaPipe's, DeepLabCut's, SLEAP's, YOLO's and others write them: the same people in all."""
 
 import json
+import os
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +13,16 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.io.lenses import lenses_of
 
 COCO = SKELETONS["COCO_17"]
 FRAMES = 6
-NAMES = (
-    "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist"
-    " right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle"
-).split()
+NAMES: tuple[str, ...] = tuple(
+    (
+        "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist"
+        " right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle"
+    ).split()
+)
 
 
 @pytest.fixture
@@ -136,7 +141,21 @@ def deeplabcut(folder: Path, name: str, people: np.ndarray, _: object) -> None:
     (folder / f"walk_{name}DLC_resnet50_walkMay3shuffle1_100000.csv").write_text(text)
 
 
-PEOPLE = [openpifpaf, openpifpaf_video, ultralytics_json, yolo, sleap, sleap_standard, deeplabcut]
+def deeplabcut_hdf5(folder: Path, name: str, people: np.ndarray, _: object) -> None:
+    """As pandas writes a table: names of columns as a pickle, a part of the cage in a block of its own."""
+    h5py = pytest.importorskip("h5py", reason="an extra")
+    axes = ("x", "y", "likelihood")
+    columns = [("DLC_resnet50", one, part, axis) for one in ("one", "two") for part in NAMES for axis in axes]
+    kind = [("index", "<i8"), ("values_block_0", "<f8", (len(columns),)), ("values_block_1", "<i8", (1,))]
+    rows = np.zeros(len(people), dtype=kind)
+    rows["index"], rows["values_block_0"] = np.arange(len(people)), people.reshape(len(people), -1)
+    with h5py.File(folder / f"walk_{name}DLC_resnet50_walkMay3shuffle1_100000.h5", "w") as file:
+        table = file.create_dataset("df_with_missing/table", data=rows, chunks=(4,))
+        for block, own in enumerate((columns, [("DLC_resnet50", "single", "corner", "x")])):
+            table.attrs[f"values_block_{block}_kind"] = np.bytes_(pickle.dumps(own, 0))
+
+
+PEOPLE = [openpifpaf, openpifpaf_video, ultralytics_json, yolo, sleap, sleap_standard, deeplabcut, deeplabcut_hdf5]
 """Write several people of one camera."""
 
 
@@ -276,11 +295,20 @@ WRITERS = {each.__name__: _each(each) for each in PEOPLE} | {
 """Write all people of a recording, for other tests."""
 
 
+@pytest.mark.parametrize("program", WRITERS)
+def test_cameras_without_a_calibration_are_found_by_their_files(program, rig, people, tmp_path):
+    WRITERS[program](tmp_path, rig, people)
+    found = lenses_of(tmp_path, ["65"], rig.cameras[0].image_size)
+    table = read_detections(tmp_path, found)
+    assert [len(np.unique(each.view)) for each in (table[0], table[2])] == [2, 0]
+
+
 REFUSED = [
     ("a.npz", b"PK\x03\x04", "a NumPy archive, which has no layout of its own; write"),
     ("a.mat", b"MATLAB 5.0", "a MATLAB file, which has no layout of its own; write"),
     ("a.pkl", b"\x80\x04", "a Python pickle, which could run code and is not opened; write"),
     ("a.slp", b"\x89HDF\r\n\x1a\n", r"a SLEAP project; export the analysis HDF5: sio export FILE\.slp"),
+    ("mediapipe_body_3d_xyz.csv", b"frame,x,y,z\n", "FreeMoCap's table of points in 3D.*pixelXY"),
     ("a.npy", b"\x93NUMPY", "a NumPy array, and only FreeMoCap's"),
 ]
 
@@ -313,7 +341,7 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
         with h5py.File(tmp_path / f"{name}.h5", "w") as damaged:
             damaged["tracks"] = h5py.ExternalLink(str(tmp_path / "secret.hdf"), "tracks")
             damaged["node_names"] = [each.encode() for each in NAMES]
-    with pytest.raises(InputError, match="only SLEAP's analysis files are known here; of DeepLabCut"):
+    with pytest.raises(InputError, match="only SLEAP's analysis files and DeepLabCut's tables are known here"):
         read_detections(tmp_path, rig)
     for name in rig.names:
         (tmp_path / f"{name}.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 8)
@@ -325,6 +353,32 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
             huge["node_names"] = [each.encode() for each in NAMES]
     with pytest.raises(InputError, match="too many numbers"):
         read_detections(tmp_path, rig)
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.mkdir, ("harm",)
+
+
+def test_names_of_columns_are_read_without_carrying_out_their_pickle(rig, people, tmp_path, monkeypatch):
+    h5py = pytest.importorskip("h5py", reason="an extra")
+    monkeypatch.chdir(tmp_path)
+    for kind, says in (
+        (pickle.dumps([Harmful()], 0), "is no list of names: GLOBAL"),
+        (pickle.dumps([("s", "nose", "x")], 4), "is no list of names"),
+        (b"(lp0\nVa\n", "damaged HDF5"),
+        (b"g7\n.", "damaged HDF5"),
+        (b"(l(Va\nta.", "only SLEAP's analysis files and"),
+        (pickle.dumps([("s", "nose", "x"), ("s", "nose", "y")], 0), "its columns are not those it names"),
+    ):
+        for name, own in zip(rig.names, people, strict=True):
+            deeplabcut_hdf5(tmp_path, name, own, None)
+        for file in tmp_path.glob("*.h5"):
+            with h5py.File(file, "r+") as opened:
+                opened["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(kind)
+        with pytest.raises(InputError, match=says):
+            read_detections(tmp_path, rig)
+    assert not (tmp_path / "harm").exists()
 
 
 @pytest.mark.parametrize(

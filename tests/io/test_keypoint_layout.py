@@ -295,7 +295,7 @@ def test_people_who_look_like_no_layout_leave_the_most_usual_and_it_is_said(tmp_
     mixed = looks(keypoint_names(SKELETONS["BODY_25B"]), 60, 1)[:, np.random.default_rng(0).permutation(25)]
     mixed[..., :2] = np.random.default_rng(1).uniform(200, 600, mixed[..., :2].shape)
     table = read_detections(results(tmp_path, a=mixed, b=mixed), rig)
-    assert table.skeleton is BODY_25 and any("people do not tell it from BODY_25B" in note for note in table.notes)
+    assert table.skeleton is BODY_25 and any("people look like those of no layout" in note for note in table.notes)
 
 
 def test_cameras_of_two_models_are_refused(tmp_path, rig):

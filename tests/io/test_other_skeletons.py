@@ -9,6 +9,7 @@ from shapepose_fg import read_detections, read_rig, reconstruct, write_rig
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, Skeleton
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.simulation import built_in_scene, simulate
+from tests.marks import slow
 
 FRAMES = 4
 
@@ -36,7 +37,7 @@ def written(folder, skeleton: Skeleton) -> None:
     write_rig(scene.rig, folder / "rig.json")
 
 
-@pytest.mark.parametrize("skeleton", [COCO_17, HALPE_26], ids=["COCO_17", "HALPE_26"])
+@pytest.mark.parametrize("skeleton", [COCO_17, *slow(HALPE_26)], ids=["COCO_17", "HALPE_26"])
 def test_everybody_is_found(tmp_path, skeleton):
     written(tmp_path, skeleton)
     rig = read_rig(tmp_path / "rig.json")

@@ -236,6 +236,7 @@ def test_nobody_is_a_note(project):
     assert written.files == [] and "no people were found" in written.notes[0]
 
 
+@pytest.mark.slow
 def test_reconstruct_takes_a_project(shared_data, tmp_path, capsys):
     """Pose2Sim's demo recording, laid out as Pose2Sim does it, its frames numbered from 5."""
     source, folder = shared_data / "pose2sim_single", tmp_path / "Demo"

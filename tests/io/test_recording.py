@@ -60,6 +60,7 @@ def sets(seen: Detections) -> tuple[np.ndarray, np.ndarray]:
     return (each[np.lexsort(each.T)] for each in (rows, links))
 
 
+@pytest.mark.slow
 def test_frames_are_what_all_cameras_saw_at_one_time(scene, together, apart, tmp_path):
     recording, times = read_recording(apart, scene.rig, None, tmp_path / "kept")
     assert len(recording) == FRAMES - LATE and times is not None
@@ -71,6 +72,7 @@ def test_frames_are_what_all_cameras_saw_at_one_time(scene, together, apart, tmp
     assert any("frames that another camera has no picture for were left out" in note for note in recording.notes)
 
 
+@pytest.mark.slow
 def test_cameras_may_have_different_numbers_of_frames(scene, apart, tmp_path):
     """The last frames of camera 1, which are of later than the others, taken out of its file."""
     for file in apart.iterdir():

@@ -65,6 +65,7 @@ def ros(monkeypatch):
         module(f"{package}.msg", **{name: message})
 
 
+@pytest.mark.slow
 def test_the_node_publishes_who_is_there(ros, tmp_path, monkeypatch, five_cameras, two_people):
     (code,) = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
     assert len(code.splitlines()) <= 80

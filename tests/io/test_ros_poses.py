@@ -13,6 +13,7 @@ from shapepose_fg.io.calibration import with_trajectories
 from shapepose_fg.io.ros.definitions import definition
 from shapepose_fg.io.ros.mcap_files import read_views
 from shapepose_fg.io.ros.messages import Message, header
+from shapepose_fg.io.ros.poses import Frames
 from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.simulation.scene import ring_of_cameras
 
@@ -213,3 +214,17 @@ def test_a_damaged_file_is_refused_in_one_sentence(robot):
             refused += 1
             assert "robot.mcap" in str(error)
     assert refused > 30
+
+
+def test_very_many_poses_at_one_time_of_the_log_are_gone_through_once(tmp_path, monkeypatch):
+    """Each look at a waiting picture goes through all poses of its frame."""
+    rig = ring_of_cameras(2, np.random.default_rng(0))
+    flat = np.concatenate([np.full((25, 2), 300.0), np.full((25, 1), 0.8)], axis=1).ravel().tolist()
+    seen = {"header": header("base", 0.9), "camera": "cam0", "people": [{"pose_keypoints_2d": flat}]}
+    poses = [("/tf", 0.0, transform("map", "base", n / 1000, MOUNT)) for n in range(1000)]
+    file = write(tmp_path / "seen.mcap", [("/detections", 0.0, seen), *poses])
+    asked = list[str]()
+    at = Frames.at
+    monkeypatch.setattr(Frames, "at", lambda self, frame, time_s: asked.append(frame) or at(self, frame, time_s))
+    (view,) = read_views(file, rig, BODY_25, print)
+    assert view[3] is not None and len(asked) < 10

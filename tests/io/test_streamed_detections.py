@@ -199,7 +199,7 @@ def test_numbers_are_read_as_python_reads_them(other, tmp_path):
     assert stream.values.tobytes() == expected.tobytes()  # to the last bit, and the sign of zero
 
 
-@pytest.mark.parametrize("lead", [*slow(0, 1, 100, BLOCK_FRAMES), BLOCK_FRAMES + 7])
+@pytest.mark.parametrize("lead", slow(0, 1, 100, BLOCK_FRAMES, BLOCK_FRAMES + 7))
 @pytest.mark.parametrize("end", [*slow(0), 3])
 def test_files_of_which_some_frames_are_common(scene, once, tmp_path, lead, end):
     """Camera 1 has `lead` frames less at the beginning and `end` less at the end: by number, block by block."""

@@ -59,7 +59,7 @@ def two_people_are_there(live, at_s: float) -> None:
     assert people.time_s[0] == pytest.approx(at_s, abs=1.5 / HZ)
 
 
-@pytest.mark.parametrize("hz", [60, 200, *slow(5, 24, 30, 120)])
+@pytest.mark.parametrize("hz", [60, *slow(5, 24, 200)])
 def test_no_picture_is_dropped_at_any_rate(live, five_cameras, seen, hz):
     for frame in range(8):
         for view, name in enumerate(five_cameras.names):
@@ -68,7 +68,7 @@ def test_no_picture_is_dropped_at_any_rate(live, five_cameras, seen, hz):
     assert (live.report().frames, live.report().dropped, live.report().late) == (8, 0, 0)
 
 
-@pytest.mark.parametrize("shift_s", [YEAR_S, -3.0, *slow(9e11, 3.0, -YEAR_S)])
+@pytest.mark.parametrize("shift_s", [-3.0, *slow(9e11, 3.0, -YEAR_S)])
 @pytest.mark.parametrize("which", [0, 31], ids=["the first", "a later"])
 def test_one_time_that_is_wrong_moves_nobody_s_clock(live, five_cameras, seen, which, shift_s):
     given = list(views(five_cameras, seen))
@@ -79,7 +79,7 @@ def test_one_time_that_is_wrong_moves_nobody_s_clock(live, five_cameras, seen, w
     two_people_are_there(live, (FRAMES - 1) / HZ)
 
 
-@pytest.mark.parametrize("shift_s", [YEAR_S, -5.0, *slow(-YEAR_S, 5.0)])
+@pytest.mark.parametrize("shift_s", [-5.0, *slow(YEAR_S, -YEAR_S, 5.0)])
 def test_a_camera_whose_clock_is_set_is_left_out_and_named(live, five_cameras, seen, shift_s):
     given = list(views(five_cameras, seen))
     for each in given[30:]:
@@ -97,6 +97,7 @@ def test_a_camera_whose_clock_is_set_is_left_out_and_named(live, five_cameras, s
     two_people_are_there(live, (2 * FRAMES - 1) / HZ)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_s", [YEAR_S, -YEAR_S, 5.0, -5.0])
 def test_cameras_whose_clocks_are_set_together_go_on(live, five_cameras, seen, shift_s):
     play(live, views(five_cameras, seen))
@@ -110,6 +111,7 @@ def test_cameras_whose_clocks_are_set_together_go_on(live, five_cameras, seen, s
     assert later == names if shift_s == 5.0 else not later & names
 
 
+@pytest.mark.slow
 def test_most_cameras_decide_which_clock_is_right(live, five_cameras, seen):
     """Two of five cameras jump together, then three more follow."""
     play(live, views(five_cameras, seen))
@@ -122,6 +124,7 @@ def test_most_cameras_decide_which_clock_is_right(live, five_cameras, seen):
     two_people_are_there(live, (4 * FRAMES - 1) / HZ + 3600)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_s", [YEAR_S, -YEAR_S])
 def test_whole_frames_of_another_time_are_survived(live, five_cameras, seen, shift_s):
     for frame in range(8):
@@ -141,7 +144,8 @@ def shifted(metres: float) -> np.ndarray:
     return pose
 
 
-@pytest.mark.parametrize("pose", [np.eye(4), shifted(1e9), *slow(shifted(9e5), 2 * np.eye(4))])
+@pytest.mark.slow
+@pytest.mark.parametrize("pose", [np.eye(4), shifted(1e9), shifted(9e5), 2 * np.eye(4)])
 @pytest.mark.parametrize("which", [0, 31], ids=["the first", "a later"])
 def test_one_pose_for_a_camera_that_stands_still(live, five_cameras, seen, which, pose):
     given = list(views(five_cameras, seen, range(40)))
@@ -213,6 +217,7 @@ def test_a_file_of_which_no_line_is_taken_is_refused(tmp_path, five_cameras):
         fed(tmp_path, five_cameras, b"\n".join(lines_of(five_cameras, 20)), push)
 
 
+@pytest.mark.slow
 def test_a_line_without_end_takes_no_memory(tmp_path, five_cameras):
     with (tmp_path / "in.jsonl").open("wb") as stream:
         stream.write(b"\n".join([*lines_of(five_cameras, 4), b""]))
@@ -250,7 +255,7 @@ class Served:
     def client(self) -> socket.socket:
         for _ in range(200):
             try:
-                return socket.create_connection(("127.0.0.1", self.port), timeout=20)
+                return socket.create_connection(("127.0.0.1", self.port), timeout=60)
             except ConnectionRefusedError:
                 time.sleep(0.05)
         raise TimeoutError
@@ -265,7 +270,7 @@ class Served:
         assert any(words in each for each in self.notes), self.notes
 
     def _wait(self, until: Callable[[], bool]) -> None:
-        last = time.monotonic() + 20
+        last = time.monotonic() + 60
         while not until() and time.monotonic() < last:
             time.sleep(0.01)
 
@@ -289,8 +294,8 @@ def test_a_client_s_rubbish_is_named_and_the_others_go_on(five_cameras):
             once_good.sendall(b"\n".join([lines[30], *[b"x"] * 10, b""]))
             assert once_good.recv(1) == b""
         served.wait_for(26)
-        assert all("127.0.0.1:" in each and "line" in each for each in served.notes)
-    served.thread.join(timeout=20)
+        assert all(each.count("127.0.0.1:") == 1 and "line" in each for each in served.notes)
+    served.thread.join(timeout=60)
     assert not served.thread.is_alive()
 
 
@@ -309,7 +314,7 @@ def test_idle_connections_make_room_and_clients_may_come_again(five_cameras):
     with served.client() as again:
         again.sendall(lines[3])
     served.wait_for(4)
-    served.thread.join(timeout=20)  # although the idle ones are still there
+    served.thread.join(timeout=60)  # although the idle ones are still there
     assert not served.thread.is_alive()
     for each in idle:
         each.close()
@@ -328,7 +333,7 @@ def test_what_is_refused_because_of_others_cuts_nobody_off(five_cameras):
     with served.client() as good:
         good.sendall(b"\n".join([*lines_of(five_cameras, 31), b""]))
         served.wait_for(1)
-    served.thread.join(timeout=20)
+    served.thread.join(timeout=60)
 
 
 def test_readers_are_bounded(monkeypatch):
@@ -339,14 +344,14 @@ def test_readers_are_bounded(monkeypatch):
     listening = sockets.listen("tcp://:0")
     port = listening.getsockname()[1]
     with outputs._Listeners(listening, notes.append) as listeners:
-        first = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(3)]
-        listeners.send("a\n")
-        late = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(3)]
+        # Nothing is sent yet: far more than the system would let wait are answered at once.
+        clients = [socket.create_connection(("127.0.0.1", port), timeout=60) for _ in range(300)]
+        first, late = clients[:3], clients[3:]
+        assert [each.recv(1) for each in late] == [b""] * 297
         for _ in range(400):
             listeners.send("b" * 100_000 + "\n")
             first[0].recv(2**20)
-        assert [each.recv(1) for each in late] == [b""] * 3
-    assert sum("sent away" in each for each in notes) == 3
+    assert sum("sent away" in each for each in notes) == 297
     assert sum("too slow" in each for each in notes) == 2
-    for each in (*first, *late):
+    for each in clients:
         each.close()

@@ -72,6 +72,7 @@ def in_chunks(scene, recording, times):
     return reconstruct(recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=Execution(chunk_frames=12))
 
 
+@pytest.mark.slow
 def test_every_row_is_of_its_frame_and_its_person(scene, whole):
     """In a run of several windows: where somebody is when, how fast, with which body, from which detections."""
     assert np.bincount(whole.frame).tolist() == [2] * 54
@@ -106,6 +107,7 @@ def test_every_row_is_of_its_frame_and_its_person(scene, whole):
     assert np.median(np.linalg.norm(residual, axis=-1)) < 8
 
 
+@pytest.mark.slow
 def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
     rows = [range(3, 8), range(18, 23), range(10, 14)]
     for number, count in assembly.rows_of.items():
@@ -221,7 +223,7 @@ class NobodyIsThere:
         return given
 
 
-@pytest.mark.parametrize("fps", [3.0, *slow(25.0), 50.0, *slow(60.0)])
+@pytest.mark.parametrize("fps", [3.0, *slow(25.0, 50.0, 60.0)])
 @pytest.mark.parametrize("views", [*slow(1), 3, *slow(6)])
 @pytest.mark.parametrize("batch", [*slow(1), 12])
 def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):

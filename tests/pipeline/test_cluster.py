@@ -43,10 +43,12 @@ def installed():
 
 
 @pytest.mark.slow
-def test_results_come_in_order_whoever_does_them():
+def test_results_come_in_order_whoever_does_them_and_an_error_of_the_work_is_that_error():
     with cluster(None, 2, "") as pool:
         assert list(pool.map(late, range(6))) == list(range(6))
         assert list(pool.map(late, [])) == []
+        with pytest.raises(ArithmeticError, match="item 0"):
+            list(pool.map(fails, range(3)))
 
 
 @pytest.mark.slow
@@ -82,12 +84,6 @@ def test_who_shares_a_cluster_keeps_a_part_of_the_work_ready(sharing, under_way)
     pool = pool_of(FakeClient(), (lambda work, item: work(2, item),), 2 / sharing)
     next(pool.map(power, (taken.append(n) or n for n in range(20))))
     assert len(taken) == under_way
-
-
-@pytest.mark.slow
-def test_an_error_of_the_work_is_that_error():
-    with cluster(None, 1, "") as pool, pytest.raises(ArithmeticError, match="item 0"):
-        list(pool.map(fails, range(3)))
 
 
 @pytest.mark.slow

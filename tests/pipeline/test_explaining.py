@@ -79,6 +79,7 @@ def test_nothing_is_the_matter(people, scene):
     assert all(view.off_sigma < 3 for view in found.views if view.off_sigma is not None)
 
 
+@pytest.mark.slow
 def test_no_view_and_one_view(people, scene):
     person, _, cameras = seen_by_many(people)
     rows = rows_of(people, person)
@@ -92,6 +93,7 @@ def test_no_view_and_one_view(people, scene):
     assert first(one) == (Cause.ONE_VIEW, (scene.rig.names[cameras[0]],))
 
 
+@pytest.mark.slow
 def test_a_detection_where_nobody_is(people, scene):
     """Half a metre off, straight up in the picture."""
     person, _, cameras = seen_by_many(people)
@@ -103,6 +105,7 @@ def test_a_detection_where_nobody_is(people, scene):
     assert found.views[cameras[0]].share == 0
 
 
+@pytest.mark.slow
 def test_somebody_elses_detection(people, scene):
     person, _, cameras = seen_by_many(people)
     table, view = people.observations, None
@@ -122,6 +125,7 @@ def test_somebody_elses_detection(people, scene):
     assert found.views[view].looks_like == f"person {name}'s LElbow"
 
 
+@pytest.mark.slow
 def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(people, scene):
     """Spoiled before anybody is sought: in one camera an elbow is half a metre up, in another it is missed, and
     the detector joins somebody else's with the arm. Neither is given to the person.
@@ -162,6 +166,7 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     assert not done & {(each.cause, *each.cameras[:1]) for each in untouched.findings}
 
 
+@pytest.mark.slow
 def test_views_that_the_body_contradicts(people, scene):
     """All views put the elbow 60 cm above itself."""
     person, _, cameras = seen_by_many(people)
@@ -205,9 +210,10 @@ def test_a_camera_that_was_turned(people, scene):
     found = asked(solved(people, spoiled), spoiled, person)
     assert first(found) == (Cause.WRONG_CAMERA, (scene.rig.names[view],))
     turn, sigma = turned_by(found)
-    assert abs(turn - 2.0) < 3 * sigma < 6.0
+    assert abs(turn - 2.0) < 3 * sigma and sigma < 3.0  # 5 before anything was seen
 
 
+@pytest.mark.slow
 def test_a_camera_of_which_hardly_anything_was_taken(scene):
     """Turned by 4 degrees before anybody is sought, 28 cm at 4 m: what it saw was given to nobody, and tells. Of a
     turn a part may as well be a shift.
@@ -221,8 +227,10 @@ def test_a_camera_of_which_hardly_anything_was_taken(scene):
     told = explain(found, rig, person=person, joint="LElbow", frame=5, detections=recording)
     assert first(told) == (Cause.WRONG_CAMERA, (rig.names[3],))
     turn, sigma = turned_by(told)
-    assert abs(turn - 4.0) < 3 * sigma < 6.0
-    assert all(each.cause != Cause.WRONG_CAMERA for each in asked(found, rig, person).findings)
+    assert abs(turn - 4.0) < 3 * sigma and sigma < 3.0  # 5 before anything was seen
+    # Without the detections it is not known, or little; no other camera is.
+    others = [each.cameras for each in asked(found, rig, person).findings if each.cause == Cause.WRONG_CAMERA]
+    assert set(others) <= {(rig.names[3],)}
 
 
 def test_what_the_set_up_check_left_out_is_said(people, scene):
@@ -240,6 +248,7 @@ def test_what_the_set_up_check_left_out_is_said(people, scene):
     assert first(asked(doubted, scene.rig, person)) == (Cause.CONTRADICTION, (name,))
 
 
+@pytest.mark.slow
 def test_the_command_says_the_same(people, scene, tmp_path, capsys):
     people.save(tmp_path)
     write_rig(scene.rig, tmp_path / CAMERAS)

@@ -12,7 +12,6 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from tests.conftest import STANDING, detect_exactly
-from tests.marks import slow
 
 ALONE = PipelineConfig(temporal=False)
 ARM, LEG = (3, 4), (13, 14, 19, 20, 21)
@@ -48,7 +47,8 @@ def errors(found: Reconstruction, people: np.ndarray) -> np.ndarray:
     return np.linalg.norm(found.joints - people, axis=-1)
 
 
-@pytest.mark.parametrize(("fps", "frequency_hz"), [(30, 3.0), *slow((60, 3.0)), (10, 2.5)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("fps", "frequency_hz"), [(30, 3.0), (60, 3.0), (10, 2.5)])
 def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, frequency_hz):
     """At 3 Hz a wrist turns by 200 m/s² and more; at 10 frames a second 2.5 Hz are 140."""
     rig = Rig(five_cameras.cameras[:4], five_cameras.up)
@@ -67,6 +67,7 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
     assert (squared < 7.81).mean() > 0.88
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most_mm"), [("time", 18.0), ("fast", 22.0)])
 def test_a_recorded_jump_kick(shared_data, name, most_mm):
     """Five cameras, 30 frames a second; frame by frame the mean error is 16.8 mm."""

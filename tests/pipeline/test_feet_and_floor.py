@@ -52,8 +52,9 @@ def test_covariances_of_feet_hold(dance):
     who = np.linalg.norm(people.joints[:, None] - truth, axis=-1).mean(axis=2).argmin(axis=1)
     apart = (people.joints - truth[np.arange(len(people)), who])[:, FEET]
     squared = np.einsum("nji,njik,njk->nj", apart, np.linalg.inv(people.covariance[:, FEET]), apart)
-    # Of a Gaussian 95 % are within 7.81; a few dozen steps of eight feet are few that are independent.
-    assert 0.86 < (squared < 7.81).mean() <= 1.0
+    # Of a Gaussian 95 % are within 7.81. Eight feet of four people stand twice or so: of 16 that are independent
+    # 12 or more are, but once in 1,000; with sigmas half as large it would be 51 %.
+    assert 0.75 < (squared < 7.81).mean() <= 1.0
 
 
 def test_bodies_stay_above_the_floor(dance):
@@ -69,6 +70,7 @@ def test_bodies_stay_above_the_floor(dance):
     assert (bodies @ floor["normal"]).min() > floor["height_m"] - 0.02
 
 
+@pytest.mark.slow
 def test_frames_alone_have_neither():
     scene = built_in_scene(frames=2)
     people = reconstruct(simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False))

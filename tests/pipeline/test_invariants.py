@@ -25,6 +25,7 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.proposal.candidates import triangulate_pairs, vote
 from shapepose_fg.simulation import built_in_scene, simulate
+from tests.marks import slow
 
 FRAMES = 6
 SAME_M = 1e-3
@@ -120,6 +121,7 @@ def test_where_the_world_begins(degrees: float, shift: tuple[float, float, float
     assert farthest_m(as_it_is(), people, back) < SAME_M
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_calibration(tmp_path):
     rig, frames = recording()
     cameras = []
@@ -165,7 +167,7 @@ def test_left_and_right():
     assert float(np.median(apart)) < 2e-3 and float(np.quantile(apart, 0.95)) < 2e-2
 
 
-@pytest.mark.parametrize("twice", [0, 3, FRAMES - 1])
+@pytest.mark.parametrize("twice", [3, *slow(0, FRAMES - 1)])
 def test_a_frame_given_twice(twice: int):
     """People who stand still for a frame: nobody is lost, new or farther than they move in a frame (2.5 m/s)."""
     rig, frames = recording()

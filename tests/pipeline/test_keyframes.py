@@ -113,6 +113,7 @@ def results(scene):
     return [reconstruct(simulate(scene), scene.rig, config, times=times) for config in (PipelineConfig(), FAST)]
 
 
+@pytest.mark.slow
 def test_fast_finds_the_same_people_as_surely(scene, results):
     """Everybody in every frame, with a body; as near to the truth but for a tenth, and no surer than right."""
     accurate, fast = results
@@ -148,6 +149,7 @@ def test_fast_is_the_same_with_processes(scene, results):
         np.testing.assert_array_equal(getattr(again, name), getattr(results[1], name))
 
 
+@pytest.mark.slow
 def test_fast_results_are_solved_anew(scene, results):
     """The same rows, where they were: what is between keyframes is carried again, and not solved from nothing."""
     fast = results[1]

@@ -120,6 +120,7 @@ def refined(drifted) -> Rig:
     return refine_trajectories(drifted.recording, drifted.rig, times=TIMES)
 
 
+@pytest.mark.slow
 def test_people_correct_the_odometry_and_say_how_surely(drifted, refined):
     before, after = camera_error(drifted, drifted.rig), camera_error(drifted, refined)
     rms = [np.sqrt((each**2).mean(axis=0)) for each in (before, after)]
@@ -254,6 +255,7 @@ def test_factors_of_your_own_on_poses_count(drifted):
     assert np.linalg.norm(camera_error(drifted, rig)[30, 3:]) < 0.004
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_trajectories(refined):
     kept = InMemory()
     assert kept_rig(kept, refined) is None
@@ -273,6 +275,7 @@ def test_a_trajectory_of_another_clock_is_refused(drifted):
         refine_trajectories(drifted.recording, rig, times=TIMES)
 
 
+@pytest.mark.slow
 def test_pictures_outside_the_trajectory_are_not_used(drifted):
     short = drifted.true
     early = short.time_s < TIMES.time_s[40]

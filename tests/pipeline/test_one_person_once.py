@@ -15,7 +15,6 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
-from tests.marks import slow
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +36,9 @@ def twice(found: Detections, again: np.ndarray) -> Detections:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False], ids=["over time", "frame by frame"])
-@pytest.mark.parametrize("how", ["in all views", *slow("in some views", "in some frames", "at random")])
+@pytest.mark.parametrize("how", ["in all views", "in some views", "in some frames", "at random"])
 def test_people_whom_a_detector_finds_twice_are_there_once(scene, how, temporal):
     rng, frames = np.random.default_rng(0), list[Detections]()
     for number, found in enumerate(simulate(scene)):
@@ -58,6 +58,7 @@ def test_people_whom_a_detector_finds_twice_are_there_once(scene, how, temporal)
         assert len(np.unique(found.person)) == 2
 
 
+@pytest.mark.slow
 def test_sides_that_most_views_exchange_for_a_while_are_held(scene):
     """In two of three views, for 0.5 s: the mean error hardly grows."""
     rig, mirror = Rig(scene.rig.cameras[:3], scene.rig.up), np.array(BODY_25.mirror)
@@ -96,7 +97,8 @@ def solved(shared_data: Path, name: str, config: PipelineConfig):
     return found, joint_metrics(found, truth[:, :, order])
 
 
-@pytest.mark.parametrize("temporal", [True, *slow(False)])
+@pytest.mark.slow
+@pytest.mark.parametrize("temporal", [True, False])
 def test_a_detector_without_suppression_of_doubles(shared_data, temporal):
     found, figures = solved(shared_data, "duplicates", PipelineConfig(temporal=temporal))
     assert len(found) == 240
@@ -105,6 +107,7 @@ def test_a_detector_without_suppression_of_doubles(shared_data, temporal):
         assert len(np.unique(found.person)) == 2
 
 
+@pytest.mark.slow
 def test_left_and_right_exchanged_in_two_of_three_cameras(shared_data):
     """For two seconds; without that the mean error is 22 mm, and with it it was 60 in the mean of all frames."""
     found, figures = solved(shared_data, "flip2of3", PipelineConfig())
@@ -112,6 +115,7 @@ def test_left_and_right_exchanged_in_two_of_three_cameras(shared_data):
     assert figures.mpjpe_mm < 26
 
 
+@pytest.mark.slow
 def test_legs_that_the_picture_cuts_off(shared_data):
     """The detector puts them on the border of two of four pictures: no worse than if it had said nothing."""
     found, figures = solved(shared_data, "border", PipelineConfig())

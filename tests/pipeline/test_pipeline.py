@@ -162,6 +162,7 @@ def test_factors_that_were_typed_somewhere_are_the_same_with_workers():
     assert run.stdout == "4 True\n", run.stderr
 
 
+@pytest.mark.slow
 def test_progress_counts_frames(scene, recording):
     seen = []
     reconstruct(
@@ -187,6 +188,7 @@ def test_nobody_and_nothing_are_empty_results(scene):
     assert len(reconstruct(Recording(BODY_25, []), scene.rig)) == 0
 
 
+@pytest.mark.slow
 def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording):
     blind = recording[1].only(recording[1].view != 2)
     frames = [recording[0], Detections.empty(), blind, recording[3]]
@@ -218,6 +220,7 @@ def test_one_person_before_two_cameras():
     assert found.mpjpe_mm < 60
 
 
+@pytest.mark.slow
 def test_factors_of_one_s_own_reach_every_person(scene, recording):
     def hands_apart(window, keys):
         right, left = keys[0, WRISTS].tolist()
@@ -228,6 +231,7 @@ def test_factors_of_one_s_own_reach_every_person(scene, recording):
     np.testing.assert_allclose(apart, 0.5, atol=0.005)
 
 
+@pytest.mark.slow
 def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, recording):
     def throw(window, keys):
         far = np.array([1000.0, 0.0, 0.0])
@@ -244,6 +248,7 @@ def test_a_factor_that_throws_a_wrist_away_is_a_status_that_names_it(scene, reco
     }
 
 
+@pytest.mark.slow
 def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recording):
     """Who is named is in people.npz; who goes when detections are given out again is counted."""
 

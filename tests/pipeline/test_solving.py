@@ -99,6 +99,7 @@ def test_rows_are_solved_anew_in_the_windows_of_the_recording():
     assert solved_frames(lambda: solve(fewer, scene, LONG))[0] == expected
 
 
+@pytest.mark.slow
 def test_a_swap_is_mended_and_only_who_was_in_it_is_solved(scene, people):
     """Two people who changed places in frame 6 are torn apart by motion; put right, they are where they were."""
     first, second, third = sorted(set(people.person.tolist()))[:3]
@@ -130,6 +131,7 @@ def run(*arguments: object) -> int:
     return int(caught.value.code or 0)
 
 
+@pytest.mark.slow
 def test_tracks_solves_anew_who_changed(scene, people, tmp_path, capsys):
     folder = saved(people, scene, tmp_path / "results")
     whole = (folder / "people.npz").read_bytes()

@@ -191,15 +191,23 @@ def command(scene, recording, tmp_path_factory) -> list[str]:
 
 
 SHORT_BLOCKS = """
+import sys, time
+from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.tracking import following
 following.BLOCK_S = 0.2
+keep, last = InFolder.keep, sys.argv.pop(1)
+def keep_and_wait(self, name, *more):
+    keep(self, name, *more)
+    time.sleep(600 if name == last else 0)
+InFolder.keep = keep_and_wait
 from shapepose_fg.__main__ import main
 main()
 """
 
 
-def start(command: list[str], *more: str) -> subprocess.Popen:
-    words = [sys.executable, "-c", SHORT_BLOCKS, *command, *more]
+def start(last: str, command: list[str], *more: str) -> subprocess.Popen:
+    """The command, which waits to be stopped when it has kept `last`."""
+    words = [sys.executable, "-c", SHORT_BLOCKS, last, *command, *more]
     return subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_ctrl_c
     )
@@ -232,7 +240,7 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     with only_run_in(out, []):
         assert finished(command, "--output", str(out)) == 2
     assert f"another run writes its results here (process {os.getpid()})" in capsys.readouterr().err
-    first = start(command, "--output", str(out))
+    first = start("part-000001", command, "--output", str(out))
     wait_for(out / "parts" / "part-000001.safetensors", first)
     first.send_signal(signal.SIGINT)
     _, said = first.communicate(timeout=60)
@@ -246,7 +254,7 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     said = capsys.readouterr().err
     assert "had another time" in said and said.count("\n") == 1
     assert left == {file.name: file.read_bytes() for file in (out / "parts").iterdir()}, "asking loses nothing"
-    second = start(command, "--output", str(out), "--resume")
+    second = start("part-000003", command, "--output", str(out), "--resume")
     wait_for(out / "parts" / "part-000003.safetensors", second)
     second.kill()
     second.communicate(timeout=60)
@@ -256,6 +264,21 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     )
     assert finished(command, "--output", str(tmp_path / "whole")) == 0
     assert_same_files(out, tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("before", "after"), [((), ("--without", "cam1")), (("--cameras", "cam0,cam2"), ())])
+def test_a_run_does_not_go_on_with_other_cameras(command, tmp_path, capsys, monkeypatch, before, after):
+    def stop(*_: object, **__: object) -> None:
+        raise Stopped(signal.SIGTERM)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("shapepose_fg.cli.reconstruct.run.reconstruct_parts", stop)
+        assert finished(command, "--output", str(tmp_path), *before) == 143
+    monkeypatch.setattr("shapepose_fg.pipeline.runs.manifest.Parts", lambda kept: _Done())
+    capsys.readouterr()
+    for more, said in (((), "go on with --resume"), (("--resume",), "had another set of cameras")):
+        assert finished(command, "--output", str(tmp_path), *after, *more) == 2
+        assert said in capsys.readouterr().err
 
 
 EARLY = """
@@ -376,6 +399,7 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     assert (tmp_path / "parts" / "wheel.stl").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_named(scene, recording, tmp_path):
     kept = Interrupted(tmp_path / "parts", 3, behind=False)
     with pytest.raises(Stopped):

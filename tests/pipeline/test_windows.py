@@ -55,6 +55,7 @@ def test_the_length_of_windows_moves_joints_by_millimetres_at_seams_and_changes_
     assert np.median(moved) < 0.002 and np.quantile(moved, 0.95) < 0.01
 
 
+@pytest.mark.slow
 def test_nothing_carries_over_a_cut(dance):
     recording, rig, times = first(dance.recording, 16), dance.scene.rig, FrameTimes(dance.times.time_s[:16])
     both = reconstruct(recording, rig, frames=range(2, 16), times=times, cuts=[9])

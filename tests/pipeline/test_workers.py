@@ -12,6 +12,7 @@ import pytest
 
 from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.pipeline.workers import suitable_workers, workers
+from tests.marks import slow
 
 posix = pytest.mark.skipif(os.name != "posix", reason="asks POSIX about processes")
 
@@ -22,6 +23,7 @@ def times(shared: int, item: int) -> int:
     return shared * item
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 def test_results_come_in_order_wherever_they_are_made(count):
     with workers(count, 10) as pool:
@@ -43,6 +45,7 @@ def about_itself(_: object, _item: int) -> tuple[int, str, str | None, object]:
     return os.getpid(), os.environ["OMP_NUM_THREADS"], os.environ.get("MINE"), signal.getsignal(signal.SIGINT)
 
 
+@pytest.mark.slow
 def test_workers_have_a_thread_each_and_are_deaf_to_ctrl_c(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.setenv("MINE", "kept")
@@ -54,6 +57,7 @@ def test_workers_have_a_thread_each_and_are_deaf_to_ctrl_c(monkeypatch: pytest.M
         assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
+@pytest.mark.slow
 def test_items_are_taken_as_they_are_needed():
     taken = []
     with workers(2, 1, ahead=2) as pool:
@@ -75,7 +79,7 @@ with workers(2, lambda item: base**item) as pool:
 _RESULT = "[(1, True), (10, True), (100, True), (1000, True)]"
 
 
-@pytest.mark.parametrize("how", ["standard input", "-c", "a cell", "a script without a guard"])
+@pytest.mark.parametrize("how", ["standard input", *slow("-c", "a cell", "a script without a guard")])
 def test_any_main_will_do(how, tmp_path):
     """As a notebook's cell does, `exec` runs code in a `__main__` that no other process can import."""
     code, words, given = _TYPED, [], None
@@ -105,6 +109,7 @@ def is_killed(_: int, item: int) -> int:
 
 
 @posix
+@pytest.mark.slow
 def test_a_worker_that_is_killed_from_outside_is_told_of():
     """As the system does where memory is short; what was done before it comes through."""
     with pytest.raises(WorkLost, match="a worker process was killed"), workers(2, 10, ahead=1) as pool:
@@ -125,7 +130,7 @@ with workers(2, None) as pool:
 
 
 @posix
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGKILL, *slow(signal.SIGINT, signal.SIGTERM)])
 def test_workers_end_with_the_process_that_started_them_whatever_ends_it(how):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     run = subprocess.Popen([sys.executable, "-c", _ENDLESS], stdout=subprocess.PIPE, stderr=subprocess.PIPE,

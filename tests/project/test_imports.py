@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -78,6 +79,7 @@ def modules(package: str) -> Iterator[tuple[str, ast.Module]]:
         yield ".".join(parts).removesuffix(".__init__"), ast.parse(path.read_text(encoding="utf-8"))
 
 
+@cache
 def imports(tree: ast.AST) -> set[str]:
     """Names of all modules that are imported anywhere in a file, those inside functions included."""
     found = set()
@@ -213,6 +215,7 @@ LIGHT = {
 }
 
 
+@pytest.mark.slow
 def test_nothing_of_this_loads_torch():
     """One after the other, in one process."""
     lines = [

@@ -159,8 +159,9 @@ def test_crossed_arms_do_not_change_hands(five_cameras, two_people, seen_exactly
     reach = np.linalg.norm(people[:, None, WRIST] - people[None, :, ELBOW], axis=-1)
     assert (np.diag(reach) > 2 * np.diag(reach[::-1])).all()
     proposals, candidates = find(seen_exactly(five_cameras, people), five_cameras)
-    # Points from one's ray and the other's lie in the clusters too; a wrist of the other is 24 cm away.
-    assert_joints(proposals, candidates, people, within_m=0.06)
+    # Points from one's ray and the other's lie in the clusters too; a wrist of the other is 24 cm away,
+    # the own one less than half as far.
+    assert_joints(proposals, candidates, people, within_m=0.12)
 
 
 def test_an_embrace_is_two_people(five_cameras, two_people, seen_exactly):

@@ -113,6 +113,7 @@ def test_strong_candidates_and_those_with_most_votes_stay(rig):
     np.testing.assert_array_equal(made, kept.joint[kept.support[:, 0]])
 
 
+@pytest.mark.slow
 def test_many_points_are_clustered_as_if_one_by_one():
     rng = np.random.default_rng(0)
     count, radius = 9000, 0.12

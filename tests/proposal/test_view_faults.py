@@ -57,11 +57,18 @@ def on_the_line(seen: Detections, view: int, height: float) -> tuple[Detections,
     return replace(seen, xy=xy), below
 
 
+def between(y, share):
+    """A height that about a `share` of joints at `y` (N,) are below: in a gap, where no joint is by chance."""
+    least, most = (np.quantile(y, min(max(1 - share + shift, 0), 1)) for shift in (-0.1, 0.1))
+    near = np.sort(y[(least <= y) & (y <= most)])
+    widest = int(np.argmax(np.diff(near)))
+    return float(near[widest : widest + 2].mean())
+
+
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_joints_on_the_border_of_a_part_of_the_picture_say_nothing(seen, five_cameras, share):
-    height = np.quantile(seen.xy[seen.view == 2, 1], 1 - share)
-    found, below = on_the_line(seen, 2, float(height))
-    np.testing.assert_array_equal(clipped(found, five_cameras), below)
+    found, below = on_the_line(seen, 2, between(seen.xy[seen.view == 2, 1], share))
+    np.testing.assert_array_equal(clipped(found, five_cameras)[seen.view == 2], below[seen.view == 2])
 
 
 def test_joints_on_the_edge_of_the_picture_say_nothing_even_alone(seen, five_cameras):
@@ -78,10 +85,11 @@ def test_the_border_is_one_of_the_picture_as_the_lens_gives_it(seen, five_camera
     cameras = [replace(each, distortion=np.array([-0.2, 0.05, 0.0, 0.0, 0.0])) for each in five_cameras.cameras]
     rig = Rig(tuple(cameras), five_cameras.up)
     raw = np.stack([cameras[v].distort(xy[None])[0] for v, xy in zip(seen.view, seen.xy, strict=True)])
-    height = float(np.quantile(raw[seen.view == 2, 1], 0.6))
-    cut, below = on_the_line(replace(seen, xy=raw), 2, height)
+    cut, below = on_the_line(replace(seen, xy=raw), 2, between(raw[seen.view == 2, 1], 0.4))
     straight = np.stack([cameras[v].undistort(xy[None])[0] for v, xy in zip(cut.view, cut.xy, strict=True)])
-    np.testing.assert_array_equal(clipped(replace(cut, xy=straight), rig), below)
+    # Of this view: in another the two highest of a hundred joints may be equally high by chance.
+    found = clipped(replace(cut, xy=straight), rig)
+    np.testing.assert_array_equal(found[cut.view == 2], below[cut.view == 2])
 
 
 def test_a_detector_that_rounds_to_a_grid_has_no_such_line(seen, five_cameras):

@@ -22,6 +22,7 @@ from tests.setup_check.spoiled_setups import (
     delayed,
     exchanged,
     inverted,
+    lasting,
     listed_twice,
     resized,
     same_pose,
@@ -56,12 +57,13 @@ def test_nothing_is_said_where_nothing_is_wrong(recording, room):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("views", [[0, 1], [0, 2, 3], [0, 1, 2, 4]])
+@pytest.mark.parametrize("views", [[0, 1], [0, 1, 2, 4]])
 def test_nothing_is_said_of_fewer_cameras(recording, room, views):
     assert diagnose(*some_cameras(recording, room, views)).findings == ()
 
 
-@pytest.mark.parametrize("degrees", [5, *slow(1, 30, 180)])
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [1, 5, 180])
 def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     found = only_finding(recording, turned(room, 2, degrees, np.array([0.3, 1.0, 0.2])))
     # A degree is hardly told from a shift of the principal point, and the sentence says both.
@@ -71,7 +73,7 @@ def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frames", [10, *slow(3, 6, -8, 15)])
+@pytest.mark.parametrize("frames", [3, -8, 15])
 def test_a_late_camera_is_named_with_its_frames(recording, room, frames):
     found = only_finding(delayed(recording, 1, frames), room)
     assert (found.kind, found.cameras) == (Kind.LATE, (1,))
@@ -92,19 +94,53 @@ def test_mistakes_of_one_camera_are_told_apart(recording, room):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("right", "down"), [(0.08, 0.0), *slow((0.0, 0.05), (-0.07, 0.07))])
+@pytest.mark.parametrize(("right", "down"), [(0.08, 0.0), (-0.07, 0.07)])
 def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, down):
-    shift = right, down
-    diagnosis = diagnose(biased(recording, room, 2, people, 1, shift), room)
+    bias = np.zeros((3, 25, 5, 2))
+    bias[1, :, 2] = right, down
+    diagnosis = diagnose(biased(recording, room, people, bias), room)
     assert diagnosis.findings == ()
     (noted,) = diagnosis.biased
     assert noted.cameras == (2,)
     # Parts of a size that is spread, not height; the prior takes a little.
-    assert noted.amount == pytest.approx(np.hypot(*shift), rel=0.25)
+    assert noted.amount == pytest.approx(np.hypot(right, down), rel=0.25)
+
+
+@pytest.mark.parametrize("of", ["joint", *slow("person and joint", "one view", "size")])
+@pytest.mark.parametrize("largest", [0.12, *slow(0.04)])
+def test_a_detector_s_biases_accuse_no_camera(recording, room, people, of, largest):
+    """Of 2 % of the size or more, by joint and view: a joint is always seen beside where it is."""
+    shape, rng = (3, 25, 5), np.random.default_rng(0)
+    bias, larger = np.zeros((*shape, 2)), np.zeros((3, 1, 5, 1))
+    if of == "joint":
+        bias += lasting(rng, 0.02, largest, *shape[1:])
+    elif of == "person and joint":
+        bias += lasting(rng, 0.02, largest, *shape)
+    elif of == "one view":
+        bias[:, :, 2] = lasting(rng, 0.02, largest, 25)
+    else:
+        larger = rng.uniform(-largest, largest, larger.shape)
+    assert diagnose(biased(recording, room, people, bias, larger), room).findings == ()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pixels", [100.0, *slow(25.0)])
+def test_real_detectors_accuse_no_camera(shared_data, shared_cases):
+    """Cameras that a board, or their own program, calibrated well."""
+    case, pizza, single = (
+        shared_cases / "caliscope_person",
+        shared_data / "pizza_video",
+        shared_data / "pose2sim_single",
+    )
+    for rig, seen in (
+        (read_rig(case / "camera_array_aniposelib_4cam.toml", up="x"), case / "detections"),
+        (read_rig(pizza / "calibration.json"), pizza / "detections"),
+        (read_rig(single / "Calib.qca.txt"), single / "openpose"),
+    ):
+        assert diagnose(read_detections(seen, rig), rig).findings == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixels", [100.0, 25.0])
 def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, pixels):
     found = only_finding(recording, shifted(room, 3, pixels, 0.0))
     assert (found.kind, found.cameras) == (Kind.PRINCIPAL_POINT, (3,))
@@ -112,7 +148,7 @@ def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of", ["turned", *slow("shifted")])
+@pytest.mark.parametrize("of", ["turned", "shifted"])
 def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recording, room, of):
     # 0.6 degrees are 10 px here. A turn sideways is a shift of the picture, but for its perspective.
     rig = turned(room, 2, 0.6, np.array([0.0, 1.0, 0.0])) if of == "turned" else shifted(room, 2, 10.0, 0.0)
@@ -180,7 +216,7 @@ def test_mistakes_of_all_cameras_are_named(recording, room):
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(0.001, "in m, and was read as mm"), (100, "in cm, and was read as m")]
+    ("factor", "words"), [(0.001, "in m, and was read as mm"), *slow((100, "in cm, and was read as m"))]
 )
 def test_a_wrong_unit_is_named(recording, room, factor, words):
     rig = scaled(room, factor)
@@ -189,12 +225,14 @@ def test_a_wrong_unit_is_named(recording, room, factor, words):
     assert words in sentence(found, rig)
 
 
-@pytest.mark.parametrize("axis", ["-z", "y", "-x"])
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", ["y", "-z"])
 def test_a_wrong_up_axis_is_named(recording, room, axis):
     found = only_finding(recording, Rig(room.cameras, axis))
     assert (found.kind, found.axis) == (Kind.UP, "z")
 
 
+@pytest.mark.slow
 def test_cameras_that_see_nobody_are_named(recording, room):
     blind = Recording(BODY_25, [recording[t].only(recording[t].view != 1) for t in range(len(recording))])
     found = only_finding(blind, room)
@@ -265,21 +303,14 @@ def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
     assert len(wanted) == 0
 
 
-@pytest.mark.slow
-def test_pose2sim_s_recording_has_what_is_wrong_with_it(shared_data):
-    folder = shared_data / "pose2sim_single"
-    rig = read_rig(folder / "Calib.qca.txt")
-    findings = diagnose(read_detections(folder / "openpose", rig), rig).findings
-    assert [each.kind for each in findings] == [Kind.PRINCIPAL_POINT]
-
-
 def test_groups_of_frames_below_zero_are_those_of_any_others():
     frame, worth = np.array([-3, 2, -3, 2, 7]), np.array([2.0, 1.0, 1.0, 3.0, 0.0])
     np.testing.assert_array_equal(least_of_each(frame, worth), [2, 1, 4])
     np.testing.assert_array_equal(least_of_each(frame + 3, worth), [2, 1, 4])
 
 
-@pytest.mark.parametrize("part", [0.4, 0.5, 0.6])
+@pytest.mark.slow
+@pytest.mark.parametrize("part", [0.4, 0.6])
 def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part):
     """Joints of 0.7 to 1 m tall people fit children, and adults in a rig that is too small: both are said."""
     report = check_setup(look_at(room, people * part), room)
@@ -290,10 +321,12 @@ def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part)
     )
 
 
+@pytest.mark.slow
 def test_adults_are_not_taken_for_children(recording, room):
     assert check_setup(recording, room).notes == ()
 
 
-@pytest.mark.parametrize("factor", [0.1, 0.2, 2.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.1, 2.0])
 def test_lengths_of_nobody_are_the_calibration_s(recording, room, factor):
     assert only_finding(recording, scaled(room, factor)).kind == Kind.UNIT

@@ -54,6 +54,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
 def test_other_names_are_found_from_how_bodies_look(dance, wrong):
     pairs, said = WRONG[wrong]
@@ -61,6 +62,7 @@ def test_other_names_are_found_from_how_bodies_look(dance, wrong):
     assert said.lower() in words.lower() and "--skeleton" in words
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_the_right_names(dance):
     assert order_findings(dance.recording, dance.scene.rig) == []
 

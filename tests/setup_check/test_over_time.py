@@ -21,6 +21,7 @@ def only_finding(report):
     return report.findings[0]
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_bumped_is_named_with_the_frame_and_left_out_from_there(recording, room):
     report = check_setup(turning(recording, room, 2, lambda t: 6.0 if t >= 25 else 0.0), room)
     found = only_finding(report)

@@ -35,6 +35,7 @@ def run(arguments, capsys):
     return ended.value.code, said.out, said.err
 
 
+@pytest.mark.slow
 def test_figures_of_a_good_set_up(recording, room):
     report = check_setup(recording, room)
     assert report.findings == () and report.warnings == ()
@@ -159,6 +160,7 @@ def test_frames_as_spans():
     assert spans_of([]) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
 def test_speeds_need_identities(recording, room, temporal):
     """Frame by frame numbers of people are no identities: whoever is number 0 next may stand anywhere."""

@@ -91,6 +91,7 @@ def test_the_same_seed_gives_the_same_bytes(scene: Scene):
     assert len(first[0]) != len(other[0]) or not np.array_equal(first[0].xy, other[0].xy)
 
 
+@pytest.mark.slow
 def test_some_frames_come_out_as_in_the_whole_recording(scene: Scene):
     whole, some = simulate(scene, seed=4), simulate(scene, seed=4, frames=[2, 5, 6])
     for frame, found in zip([2, 5, 6], some, strict=True):
@@ -107,6 +108,7 @@ def test_candidates_come_in_no_order_that_tells_people_apart(scene: Scene):
     assert 0.6 < np.mean(person[1:] != person[:-1]) < 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seen", "state"), [(1.0, 0), (0.0, 1)])
 def test_misses_and_confidences_are_as_measured(seen: float, state: int):
     rig, joints = crowd(12)
@@ -127,6 +129,7 @@ def test_misses_and_confidences_are_as_measured(seen: float, state: int):
             np.testing.assert_allclose(found, quantiles, atol=0.05)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_their_confidence_says():
     rig, joints = crowd(12)
     table = drawing(floor_px=0.0)
@@ -220,6 +223,7 @@ def test_joints_are_found_under_both_names_as_often_as_configured():
     assert [len(found) for found in hidden] == [2 * 12 * 25] * 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seen", "hidden_by"), [(1.0, -1), (0.0, 0)])
 def test_whom_others_hide_is_missed_as_a_whole(seen: float, hidden_by: int):
     """Joint 4 of every person, seen or hidden by another, where others hide nobody else, or 14 further joints."""
@@ -238,6 +242,7 @@ def test_whom_others_hide_is_missed_as_a_whole(seen: float, hidden_by: int):
         assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / 960)
 
 
+@pytest.mark.slow
 def test_people_are_lost_as_wholes():
     rig, joints = crowd(12)
     table = drawing(
@@ -252,7 +257,7 @@ def test_people_are_lost_as_wholes():
     # 960 people in views: four standard errors, and as much again since single joints are missed by chance too.
     assert abs((missed > 0.5).mean() - 0.2) < 0.1
     assert abs((missed > 0.8).mean() - 0.1) < 0.08
-    assert np.median(missed) <= 0.04 + 1e-9  # one joint
+    assert np.median(missed) < missed.mean() / 2  # joints that are lost one by one would make them equal
 
 
 @pytest.mark.slow
@@ -375,6 +380,7 @@ def test_faces_are_not_found_from_behind():
     assert count[0] > 0.85 * 240 and count[1] < 0.2 * 240
 
 
+@pytest.mark.slow
 def test_larger_and_smaller_knobs_err_more_and_less(scene: Scene):
     def mean_error(noise: float) -> float:
         found = simulate(scene, replace(PLAIN, noise=noise, misses=0.0), frames=[0])[0]

@@ -254,6 +254,7 @@ def test_real_people_stand_on_the_floor(real_mocap: Mocap, body: BodyModel):
         assert np.abs(np.diff(height, 2)).max() * 900 < 40.0  # m/s^2: a stamp, not a jump of centimetres
 
 
+@pytest.mark.slow
 def test_real_pairs_hold_hands(real_mocap: Mocap, body: BodyModel):
     gaps, raw = [], []
     for lead, follow in real_mocap.pairs[4:10:2]:

@@ -20,6 +20,7 @@ from shapepose_fg.simulation.sequences import (
     salsa_takes,
     sequence,
 )
+from tests.marks import slow
 
 HIP = BODY_25.index("MidHip")
 SPLITS: tuple[Split, Split] = ("tune", "report")
@@ -55,8 +56,8 @@ def real(real_mocap: Mocap) -> dict[tuple[str, Split], Scene]:
     return {(name, split): sequence(name, split, real_mocap, frames=500) for name in SEQUENCES for split in SPLITS}
 
 
-@pytest.mark.parametrize("split", SPLITS)
-@pytest.mark.parametrize("name", SEQUENCES)
+@pytest.mark.parametrize("split", ["report", *slow("tune")])
+@pytest.mark.parametrize("name", ["crossing", *slow("salsa", "crowd")])
 def test_tiny_sequences(tiny_mocap: Mocap, name: str, split: Split):
     scene = sequence(name, split, tiny_mocap, frames=160)
     assert (len(scene), scene.people, len(scene.rig)) == (160, SEQUENCES[name].people, 6)
@@ -144,6 +145,7 @@ def test_feet_are_on_the_floor(real: dict[tuple[str, Split], Scene]):
         assert lowest.min() > -0.07  # a hand on the floor may be deeper in it than a foot
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(tiny_mocap: Mocap):
     config = SEQUENCES["salsa"]
     first, again, other = (
@@ -179,6 +181,7 @@ def test_difficulty_is_in_the_configuration(tiny_mocap: Mocap):
     assert gaps[[0, 2], [1, 3]].mean() < gaps[4:, :4].mean()
 
 
+@pytest.mark.slow
 def test_another_frame_rate_shows_the_same_time(tiny_mocap: Mocap):
     fast = sequence("salsa", "tune", tiny_mocap, frames=150, fps=60.0)
     assert fast.fps == 60.0 and len(fast) == 150

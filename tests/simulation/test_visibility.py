@@ -109,6 +109,7 @@ def test_it_decides_as_rays_through_the_whole_mesh_do(scene: Scene):
     assert np.mean(wrong_quick) <= 0.08
 
 
+@pytest.mark.slow
 def test_the_coarse_surface_decides_as_the_full_one_does(scene: Scene):
     differs, share = [], []
     for frame in (0, 2, 5):

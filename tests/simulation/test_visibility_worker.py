@@ -50,6 +50,7 @@ def test_workers_and_the_choice_of_frames_change_no_byte(scene: Scene):
     assert not same_bytes(alone[0], alone[1])  # or the comparison would say nothing
 
 
+@pytest.mark.slow
 def test_scenes_with_nobody_and_without_frames_need_no_special_care():
     empty = built_in_scene(0, people=0, cameras=2, frames=2)
     alone, helped = simulate(empty), simulate(empty, workers=2)
@@ -84,6 +85,7 @@ def test_an_error_in_a_worker_is_raised_here(worker: VisibilityWorker, people: l
     assert multiprocessing.active_children() == []
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_no_endless_wait(worker: VisibilityWorker, people: list[FramePeople]):
     with closing(worker.all(people * 9, 2)) as seen:
         next(seen)

@@ -75,6 +75,7 @@ def test_nobody_gets_what_is_too_far_away(five_cameras, two_people, seen_exactly
     assert (nothing < 0).all()
 
 
+@pytest.mark.slow
 def test_a_wrist_a_metre_from_its_elbow_is_torn_and_its_neighbours_are_not(two_people):
     places = two_people.copy()
     places[0, WRIST] += 1.0

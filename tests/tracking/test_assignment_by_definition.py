@@ -149,7 +149,7 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
 ):
     """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
     monkeypatch.setattr(view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6))
-    settle(passes=1, overlap_m=0.3, reach_m=0.4)
+    settle(passes=1, overlap_m=0.6, farthest_m=0.6)
     sight = Sight.of(crowded, five_cameras, BODY_25)
     chosen, probability = view_assignment.assign_with_probability(predicted, sight)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))

@@ -48,6 +48,8 @@ def test_joints_are_drawn_where_the_lens_shows_them(scene, scale):
     camera = bent(scene.rig.cameras[0])
     view = view_of(camera, (round(camera.image_size[0] * scale), round(camera.image_size[1] * scale)))
     joints = scene.keypoints[0, :1].copy()  # a second person's bones may cross the first's joints
+    hip = (np.linalg.inv(camera.wTc) @ np.append(joints[0, 8], 1.0))[:3]
+    joints += (0.3 * hip[2] - hip[0]) * camera.wTc[:3, 0]  # half-way to the right border, where the lens bends
     joints[0, 4] = np.nan
     drawn = grey(view)
     draw_skeletons(drawn, view, skeletons(joints))

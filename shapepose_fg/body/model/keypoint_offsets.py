@@ -148,12 +148,19 @@ class KeypointOffsets:
             np.array([[_number(value) for value in row["xyz_mm"]] for row in rows]) / 1e3,
             np.array([_number(row["sigma_mm"]) for row in rows]) / 1e3,
             np.array([int(_number(row["count"])) for row in rows]),
-            np.array([SMPL_24.index(row["bone"]) for row in rows]),
+            np.array([_bone(row["bone"]) for row in rows]),
         )
+
+
+def _bone(name: object) -> int:
+    """The place of a joint of SMPL; ValueError for anything else."""
+    if name not in SMPL_24:
+        raise ValueError(f"{name!r:.80} is no joint of SMPL")
+    return SMPL_24.index(str(name))
 
 
 def _number(value: object) -> float:
     """A finite JSON number as float; ValueError for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{value!r} is not a number")
+        raise ValueError(f"{value!r:.80} is not a number")
     return float(value)

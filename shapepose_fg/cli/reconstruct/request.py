@@ -165,9 +165,11 @@ def prepare(request: Request, output: Path | None, tell: Callable[[str], None] =
         listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
         raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
     check_fps(request.fps)
+    if request.synchronise and request.timestamps is not None:
+        raise InputError("--synchronise and --timestamps: when frames were taken is sought, or known; give one")
     request = replace(request, timestamps=times_beside(detections, request.fps, request.timestamps))
-    if request.synchronise and (request.fps is None or request.timestamps is not None):
-        raise InputError("--synchronise: needs --fps, the rate of all cameras, and no times of frames")
+    if request.synchronise and request.fps is None and request.timestamps is None:
+        raise InputError("--fps: missing; say how many frames a second the cameras took")
     if request.frames is not None:
         ends(request.frames)
     return Prepared(request, project, calibration, detections, output)

@@ -115,7 +115,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
     the results; those that are there already where they are `kept`, of a run that goes on.
     """
     asked, file = known.request, known.output / CLOCKS
-    if not asked.synchronise or asked.fps is None:
+    if not asked.synchronise:
         return known
     if not (kept and file.is_file()):
         rig = asked.still_rig("--synchronise")
@@ -191,6 +191,7 @@ class _Run:
         task, asked, skeleton = self.task, self.known.request, self.recording.skeleton
         frames, times, cuts = task.whole()
         return {
+            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "inputs": self.inputs,
             "configuration": asdict(task.config),
             "frames": [frames.start, frames.stop],
@@ -201,7 +202,6 @@ class _Run:
             "body": None if asked.body is None else str(asked.body),
             "shapes": None if asked.shapes is None else str(asked.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
-            "cameras": _digest(asdict(replace(task.rig, notes=()))),
             "versions": versions(),
             "program": program_digest(),
         }

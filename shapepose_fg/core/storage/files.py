@@ -129,7 +129,7 @@ def read_json(path: Path, *, most: int = LARGE) -> Any:
     return parse_json(read_text(path, most=most), path)
 
 
-def parse_json(text: str, path: Path) -> Any:
+def parse_json(text: str, path: Path | str) -> Any:
     """The same of text that is from the file at `path`."""
     try:
         value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
@@ -147,7 +147,7 @@ def not_text(path: Path, byte: int) -> InputError:
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
 
 
-def not_json(path: Path, line: int, column: int, problem: str, *, rest: str | None) -> InputError:
+def not_json(path: Path | str, line: int, column: int, problem: str, *, rest: str | None) -> InputError:
     """An error about JSON text, at a line and column from 1; `rest` is the text from there on, if it is known."""
     cut = rest is not None and (problem.startswith("Unterminated") or _BROKEN_OFF.fullmatch(rest))
     ends = " (the file ends too early)" if cut else ""
@@ -184,7 +184,7 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read as TOML ({error}); write the file again") from None
 
 
-def bounded(value: Any, path: Path, *, numbers: bool = True) -> Any:
+def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
     """`value`, parsed from `path`, if its lists and objects are not absurdly deep.
 
     With `numbers`, also if its whole numbers have 64 bits: longer ones fit no float and no array, and take the
@@ -289,7 +289,7 @@ def _naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def unique_keys(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]], path: Path | str) -> dict[str, Any]:
     """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
     members: dict[str, Any] = {}
     for key, value in pairs:

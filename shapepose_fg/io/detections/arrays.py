@@ -1,5 +1,6 @@
-"""People in arrays: FreeMoCap's NumPy file of all cameras, SLEAP's analysis HDF5 of each; never a pickle."""
+"""People in arrays: FreeMoCap's NumPy file of all cameras, HDF5 of SLEAP and DeepLabCut; never a pickle."""
 
+import pickletools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -10,21 +11,31 @@ from numpy.lib import format as npy
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
+from shapepose_fg.io.detections.csv_people import body_parts, people_in
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 
-_FREEMOCAP, _SLEAP = "FreeMoCap's 2D points", "SLEAP's analysis HDF5"
+_FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF5", "DeepLabCut's HDF5"
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
 _SMALL_BYTES, _MOST_PACKED = 2**27, 50
 """Bytes of an array of a packed file, small or at the most so many times the file: columns of NaN pack well."""
+_MOST_CAMERAS = 1000
 _MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
+_TABLE, _LONGEST_LIST = "df_with_missing/table", 2**20
+"""Where DeepLabCut and AniPose keep their table, and bytes of the list of its columns."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
 """How HDF5 keeps a text of any length: how long it is, and where."""
 _BLAZEPOSE = 33
 """MediaPipe's points of the body come first; hands and face follow."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_HDF5 = "an HDF5 file, and only SLEAP's analysis files and DeepLabCut's tables are known here; give the CSV"
+_FREEMOCAP_3D = (
+    "FreeMoCap's table of points in 3D, and its 2D points are needed; give the recording's folder, or"
+    " output_data/raw_data/..._pixelXY.npy in it"
+)
 _OTHERS = {
     ".npy": "a NumPy array, and only FreeMoCap's of (cameras, frames, points, 2 or 3) pixels is known here",
     ".npz": "a NumPy archive, which has no layout of its own",
@@ -32,18 +43,20 @@ _OTHERS = {
     ".pkl": "a Python pickle, which could run code and is not opened",
     ".pickle": "a Python pickle, which could run code and is not opened",
     ".slp": "a SLEAP project; export the analysis HDF5: sio export FILE.slp -o FILE.h5",
-    ".h5": "an HDF5 file, and only SLEAP's analysis files are known here; of DeepLabCut or AniPose give the CSV"
-    " (deeplabcut.analyze_videos_converth5_to_csv)",
-    ".hdf5": "an HDF5 file, and only SLEAP's analysis files are known here",
+    ".h5": f"{_HDF5} (deeplabcut.analyze_videos_converth5_to_csv)",
+    ".hdf5": _HDF5,
     ".parquet": "a Parquet table, which has no layout of its own",
     ".c3d": "a C3D file of points in 3D, and 2D detections are needed",
+    "_3d_xyz.csv": _FREEMOCAP_3D,
+    "freemocap_data_by_frame.csv": _FREEMOCAP_3D,
     ".trc": "a TRC file of points in 3D, and 2D detections are needed",
 }
 
 
 def what_it_is(path: Path) -> str | None:
     """What a file is that cannot be read, and how to bring its content; None where its ending tells nothing."""
-    if (known := _OTHERS.get(path.suffix.lower())) is None:
+    known = next((what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None)
+    if known is None:
         return None
     cure = "" if ";" in known else "; write what it holds as <camera>.json, COCO's keypoint results"
     return f"{known}{cure}"
@@ -57,8 +70,6 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
     """
     with open_regular(path) as stream:
         shape, dtype, fortran, offset = _header(path, stream)
-        if len(shape) != 4 or shape[3] not in (2, 3) or dtype.kind != "f":
-            raise InputError(f"{path}: holds {dtype} of shape {shape}; {what_it_is(path)}")
         if shape[0] != cameras:
             raise InputError(
                 f"{path}: has {shape[0]} cameras, and {cameras} are wanted; give the calibration of the same"
@@ -89,6 +100,12 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
     return CameraPeople(path, _FREEMOCAP, blocks(), 0, shape[1] - 1, rerun=_RERUN, joints=joints)
 
 
+def cameras_of_freemocap(path: Path) -> list[str]:
+    """Names for the cameras of FreeMoCap's file, by their order. InputError as `read_freemocap`."""
+    with open_regular(path) as stream:
+        return [f"cam_{n}" for n in range(min(_header(path, stream)[0][0], _MOST_CAMERAS))]
+
+
 def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:
     """Shape, type and order of the array in an .npy file, and where its numbers begin."""
     try:
@@ -98,33 +115,99 @@ def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bo
         raise InputError(f"{path}: this is no NumPy array; {what_it_is(path)}") from None
     if dtype.hasobject:
         raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
+    if len(shape) != 4 or shape[3] not in (2, 3) or dtype.kind != "f":
+        raise InputError(f"{path}: holds {dtype} of shape {shape}; {what_it_is(path)}")
     return shape, dtype, fortran, stream.tell()
 
 
-def read_sleap(path: Path) -> CameraPeople:
-    """The people of one camera: each track is one, its nodes are named. InputError naming file and cure."""
+def read_hdf5(path: Path) -> CameraPeople:
+    """The people of one camera, in SLEAP's analysis file or DeepLabCut's table.
+
+    InputError naming file and cure.
+    """
     h5py = optional("h5py", "hdf5")
     with open_regular(path) as stream:
         if stream.read(8) != b"\x89HDF\r\n\x1a\n":
             raise InputError(f"{path}: this is no HDF5 file; {what_it_is(path)}")
     try:
         with h5py.File(path, "r") as file:
-            tracks = _dataset(h5py, file, "tracks")
-            names = _dataset(h5py, file, "node_names")
-            if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
-                raise InputError(f"{path}: {what_it_is(path)}")
-            joints = _names(path, names)
-            xy, score = _numbers(path, tracks), None
-            if (scores := _dataset(h5py, file, "point_scores")) is not None and scores.ndim == 3:
-                score = _numbers(path, scores)
-            occupancy = _dataset(h5py, file, "track_occupancy")
-            if not _frames_first(xy.shape, len(joints), None if occupancy is None else occupancy.shape):
-                xy, score = xy.transpose(3, 0, 2, 1), None if score is None else score.transpose(2, 0, 1)
-            score = np.ones(xy.shape[:3]) if score is None else score
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError) as error:
+            table = _dataset(h5py, file, _TABLE)
+            return _sleap(path, h5py, file) if table is None else _deeplabcut(path, table)
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again") from None
+
+
+def _deeplabcut(path: Path, table: Any) -> CameraPeople:
+    """One person, or each individual, in a table of pandas: a row a frame, columns in one block or several."""
+    names = [name for name in table.dtype.names or () if name.startswith("values_block_")]
+    columns = [row for name in names for row in _list_of_rows(table.attrs, f"{name}_kind")]
+    known = table.ndim == 1 and not table.dtype.hasobject and "index" in (table.dtype.names or ())
+    if not known or any(len(row) not in (3, 4) for row in columns):
+        raise InputError(f"{path}: {what_it_is(path)}")
+    joints, picked = body_parts(path, ((row[1] if len(row) == 4 else "", row[-2], row[-1]) for row in columns))
+    _check_size(path, table.size * table.dtype.itemsize / 8, table.shape)
+    rows = table[:]
+    frame, *blocks = (np.asarray(rows[name]) for name in ("index", *names))
+    values = np.concatenate([np.zeros((len(rows), 1)), *(each.reshape(len(rows), -1) for each in blocks)], axis=1)
+    if (
+        frame.dtype.kind not in "iu"
+        or (np.diff(frame, prepend=-1) <= 0).any()
+        or frame.max(initial=0) >= MOST_FRAME
+    ):
+        raise InputError(f"{path}: frames must be whole numbers that rise; {_RERUN}")
+    if len(rows) == 0 or values.shape[1] != 1 + len(columns):
+        raise InputError(
+            f"{path}: has {len(rows)} frames, and its columns are not those it names; export it again"
+        )
+    row, people = people_in(values.astype(np.float64), picked)
+    first, last = int(frame[0]), int(frame[-1])
+    blocks = iter([PeopleBlock(frame[row].astype(np.intp), people)] if len(row) > 0 else [])
+    return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+
+
+def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
+    """A list of rows of texts, which pandas keeps as a pickle: it is read as text, nothing in it is carried out.
+
+    ValueError where it is anything else.
+    """
+    kind = attributes.get_id(name)
+    if kind.dtype.kind != "S" or kind.shape != () or kind.dtype.itemsize > _LONGEST_LIST:
+        raise ValueError(f"{name} is no plain text")
+    known, rows, row, last = dict[Any, str](), list[list[str]](), list[str](), ""
+    for operation, value, _ in pickletools.genops(bytes(attributes[name])):
+        match operation.name:
+            case "MARK":
+                row = []
+            case "UNICODE" | "STRING" | "GET":
+                last = known[value] if operation.name == "GET" else str(value)
+                row.append(last)
+            case "PUT":
+                known[value] = last
+            case "TUPLE":
+                rows.append(row)
+            case "LIST" | "APPEND" | "STOP":
+                pass
+            case other:
+                raise ValueError(f"{name} is no list of names: {other}")
+    return rows
+
+
+def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
+    """Each track is one person, its nodes are named."""
+    tracks = _dataset(h5py, file, "tracks")
+    names = _dataset(h5py, file, "node_names")
+    if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
+        raise InputError(f"{path}: {what_it_is(path)}")
+    joints = _names(path, names)
+    xy, score = _numbers(path, tracks), None
+    if (scores := _dataset(h5py, file, "point_scores")) is not None and scores.ndim == 3:
+        score = _numbers(path, scores)
+    occupancy = _dataset(h5py, file, "track_occupancy")
+    if not _frames_first(xy.shape, len(joints), None if occupancy is None else occupancy.shape):
+        xy, score = xy.transpose(3, 0, 2, 1), None if score is None else score.transpose(2, 0, 1)
+    score = np.ones(xy.shape[:3]) if score is None else score
     if xy.shape[3] != 2 or xy.shape[2] != len(joints) or score.shape != xy.shape[:3]:
         raise InputError(
             f"{path}: tracks are {xy.shape}, and there are {len(joints)} node_names; export it again with SLEAP"
@@ -144,9 +227,11 @@ def read_sleap(path: Path) -> CameraPeople:
 
 def _dataset(h5py: Any, file: Any, name: str) -> Any:
     """A dataset of the file itself: None where there is none, or its numbers are in another file."""
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        return None
-    found = file[name]
+    found = file
+    for part in name.split("/"):
+        if not isinstance(found, h5py.Group) or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+            return None
+        found = found[part]
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
         return None
     return found
@@ -193,6 +278,11 @@ def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...
 
 def _numbers(path: Path, dataset: Any) -> Array:
     """All of a dataset."""
-    if 8 * dataset.size > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size) or dataset.dtype.kind not in "fiu":
-        raise InputError(f"{path}: {dataset.shape} are too many numbers; export a part of the recording")
+    _check_size(path, dataset.size if dataset.dtype.kind in "fiu" else np.inf, dataset.shape)
     return np.asarray(dataset[:], dtype=np.float64)
+
+
+def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
+    """InputError where so many numbers are more than the file can hold."""
+    if 8 * count > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size):
+        raise InputError(f"{path}: {shape} are too many numbers; export a part of the recording")

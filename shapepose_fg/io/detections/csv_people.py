@@ -1,7 +1,7 @@
 """People in CSV: DeepLabCut's and AniPose's of one camera, with three or four header rows; Caliscope's of all."""
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -53,22 +53,9 @@ def read_deeplabcut(path: Path) -> CameraPeople:
             break
     if "bodyparts" not in heads or "coords" not in heads:
         raise InputError(f"{path}: no rows bodyparts and coords under scorer, as DeepLabCut writes them; {_RERUN}")
-    parts, coords = heads["bodyparts"], heads["coords"]
-    count = min(len(parts), len(coords))
+    count = min(len(heads["bodyparts"]), len(heads["coords"]))
     whose = heads.get("individuals", [""] * count)
-    people = dict[str, dict[str, dict[str, int]]]()
-    for column, (one, part, axis) in enumerate(zip(whose, parts, coords, strict=False), start=1):
-        people.setdefault(one, {}).setdefault(part, {})[axis] = column
-    joints = tuple(next(iter(people.values()))) if people else ()
-    # Parts that all animals share, such as corners of the cage, are an individual of other parts.
-    columns = [
-        [[axes.get(name, 0) for name in ("x", "y", "likelihood")] for axes in own.values()]
-        for own in people.values()
-        if tuple(own) == joints
-    ]
-    if len(joints) == 0 or any(0 in axes[:2] for own in columns for axes in own):
-        raise InputError(f"{path}: each body part must have the columns x and y; {_RERUN}")
-    picked = np.array(columns)
+    joints, picked = body_parts(path, zip(whose, heads["bodyparts"], heads["coords"], strict=False))
     width = count + 1
 
     frames, found, first, last = list[Index](), list[Array](), 0, -1
@@ -79,16 +66,46 @@ def read_deeplabcut(path: Path) -> CameraPeople:
             raise InputError(f"{path}: line {line}: frames must rise; {_RERUN}")
         first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
         values = np.array([_numbers(path, line, row, width) for line, row in some])
-        taken = np.where(picked > 0, values[:, picked], 1.0)  # no likelihood: as sure as any
-        seen = np.asarray(np.isfinite(taken).all(axis=3))
-        taken = np.where(seen[..., None], taken, 0.0)
-        row, person = np.nonzero(seen.any(axis=2))
+        row, people = people_in(values, picked)
         frames.append(numbers[row])
-        found.append(taken[row, person])
+        found.append(people)
     if last < 0:
         raise InputError(f"{path}: no frames under the heads; {_RERUN}")
     blocks = (PeopleBlock(*each) for each in zip(frames, found, strict=True) if len(each[0]) > 0)
     return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+
+
+def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tuple[str, ...], Index]:
+    """DeepLabCut's body parts, and (P, J, 3) the columns of x, y and likelihood of each individual, 0 for none.
+
+    `columns` are the individual, part and axis of columns 1, 2, ...
+    """
+    people = dict[str, dict[str, dict[str, int]]]()
+    for column, (one, part, axis) in enumerate(columns, start=1):
+        people.setdefault(one, {}).setdefault(part, {})[axis] = column
+    joints = tuple(next(iter(people.values()))) if people else ()
+    # Parts that all animals share, such as corners of the cage, are an individual of other parts.
+    picked = [
+        [[axes.get(name, 0) for name in ("x", "y", "likelihood")] for axes in own.values()]
+        for own in people.values()
+        if tuple(own) == joints
+    ]
+    if len(joints) == 0 or any(0 in axes[:2] for own in picked for axes in own):
+        raise InputError(f"{path}: each body part must have the columns x and y; {_RERUN}")
+    return joints, np.array(picked)
+
+
+def people_in(values: Array, columns: Index) -> tuple[Index, Array]:
+    """The row of each person who is seen in a table `values` (T, C), and keypoints (N, J, 3), by `body_parts`."""
+    taken = np.where(columns > 0, values[:, columns], 1.0)  # no likelihood: as sure as any
+    seen = np.asarray(np.isfinite(taken).all(axis=3))
+    row, person = np.nonzero(seen.any(axis=2))
+    return row, np.where(seen[..., None], taken, 0.0)[row, person]
+
+
+def cameras_of_caliscope(path: Path) -> list[str]:
+    """Names for the cameras of Caliscope's file. InputError as `read_caliscope`."""
+    return [f"cam_{port}" for port in np.unique(_points(path)[:, 1].astype(np.intp)).tolist()]
 
 
 def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeople:
@@ -96,6 +113,20 @@ def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeo
 
     InputError naming line and cure.
     """
+    table = _points(path)
+    ports = np.unique(table[:, 1].astype(np.intp)).tolist()
+    own = table[table[:, 1] == _port(path, camera, cameras, ports)]
+    own = own[own[:, 2] < _BLAZEPOSE]
+    frame, place = np.unique(own[:, 0].astype(np.intp), return_inverse=True)
+    keypoints = np.zeros((len(frame), _BLAZEPOSE, 3))
+    keypoints[place, own[:, 2].astype(np.intp)] = np.column_stack([own[:, 3:], np.ones(len(own))])
+    first, last = int(table[:, 0].min()), int(table[:, 0].max())
+    blocks = iter([PeopleBlock(frame, keypoints)])
+    return CameraPeople(path, _CALISCOPE, blocks, first, last, rerun=_RERUN, joints="mediapipe")
+
+
+def _points(path: Path) -> Array:
+    """(N, 5) frame, camera, keypoint, x and y of Caliscope's points."""
     rows = _rows(path)
     _, head = next(rows)
     names = [word.strip() for word in head]
@@ -114,19 +145,11 @@ def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeo
             raise InputError(f"{path}: line {line} must hold whole numbers and pixels; export it again")
         parts.append(values)
     table = np.concatenate(parts) if parts else np.zeros((0, 5))
-    ports = np.unique(table[:, 1].astype(np.intp)).tolist()
     if table[:, 2].max(initial=0) > _BLAZEPOSE and not (table[:, 2] == 0).any():
         table = table[:0]
     if len(table) == 0:
         raise InputError(f"{path}: no points of a person's body; track with Caliscope's POSE or HOLISTIC")
-    own = table[table[:, 1] == _port(path, camera, cameras, ports)]
-    own = own[own[:, 2] < _BLAZEPOSE]
-    frame, place = np.unique(own[:, 0].astype(np.intp), return_inverse=True)
-    keypoints = np.zeros((len(frame), _BLAZEPOSE, 3))
-    keypoints[place, own[:, 2].astype(np.intp)] = np.column_stack([own[:, 3:], np.ones(len(own))])
-    first, last = int(table[:, 0].min()), int(table[:, 0].max())
-    blocks = iter([PeopleBlock(frame, keypoints)])
-    return CameraPeople(path, _CALISCOPE, blocks, first, last, rerun=_RERUN, joints="mediapipe")
+    return table
 
 
 def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> int:

@@ -68,6 +68,8 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
 
     InputError where cameras surely fit different ones.
     """
+    from shapepose_fg.body.joint_order import LIKE_A_BODY
+
     chosen: dict[str, CameraPeople] = {}
     usual, fits = layouts[0], list[Array]()
     for each in people:
@@ -84,6 +86,8 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
     fits_of_all = np.concatenate(fits, axis=1)
     best = _sure(fits_of_all)
     if best is None:
+        if fits_of_all.shape[1] > 0 and fits_of_all.mean(axis=1).max() < LIKE_A_BODY:
+            return usual, ", the most usual; people look like those of no layout"
         rivals = [
             each.name for each, fit in zip(layouts, fits_of_all, strict=True) if not _surely(fits_of_all[0] - fit)
         ]

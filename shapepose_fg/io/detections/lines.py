@@ -1,6 +1,5 @@
 """What one camera saw in one picture as a line of JSON: OpenPose's frame, with camera and time beside it."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -46,7 +45,7 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
 
     InputError naming the `place` of a line that is none.
     """
-    line = validated(_Line, parse_json(text.strip(), Path(place)), place, _CURE)
+    line = validated(_Line, parse_json(text.strip(), place), place, _CURE)
     if line.camera in rig.unwanted:
         return None
     people = [one.pose_keypoints_2d for one in line.people]
@@ -75,5 +74,5 @@ def view_of(
         raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; divide them")
     frame = np.zeros(len(flat), dtype=np.intp)
     view = joints_of_people(frame, keypoints, lambda score: np.minimum(score, 1.0), skeleton)
-    seen = undistorted(view, Path(place), rig.cameras[rig.names.index(camera)]).seen
+    seen = undistorted(view, place, rig.cameras[rig.names.index(camera)]).seen
     return camera, seen, float(time_s)

@@ -14,14 +14,21 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections.arrays import read_freemocap, read_sleap, what_it_is
+from shapepose_fg.io.detections.arrays import cameras_of_freemocap, read_freemocap, read_hdf5, what_it_is
 from shapepose_fg.io.detections.association_text import read_association_text
-from shapepose_fg.io.detections.csv_people import is_caliscope, is_deeplabcut, read_caliscope, read_deeplabcut
+from shapepose_fg.io.detections.csv_people import (
+    cameras_of_caliscope,
+    is_caliscope,
+    is_deeplabcut,
+    read_caliscope,
+    read_deeplabcut,
+)
 from shapepose_fg.io.detections.json_people import read_json_people
 from shapepose_fg.io.detections.keypoint_layout import skeleton_of_people
 from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople, candidates_of, score_rule
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.detections.yolo import label_files, read_yolo
+from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000
@@ -48,9 +55,16 @@ JSON = Format(
     lambda place, camera: _read_folder(place, camera),
 )
 CSV = Format("CSV of DeepLabCut and AniPose", ("{}.csv",), lambda place, camera: read_deeplabcut(place))
-HDF5 = Format("SLEAP's analysis HDF5", ("{}.h5", "{}.analysis.h5"), lambda place, camera: read_sleap(place))
-FORMATS = [Format("4D Association's text", ("{}.txt",), read_association_text), JSON, CSV, HDF5]
+HDF5 = Format(
+    "HDF5 of SLEAP, DeepLabCut and AniPose", ("{}.h5", "{}.analysis.h5"), lambda place, camera: read_hdf5(place)
+)
+TEXT = Format("4D Association's text", ("{}.txt",), read_association_text)
+FORMATS = [TEXT, JSON, CSV, HDF5]
 """The first by whose names some camera has a file or folder reads those of all cameras."""
+_FOLDERS = ("detection", "output_data/raw_data", "raw_data")
+"""Where 4D Association and FreeMoCap lay them, in the folder of a recording."""
+_PROGRAM_S = re.compile(r"^(alphapose-)?results_|_results$|_json$|\.analysis$|DLC[_A-Za-z].*")
+"""What programs add to a camera's name, or a video's: what follows DLC has numbers of its own."""
 _FREEMOCAP_FILES = re.compile(r"2dData_numCams_numFrames_numTrackedPoints_pixelXY\.npy$|^mediaPipeData_2d\.npy$")
 
 
@@ -101,15 +115,14 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
     InputError naming the camera that is missing.
     """
     if path.is_file():
-        if (form := _of_all_cameras(path, rig)) is not None:
+        if (form := _of_all_cameras(path, rig.names)) is not None:
             return form, [path] * len(rig), []
         known = what_it_is(path)
         what = "this is a file" if known is None else f"this is {known}"
         raise InputError(f"{path}: {what}; give the folder that holds the detections of all cameras")
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; check the path of the detections")
-    folder = path / "detection" if (path / "detection").is_dir() else path
-    entries = sorted(each for each in folder.iterdir() if not each.name.startswith("."))
+    folder, entries = _entries(path)
     holds = listing([each.name for each in entries])
     for form in FORMATS:
         found = [_named(folder, name, form.names) for name in rig.names]
@@ -123,19 +136,10 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
                 f" {folder} holds {holds}; add them, or choose cameras by --without {missing}"
             )
     # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
-    for form, offered in (
-        (JSON, [each for each in entries if each.is_dir() or each.suffix == ".json"]),
-        (CSV, _unfiltered([each for each in entries if each.suffix == ".csv" and is_deeplabcut(each)])),
-        (HDF5, _unfiltered([each for each in entries if each.suffix in (".h5", ".hdf5")])),
-    ):
-        names = [each.name.removesuffix(each.suffix).removesuffix("_json") for each in offered]
-        # What DeepLabCut adds to a video's name has numbers of its own.
-        names = [re.split(r"DLC[_A-Za-z]", name)[0] for name in names]
+    for form, offered, names in _offered(entries):
         if (told := told_by_parts(folder, rig.names, offered, names)) is not None:
             return form, *told
-    whole = [
-        (form, each) for each in entries if each.is_file() and (form := _of_all_cameras(each, rig)) is not None
-    ]
+    whole = [(form, each) for each in entries if (form := _of_all_cameras(each, rig.names)) is not None]
     if len(whole) == 1:
         form, file = whole[0]
         return form, [file] * len(rig), []
@@ -152,12 +156,64 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
     )
 
 
-def _of_all_cameras(file: Path, rig: Rig) -> Format | None:
+def camera_names(path: Path) -> list[str]:
+    """What cameras are called whose detections are at a place that `read_detections` reads, by files and folders.
+
+    InputError where there are none.
+    """
+    if path.is_file():
+        folder, entries = path.parent, [path]
+    elif path.is_dir():
+        folder, entries = _entries(path)
+    else:
+        raise InputError(f"{path}: there is no such folder; check the path of the detections")
+    for each in entries:
+        if _FREEMOCAP_FILES.search(each.name) is not None:
+            return cameras_of_freemocap(each)
+        if each.suffix == ".csv" and is_caliscope(each):
+            return cameras_of_caliscope(each)
+    for empty in (False, True):
+        for _, places, names in _offered(entries):
+            holds = [
+                empty or each.is_file() or any(each.glob("*.json")) or bool(label_files(each)) for each in places
+            ]
+            if any(holds):
+                return [name for name, there in zip(names, holds, strict=True) if there]
+    holds = listing([each.name for each in entries])
+    cure = "give the folder with a file or folder for each camera"
+    raise InputError(f"{folder}: no detections here, only {holds}; {cure}")
+
+
+def _entries(path: Path) -> tuple[Path, list[Path]]:
+    """The folder of the detections, which programs put into one of that name, and what is in it."""
+    folder = next((each for name in _FOLDERS if (each := path / name).is_dir()), path)
+    return folder, sorted(each for each in folder.iterdir() if not each.name.startswith("."))
+
+
+def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
+    """What may be a camera's in a folder, by format, and what the cameras are called then."""
+    files = [each for each in entries if each.is_file()]
+    folders = [each for each in entries if each.is_dir()]
+    tables = [each for each in files if each.suffix == ".csv" and is_deeplabcut(each)]
+    kinds = (
+        (JSON, folders),
+        (TEXT, [each for each in files if each.suffix == ".txt"]),
+        (JSON, [each for each in files if each.suffix == ".json" and each.name != FOOTAGE]),
+        (CSV, _unfiltered(tables)),
+        (HDF5, _unfiltered([each for each in files if each.suffix in (".h5", ".hdf5")])),
+    )
+    found = []
+    for form, places in kinds:
+        names = [each.stem if each.is_file() else each.name for each in places]
+        found.append((form, places, [_PROGRAM_S.sub("", name) for name in names]))
+    return found
+
+
+def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
     """The format of a file that holds all cameras; None where it is none."""
-    names = rig.names
-    if _FREEMOCAP_FILES.search(file.name) is not None:
+    if file.is_file() and _FREEMOCAP_FILES.search(file.name) is not None:
         return Format("", (), lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)))
-    if file.suffix == ".csv" and is_caliscope(file):
+    if file.is_file() and file.suffix == ".csv" and is_caliscope(file):
         return Format("", (), lambda place, camera: read_caliscope(place, names.index(camera.name), names))
     return None
 

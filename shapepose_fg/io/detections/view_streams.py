@@ -244,7 +244,7 @@ class _LeftOut:
 class _Undistorted:
     """One camera's candidates with the pixels of a camera without distortion, and those that were left out."""
 
-    def __init__(self, source: Path, camera: Camera) -> None:
+    def __init__(self, source: Path | str, camera: Camera) -> None:
         self.source, self.camera = source, camera
         self.reasons = (
             _LeftOut("give detections made on pictures of the calibrated size", _STRAY),
@@ -279,6 +279,6 @@ class _Undistorted:
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
 
 
-def undistorted(view: ViewCandidates, source: Path, camera: Camera) -> ViewCandidates:
+def undistorted(view: ViewCandidates, source: Path | str, camera: Camera) -> ViewCandidates:
     """What one camera saw in pixels of a camera without distortion; joints without a place there are left out."""
     return _Undistorted(source, camera).undistorted(view)

@@ -48,6 +48,8 @@ _WINDOW, _MOST_RECORDS = 2**27, 2**19
 memory: 64 MiB of records of 128 bytes."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
+_LOOK_S = 0.1
+"""Pictures that wait for a pose are looked at so often, by the log's time: each look goes through all poses."""
 _POSES_KEPT_S = 3.0
 """Poses are kept so long: detections that were logged later than what moved find theirs."""
 View = tuple[str, Detections, float, Array | None, Array | None]
@@ -110,6 +112,7 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
     sentence, for a file that is none or holds no detection.
     """
     number, frames, unplaced, begun_s, tidied_s = 0, Frames(), Counter[tuple[str, str]](), math.inf, -math.inf
+    looked_s, left = -math.inf, 0
     waiting = deque[tuple[tuple[str, Detections, float], str]]()
     carrier = {each.name: each.carrier for each in rig.cameras}
 
@@ -143,7 +146,9 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
                     view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
                     goes = carrier[message.camera]
                     waiting.append((view, frame_of(goes) if goes else message.header.frame_id.lstrip("/")))
-            yield from placed(logged_s)
+            if abs(logged_s - looked_s) >= _LOOK_S or len(waiting) > 2 * left + 64:
+                yield from placed(logged_s)
+                looked_s, left = logged_s, len(waiting)
             if logged_s > tidied_s + 1.0:
                 frames.forget(logged_s - _POSES_KEPT_S)
                 tidied_s = logged_s

@@ -145,6 +145,7 @@ def test_a_thinned_skin_is_the_same_body(arrays):
     assert area(arrays.template[kept], faces) == pytest.approx(area(arrays.template, arrays.faces), rel=0.08)
 
 
+@pytest.mark.slow
 def test_view_without_a_viewer_is_one_sentence(copied, capfd):
     pytest.importorskip("rerun")
     assert run("view", copied, "--connect", "nonsense") == 2

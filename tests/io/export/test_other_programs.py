@@ -152,6 +152,7 @@ print(json.dumps({"low": low.tolist(), "high": high.tolist(), "meshes": len(scen
     assert told["meshes"] == 2 and 1.4 < extent[1] < 2.2
 
 
+@pytest.mark.slow
 def test_rerun_has_the_frames_and_their_times(exported, filmed, tmp_path):
     rerun = pytest.importorskip("rerun")
     export_result(exported, [FORMATS["rrd"]], tmp_path)

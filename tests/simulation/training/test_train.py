@@ -114,6 +114,7 @@ def test_training_is_the_same_each_time_and_another_with_another_seed(frame):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_training_and_fits_take_the_same_steps(frame):
     """One is torch and differentiable, the other NumPy."""
     trainer, generator = make_trainer(frame), torch.Generator().manual_seed(3)

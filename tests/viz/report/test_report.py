@@ -264,6 +264,7 @@ def test_the_command_makes_the_page_anew(saved, page, capsys, tmp_path):
         assert words in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_correction_brings_the_page_up_to_date(result, tmp_path, capsys):
     result.save(tmp_path)
     report_of(tmp_path)
