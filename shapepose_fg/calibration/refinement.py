@@ -14,9 +14,10 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.setup_check.diagnosis import build_of, diagnose
-from shapepose_fg.setup_check.findings import Kind
+from shapepose_fg.setup_check.diagnosis import Diagnosis, build_of, diagnose
+from shapepose_fg.setup_check.findings import SURE, Kind
 from shapepose_fg.setup_check.fit import difference
+from shapepose_fg.setup_check.small import Problem
 
 _ROUNDS = 4
 """Times that people are grouped anew under the cameras of the round before."""
@@ -64,11 +65,13 @@ class Refinement:
     """
     stature_m: float = float("nan")
     """Median of the people's statures as their bones say, in the adjusted cameras' metres."""
+    probability: float = 1.0
+    """That the given cameras are off, and not only the detector biased, which frames of the same people share."""
 
     @property
     def better(self) -> bool:
-        """Whether the refined cameras fit people better whom they were not refined by."""
-        return self.after_px < self.before_px
+        """Whether the refined cameras fit people better whom they were not refined by, and no bias explains it."""
+        return self.after_px < self.before_px and self.probability > SURE
 
     @property
     def rig(self) -> Rig:
@@ -114,7 +117,12 @@ class Refinement:
             for view, camera in enumerate(self.given.cameras)
         ]
         held_out = {"before_px": round(self.before_px, 3), "after_px": round(self.after_px, 3)}
-        about = {"better": self.better, "stature_m": round(self.stature_m, 3), "notes": list(self.notes)}
+        about = {
+            "better": self.better,
+            "probability": round(self.probability, 4),
+            "stature_m": round(self.stature_m, 3),
+            "notes": list(self.notes),
+        }
         return {"cameras": cameras, "held_out": held_out, **about}
 
 
@@ -132,7 +140,8 @@ def refine(
     The scale is that of the cameras' places beforehand. InputError where hardly anybody is seen by two cameras.
     """
     freedom = Freedom() if freedom is None else freedom
-    footage, start = Footage.of(detections, rig, times, frames), _found_again(detections, rig, frames)
+    diagnosis = diagnose(detections, rig, frames)
+    footage, start = Footage.of(detections, rig, times, frames), _found_again(diagnosis, rig)
     taken = np.unique(footage.sightings.frame)
     halves = np.array_split(taken, 2)
     spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
@@ -159,12 +168,15 @@ def refine(
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
     stature = build_of(found[0].people.points, detections.skeleton).stature
     notes = tuple(_undetermined(found[0], freedom, counts))
-    return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature)
+    sure = 1.0
+    if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
+        order = [*range(6), 7, 8, 6]  # in which the check has the parameters
+        sure = Problem.of(diagnosis.look).off(freedom.sigmas[order], reference)
+    return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature, sure)
 
 
-def _found_again(detections: DetectionSequence, rig: Rig, frames: range) -> Rig:
+def _found_again(diagnosis: Diagnosis, rig: Rig) -> Rig:
     """The rig with cameras that look somewhere else, by degrees, turned to where they see the others' people."""
-    diagnosis = diagnose(detections, rig, frames)
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
     turned = {view for each in diagnosis.findings if each.kind in kinds for view in each.cameras}
     cameras, found = list(rig.cameras), diagnosis.corrected.views

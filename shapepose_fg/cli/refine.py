@@ -141,8 +141,11 @@ def _words(found: "Refinement", may: FreedomOptions) -> list[str]:
     )
     stays = "the rig as a whole" if may.reference is None else f"camera {may.reference}"
     figures = f"{found.before_px:.1f} px before, {found.after_px:.1f} px after"
+    why = "the people do not fit better"
+    if found.after_px < found.before_px:
+        why = f"a detector's lasting bias explains it as well ({found.probability:.2f} that cameras are off)"
     return [
         f"± is one sigma, as against {stays}; scale: {scale}",
         f"a joint as against the other cameras, on frames that were not used: {figures}",
-        *(["the people do not fit better: the cameras are left as they were"] if not found.better else []),
+        *([f"{why}: the cameras are left as they were"] if not found.better else []),
     ]

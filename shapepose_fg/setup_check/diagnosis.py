@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
@@ -20,22 +20,13 @@ from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
-from shapepose_fg.setup_check.findings import Finding, Kind, one_of
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import (
-    GAIN,
-    GOOD_PAIR,
-    Change,
-    Lag,
-    judged,
-    lag_of,
-    lags,
-    mistake_of_cameras,
-)
+from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted
-from shapepose_fg.setup_check.small import SHIFT, Problem, SmallErrors
+from shapepose_fg.setup_check.small import Problem
 
 _SAME_PX = 0.6
 """Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""
@@ -167,20 +158,8 @@ _CROWD = 8.0
 """With more people in a picture, who hide each other, cameras that do not fit are no mistake of the set-up."""
 MIN_SIGHTINGS = 20
 """With fewer people seen, nothing is said of a camera."""
-_OFF_DEG, _OFF_FOCAL = 0.45, 0.04
-"""Turns and focal lengths that are named where people tell them surely. In simulated recordings without any error
-few come out larger (docs/setup_checks.md)."""
-_SURE, _SIGMAS = 1.2, 2.2
-"""How many sigmas make sure of a turn (the sparse prior shrinks it; a roll needs twice as many: a detector's
-errors left and right of a body look like one), and of a focal length."""
-_MOST_COST = 0.86
-"""Small errors that leave more than this of the residuals' cost are the detector's."""
-_OUTLIER_DEG, _OUTLIER_RATIO = 0.8, 1.5
-"""Where several cameras have small errors, one that is off by so much, and so many times the next, is turned."""
-_NOTABLE_DEG = 0.25
-_LIKELY, _SURE_OF_ONE = 1.0, 0.5
-"""One camera's mistake is named if it is so much likelier than none (the likelihood's logarithm, less its
-price), and of all cameras' mistakes with this probability its own."""
+_LEAST_DEG, _LEAST_FOCAL = 0.25, 0.04
+"""Smaller turns and focal lengths of one camera are not named."""
 _NOBODY = 0.05
 """With fewer people than this for each sighting, cameras see no people in common."""
 _STOPPED = 0.02
@@ -222,20 +201,16 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     rng = np.random.default_rng(0)
-    problem, biased = Problem.of(look), list[Finding]()
-    while len(findings) < _MOST_FINDINGS and (change := _next(look, problem, rng)) is not None:
-        (biased if change.finding.kind == Kind.BIASED else findings).append(change.finding)
+    while len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
+        findings.append(change.finding)
         look = change.look
-        problem = Problem.of(look)
-        if len(biased) == _MOST_BIASED:
-            break
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
         findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
         trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
-        return Diagnosis(tuple(findings), given, look, biased=tuple(biased), trust=trust)
-    small = problem.small_errors()
-    remaining = lags(refined := replace(look, views=small.views))
+        return Diagnosis(tuple(findings), given, look, trust=trust)
+    problem = Problem.of(look)
+    remaining = lags(refined := replace(look, views=problem.relaxed()))
     for _ in range(_MOST_FINDINGS):
         late = [view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset]
         if len(late) == 0:
@@ -244,28 +219,19 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
         before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
         if abs(settled[0].lag[view]) > evidence.most_lag:  # it would run on: chance, and no offset
             break
-        look, problem, small = settled
+        look, problem = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
-        remaining = lags(refined := replace(look, views=small.views))
+        remaining = lags(refined := replace(look, views=problem.relaxed()))
     known = {view for finding in findings for view in finding.cameras}
-    findings += _small_findings(look, problem, small, known)
-    findings += _unfit(look, known)
+    unfit = _unfit(look, known)
+    known |= {view for finding in unfit for view in finding.cameras}
+    small, biased = _small_findings(problem, known)
+    findings += [*(small if look.cameras_used > 2 else []), *unfit]
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
     findings += order or _of_people(build, rig)  # joints that are others say nothing of unit and up
     trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
     return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
-
-
-def _next(look: Look, problem: Problem, rng: np.random.Generator) -> Change | None:
-    """The mistake that explains most: of a camera all the time, or from some time on, or of one person."""
-    camera, bias = mistake_of_cameras(look, rng), problem.bias
-    if bias is None:
-        return camera
-    person = Change(problem.biased, problem.unbiased(look, bias), 0.0, freedom=2)
-    # Of one person alone a bias and a turn look alike, and nobody is accused.
-    more = 0.0 if camera is None else judged(look, camera) - judged(look, person)
-    return person if more <= GAIN / look.view_count else camera
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
@@ -302,20 +268,19 @@ def _nobody(look: Look) -> list[Finding]:
     return [Finding(Kind.NOBODY, (), amount=float(len(look.sightings)))]
 
 
-def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem, SmallErrors]:
-    """The recording with a camera late by about `frames`, and its small errors.
+def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
+    """The recording with a camera late by about `frames`, and its residuals.
 
     People who move mostly one way look as if the camera was turned, so offset and turn are found in turns.
     """
     for _ in range(_LAG_ROUNDS):
         look = look.later(view, frames)
         problem = Problem.of(look)
-        small = problem.small_errors()
-        more = lag_of(replace(look, views=small.views), view, _LAG_NEAR)
+        more = lag_of(replace(look, views=problem.relaxed()), view, _LAG_NEAR)
         frames = more.frames
         if frames == 0 or more.agreement < 0:
             break
-    return look, problem, small
+    return look, problem
 
 
 def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]:
@@ -326,55 +291,28 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
     return [*rest, Finding(Kind.LATE, (view,), total)] if total != 0 else rest
 
 
-def _small_findings(look: Look, problem: Problem, small: SmallErrors, known: set[int]) -> list[Finding]:
-    """Small errors that are worth naming: of one camera, or of several."""
-    (gain, view, _), log = problem.singles[0], np.abs(np.log(small.focal))
-    one = look.cameras_used > 2 and gain > _LIKELY and problem.guilt[view] > _SURE_OF_ONE
-    if one and view not in known:
-        told = problem.causes()
-        found, views = one_of([each for each, _ in told]), told[0][1]
-        large = abs(np.log(found.amount)) > _OFF_FOCAL if found.kind == Kind.FOCAL else found.amount > _NOTABLE_DEG
-        # Where another camera is off without this mistake, several are.
-        if large and (views is look.views or Problem.of(replace(look, views=views)).singles[0][0] < 0):
-            return [found]
-    largest = float(np.hypot(small.shift_deg, small.roll_deg).max())
-    if largest < _OFF_DEG and log.max() < _OFF_FOCAL:
-        return []
-    shifted = problem.small_errors(SHIFT)
-    turned, focal = _off(problem, small, shifted)
-    off = np.flatnonzero(turned | focal)
-    if len(off) == 0:
-        return []
-    # Three cameras cannot tell which of their small errors belong to which.
-    tells_apart = look.cameras_used > 3
-    if shifted.cost > _MOST_COST:
-        return []
-    shift = shifted.shift_deg.copy()
-    shift[list(known)] = 0.0
-    order, findings = np.argsort(-shift, kind="stable"), list[Finding]()
-    first, second = shift[order[:2]]
-    alone = problem.likely(int(order[0])) > 0 and first > _OUTLIER_RATIO * second
-    if tells_apart and first > _OUTLIER_DEG and alone:
-        angle = float(np.hypot(shifted.shift_deg[order[0]], shifted.roll_deg[order[0]]))
-        findings.append(Finding(Kind.TURNED, (int(order[0]),), angle))
-        shift[order[0]] = 0.0
-    rest = np.flatnonzero(shift > _NOTABLE_DEG)
-    if len(rest) == 1:
-        return [*findings, one_of([each for each, _ in problem.kinds(int(rest[0]), 1.0)])]
-    if len(rest) > 0:
-        shifts = tuple((float(x), float(y)) for x, y in shifted.centre_px[rest])
-        findings.append(Finding(Kind.PRINCIPAL_POINT, tuple(rest.tolist()), float(shift.max()), shifts))
-    return findings
-
-
-def _off(problem: Problem, small: SmallErrors, shifted: SmallErrors) -> tuple[Mask, Mask]:
-    """(V,) whether each camera is turned, and whether its focal length is wrong, beyond what people can tell."""
-    shift_sigma, roll_sigma, focal_sigma = problem.sigmas(small.views)
-    roll, log = np.abs(small.roll_deg), np.abs(np.log(small.focal))
-    sure = np.hypot(small.shift_deg / shift_sigma, roll / (2 * roll_sigma)) > _SURE
-    turned = (np.hypot(small.shift_deg, roll) > _OFF_DEG) & sure
-    turned |= (small.shift_deg > _OFF_DEG) & (shifted.cost < _MOST_COST)
-    return turned, (log > _OFF_FOCAL) & (log > _SIGMAS * focal_sigma)
+def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], list[Finding]]:
+    """Small errors of cameras that are surer than no error, and than a detector's bias; and such biases."""
+    biased = list[Finding]()
+    while True:
+        told = [(each.person, each.finding) for each in problem.causes if each.finding is not None]
+        of_cameras = [finding for person, finding in told if person < 0]
+        guilt = sum(each.sure for each in of_cameras)
+        nothing = 1 - sum(finding.sure for _, finding in told)
+        if guilt > SURE * (1 - nothing) or nothing > 1 - SURE or len(biased) == _MOST_BIASED:
+            break
+        (person, bias), camera = next(each for each in told if each[0] >= 0), one_of(of_cameras)
+        instead = tuple(each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE)
+        biased.append(replace(bias, sure=1 - guilt - nothing, instead=instead))
+        problem = replace(problem, biased=(*problem.biased, (person, *bias.cameras)))
+    of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
+    if guilt <= max(SURE * (1 - nothing), nothing) or len(of_cameras) == 0:
+        return [], biased
+    found = one_of(of_cameras)
+    size, least = (
+        (found.amount, _LEAST_DEG) if found.kind != Kind.FOCAL else (abs(np.log(found.amount)), _LEAST_FOCAL)
+    )
+    return ([found] if size > least or found.kind == Kind.MOVED else []), biased
 
 
 def _unfit(look: Look, known: set[int]) -> list[Finding]:
@@ -390,7 +328,7 @@ def _unfit(look: Look, known: set[int]) -> list[Finding]:
         fits = look.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
         return [] if fits else [Finding(Kind.UNFIT, everybody, float(look.scores[0]))]
     bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
-    bad = tuple(view for view in bad if view not in known)
+    bad = tuple(view for view in bad if view not in known and look.beside_biases(view) < _UNFIT)
     return [Finding(Kind.UNFIT, bad, float(look.scores[list(bad)].min()))] if bad else []
 
 

@@ -15,7 +15,18 @@ from shapepose_fg.core.pieces import add_view, project, solved
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
-from shapepose_fg.setup_check.matching import GATE, Groups, Pairs, Sightings, centres_of, median_of
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    Groups,
+    Pairs,
+    Sightings,
+    centres_of,
+    distances,
+    followed,
+    least_of_each,
+    median_of,
+    median_over,
+)
 
 _STEPS = 6
 """Gauss-Newton steps of a robust triangulation; errors fall under a hundredth of a pixel in four."""
@@ -110,8 +121,6 @@ class Structure:
     """(P, V) the person's size in each picture."""
     weight: Array
     """(P, J, V) robust weight of each detection, in 1 / pixels^2 of a unit of its noise; 0 where there is none."""
-    slope: Array
-    """(P, J, V) sum of the squares of each projection's derivatives by the point."""
 
 
 def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]:
@@ -130,14 +139,14 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
     xy, prior = np.ascontiguousarray(xy), np.ascontiguousarray(prior)
     points = np.empty((*prior.shape[:2], 3))
-    miss_px, depth, weight, slope = (np.empty(prior.shape) for _ in range(4))
+    miss_px, depth, weight = (np.empty(prior.shape) for _ in range(3))
     to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ np.linalg.inv(views.K)
     cameras = (views.K @ views.cTw, to_world, centres_of(views))
-    _triangulate(xy, prior, *cameras, steps, points, miss_px, depth, weight, slope)
-    return Structure(points, xy, miss_px, depth, size, weight, slope)
+    _triangulate(xy, prior, *cameras, steps, points, miss_px, depth, weight)
+    return Structure(points, xy, miss_px, depth, size, weight)
 
 
-@kernel("f4 f3 f3 f3 f2 i0 f3 f3 f3 f3 f3")
+@kernel("f4 f3 f3 f3 f2 i0 f3 f3 f3 f3")
 def _triangulate(
     xy: Array,
     prior: Array,
@@ -149,7 +158,6 @@ def _triangulate(
     miss_px: Array,
     depth: Array,
     weight: Array,
-    slope: Array,
 ) -> None:
     """`triangulate` with K [R t] as `cameras` (V, 3, 4), from pixels to rays (V, 3, 3), and `centres` (V, 3)."""
     A, b, x, ray, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -184,17 +192,10 @@ def _triangulate(
                     b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
                 for v in range(views):
                     u, w, z = project(cameras[v], x)
-                    depth[p, j, v], miss_px[p, j, v], slope[p, j, v] = z, math.nan, math.nan
+                    depth[p, j, v], miss_px[p, j, v] = z, math.nan
                     if step < steps:
                         weight[p, j, v] = 0.0
-                    if not z > 0:
-                        continue
-                    slope[p, j, v] = 0.0
-                    for i in range(3):
-                        along_u = cameras[v, 0, i] - u * cameras[v, 2, i]
-                        along_w = cameras[v, 1, i] - w * cameras[v, 2, i]
-                        slope[p, j, v] += (along_u**2 + along_w**2) / z**2
-                    if not prior[p, j, v] > 0:
+                    if not (z > 0 and prior[p, j, v] > 0):
                         continue
                     du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
                     square = du * du + dw * dw
@@ -311,6 +312,22 @@ class Look:
         if self.cameras_used < 3:
             return np.full(self.view_count, self._pair_score)
         return np.array([match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views])
+
+    def beside_biases(self, view: int) -> float:
+        """How well a camera fits the others' people, as `Match.score`, where the detector's errors last."""
+        others, seen, camera = self.others(view), self.seen_by(view), self.camera(view)
+        person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw)
+        near = least_of_each(person, error)
+        near = near[error[near] < 2 * GATE]
+        person, sighting = person[near], sighting[near]
+        at = others.points[person] @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
+        away = (seen.xy[sighting] - at[..., :2] / at[..., 2:]) / seen.size_px[sighting][:, None, None]
+        who = followed(others.frame, others.points)[person]
+        for each in np.unique(who).tolist():
+            away[who == each] -= median_over(away[who == each])
+        miss = np.linalg.norm(away, axis=-1)
+        left = np.maximum(1 - median_of(miss, ~np.isnan(miss)) / GATE, 0.0)
+        return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
 
     @property
     def _pair_score(self) -> float:

@@ -16,7 +16,7 @@ PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centr
 """Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the
 principal point (px), and the logarithm of the focal length."""
 Q = len(PARAMETERS)
-TURN, CENTRE, FOCAL, POSE = [0, 1, 2], [6, 7], [8], [0, 1, 2, 3, 4, 5]
+TURN, MOVE, CENTRE, FOCAL, POSE = [0, 1, 2], [3, 4, 5], [6, 7], [8], [0, 1, 2, 3, 4, 5]
 _MOST_ZOOM = 5.0
 """A step of the focal length's logarithm beyond this is no camera's, and would soon be no number."""
 _TRIES = 40

@@ -10,11 +10,11 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.findings import Finding, Kind, one_of
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
 from shapepose_fg.setup_check.over_time import stories
-from shapepose_fg.setup_check.small import ONE, Problem, named
+from shapepose_fg.setup_check.small import ONE, Problem, named, probable
 
 _AGREEMENT, _LEAST_GAIN, _LIKELY_LAG, _SMALL = 0.12, 0.004, 12.0, 8
 """An offset in time is named if it takes away enough of what people move in it, and 7 mm on average, or if the
@@ -223,7 +223,8 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
         poses += [change for view in (0, 1) for change in _in_mirror(look, view)]
         found += [(change.score - look.total, change) for change in poses]
     best = max((gain for gain, _ in found), default=0.0) + look.total
-    if len(weak) > look.view_count / 2 and best < _EXPLAINED:
+    poor = [view for view in weak if look.beside_biases(view) < GOOD]
+    if len(poor) > look.view_count / 2 and best < _EXPLAINED:
         few = replace(look, evidence=look.evidence.thinned(_FEW))
         found += [
             (change.score - few.total, replace(change, look=replace(change.look, evidence=look.evidence)))
@@ -233,11 +234,16 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     for view in range(look.view_count if look.cameras_used > 2 else 0):
         changes = [Change(finding, after, 0.0, freedom) for finding, after, freedom in stories(look, view, rng)]
         found += [(judged(look, change), change) for change in changes]
-    return None if len(found) == 0 else _likeliest(look, found)
+    return _likeliest(look, found)
 
 
-def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change:
-    """The best of changes and what each is `judged`, with its probability, and what else it may be."""
+def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
+    """The best of changes and what each is `judged`, with its probability, and what else it may be.
+
+    A change that moves a camera must be likelier than a detector's bias, else it is none.
+    """
+    if len(found) == 0:
+        return None
     # All that is seen bears on it: as many independent joints as people and cameras have.
     gains = np.array([gain for gain, _ in found]) * GATE / ERROR
     gains *= look.view_count * max(independent(look.others(view)) for view in range(look.view_count))
@@ -246,17 +252,27 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change:
         replace(change, finding=replace(change.finding, sure=float(weight)))
         for weight, (_, change) in sorted(zip(weights, found, strict=True), key=lambda each: -each[0])
     ]
-    best = changes[0]
+    best, (view, *_) = changes[0], changes[0].finding.cameras
+    if best.look.evidence is not look.evidence or best.look.lag is not look.lag:
+        return replace(best, finding=one_of([each.finding for each in changes]))
     # Which of a camera's parameters are wrong shows in single joints, with the people free.
     rivals = [each for each in changes if each.fitted is not None and each.finding.cameras == best.finding.cameras]
-    if best.fitted is not None:
+    problem = Problem.of(best.look, look.views)
+    if best.fitted is None:
+        of_camera = [problem.as_they_are(best.finding, best.look.views)]
+    else:
         starts = {each.fitted: each.look.views for each in reversed(rivals) if each.fitted is not None}
-        (view,) = best.finding.cameras
-        told = Problem.of(best.look).explained(view, look.views, starts)
-        share = sum(each.finding.sure for each in rivals)
+        of_camera = problem.explained(view, starts)
+    told = probable([problem.as_they_are(None, look.views), *problem.biases(), *of_camera])
+    guilty = [(each.finding, each.views) for each in told if each.finding is not None and each.person < 0]
+    guilt = sum(finding.sure for finding, _ in guilty)
+    if guilt < SURE:
+        return _likeliest(look, [each for each in found if each[1].finding.cameras != best.finding.cameras])
+    if best.fitted is not None:
+        share = sum(each.finding.sure for each in rivals) / guilt
         fitted = [
             replace(best, finding=replace(f, sure=f.sure * share), look=replace(look, views=views))
-            for f, views in told
+            for f, views in guilty
         ]
         changes = fitted + [each for each in changes if each not in rivals]
     return replace(changes[0], finding=one_of([each.finding for each in changes]))

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections, DetectionSequence
@@ -321,3 +322,45 @@ def _medians(rows: Array, median: Array) -> None:
                 rows[n, place] = value
                 count += 1
         median[n] = rows[n, (count - 1) // 2] if count > 0 else math.inf
+
+
+def median_over(values: Array) -> Array:
+    """(...) median over the first axis, without NaN; 0 where there is nothing else."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.isfinite(values).sum(axis=0)
+    middle = [np.take_along_axis(ordered, np.maximum(count - k, 0)[None] // 2, axis=0)[0] for k in (0, 1)]
+    return np.where(count > 0, (middle[0] + middle[1]) / 2, 0.0)
+
+
+_REACH, _FORGOTTEN = 1.4, 40
+"""A person is followed from frame to frame over so many times the spread of the joints (two thirds of a metre),
+and sought for so many frames."""
+
+
+def followed(frame: Index, points: Array) -> Index:
+    """(P,) who people (P, J, 3) at some frames are: each is the nearest of the frame before, if that is near."""
+    middle = _middle(points)
+    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
+    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
+    who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
+    for now in np.unique(frame).tolist():
+        here = np.flatnonzero(frame == now)
+        away = np.linalg.norm(middle[here, None] - middle[last], axis=-1)
+        before, after = least_cost_pairs(np.minimum(np.nan_to_num(away, nan=np.inf), reach).T)
+        near = away[after, before] < reach
+        who[here[after[near]]] = who[last[before[near]]]
+        new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
+        if len(new) == len(lost) == 1:  # the only one who can have come back, after a cut for example
+            who[new], lost = who[lost], lost[:0]
+        else:
+            who[new] = count + np.arange(len(new))
+            count += len(new)
+        gone = lost[frame[lost] > now - _FORGOTTEN]
+        last = np.concatenate([here, gone])
+    return who
+
+
+def _middle(points: Array) -> Array:
+    """(N, n) mean of those `points` (N, J, n) that there are; 0 where there are none."""
+    there = ~np.isnan(points[..., :1])
+    return np.asarray(np.where(there, points, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))

@@ -34,16 +34,11 @@ _SURE = 6.0
 
 def warped(seen: Sightings, camera: Pinhole, turns: Array) -> Sightings:
     """What `camera` would have seen without the `turns` (S, 3), rotation vectors about its own axes."""
-    xy = unturned(seen.xy, camera, turns)
-    return replace(seen, xy=xy, confidence=np.where(np.isnan(xy[..., 0]), 0.0, seen.confidence))
-
-
-def unturned(xy: Array, camera: Pinhole, turns: Array) -> Array:
-    """(S, J, 2) where `camera` would have seen the joints `xy` without the `turns` (S, 3); NaN for behind it."""
     back = camera.K @ exp_so3(-turns) @ np.linalg.inv(camera.K)
-    h = np.einsum("sij,snj->sni", back[:, :, :2], xy) + back[:, None, :, 2]
+    h = np.einsum("sij,snj->sni", back[:, :, :2], seen.xy) + back[:, None, :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(h[..., 2:] > 0, h[..., :2] / h[..., 2:], np.nan)
+        xy = np.where(h[..., 2:] > 0, h[..., :2] / h[..., 2:], np.nan)
+    return replace(seen, xy=xy, confidence=np.where(np.isnan(xy[..., 0]), 0.0, seen.confidence))
 
 
 Way = Callable[[Index], Array]

@@ -17,7 +17,11 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.diagnosis import build_of
+from shapepose_fg.setup_check.evidence import Look, gather
+from shapepose_fg.setup_check.small import Problem
 from tests.calibration.conftest import FPS, disturbed, off_by
+from tests.marks import slow
+from tests.setup_check.spoiled_setups import biased, lasting
 
 TIMES = FrameTimes.from_fps(FPS, 250)
 
@@ -64,6 +68,36 @@ def test_a_sound_rig_stays_within_its_sigma(rig, recording):
     for off, sigma in ((turn, np.degrees(found.adjusted.sigma(TURN))), (move, found.adjusted.sigma(MOVE))):
         assert (off < 3 * sigma).all() and np.median(off / sigma) < 2
     assert abs(found.after_px / found.before_px - 1) < 0.1
+
+
+@pytest.mark.slow
+def test_a_calibration_by_a_board_is_kept_against_a_detector_s_biases(shared_cases, tmp_path, capsys):
+    """One person's lasting biases fit other cameras better, on frames that were not used as well."""
+    case, new = shared_cases / "caliscope_person", tmp_path / "new.toml"
+    base = [
+        "refine-calibration",
+        "--calibration",
+        case / "camera_array_aniposelib_4cam.toml",
+        "--up",
+        "x",
+        "--focal",
+    ]
+    code, out, _ = run([*base, "--detections", case / "detections", "--fps", 30, "--output", new], capsys)
+    assert code == 0 and "the cameras are left as they were" in " ".join(out.split())
+    given, kept = (read_rig(each, up="x") for each in (base[2], new))
+    np.testing.assert_allclose(kept.centres, given.centres, atol=1e-6)
+    np.testing.assert_allclose(kept.K, given.K, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", [0, *slow(1, 2)])
+def test_more_frames_of_the_same_biases_are_no_more_evidence(rig, recording, people, seed):
+    bias = lasting(np.random.default_rng(seed), 0.02, 0.08, 25, 4)[None]
+    seen = biased(recording, rig, people, np.repeat(bias, 3, axis=0))
+    usual = np.array([*Freedom(1.0, 0.02).sigmas[:6], 0.0, 0.0, 0.02])
+    few, many = (gather(seen, frames, 4) for frames in (range(60), range(250)))
+    for evidence in (few, many):
+        assert Problem.of(Look.given(evidence, rig)).off(usual) < 0.5
+    assert Problem.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual) > 0.5
 
 
 @pytest.mark.slow
@@ -125,9 +159,10 @@ def test_two_cameras(rig, recording):
     seen = Recording(recording.skeleton, [each.only(each.view < 2) for each in recording.frames])
     wrong = disturbed(two, 0)
     found = refine(seen, wrong, TIMES, range(250))
-    assert found.better and found.after_px < 3
+    # Of two cameras half of what is wrong shows: here a bias of the detector is no good explanation, but one.
+    assert found.after_px < min(3, found.before_px) and found.probability > 0.5
     # How they look at each other is found; along the line between them they may both turn.
-    assert off_by(found.rig, two)[0].max() < off_by(wrong, two)[0].max()
+    assert off_by(found.adjusted.rig, two)[0].max() < off_by(wrong, two)[0].max()
 
 
 @pytest.mark.slow

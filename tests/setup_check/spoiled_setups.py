@@ -105,17 +105,26 @@ def shifted(rig: Rig, view: int, right_px: float, down_px: float) -> Rig:
 
 
 def biased(
-    detections: DetectionSequence, rig: Rig, view: int, people: Array, person: int, shift: tuple[float, float]
+    detections: DetectionSequence, rig: Rig, people: Array, bias: Array, larger: Array | float = 0.0
 ) -> Recording:
-    """One person of `people` (T, P, J, 3) seen beside where they are by one camera, by parts of their height."""
+    """People (T, P, J, 3) seen beside where they are by `bias` (P, J, V, 2), and `larger` (P, 1, V, 1).
+
+    Both are parts of their height in the picture, and last.
+    """
     frames = []
     for number in range(len(detections)):
-        found, at = detections[number], rig.project(people[number])[0][view]
-        xy, mine = found.xy.copy(), np.flatnonzero(found.view == view)
-        away = np.linalg.norm(at[:, found.joint[mine]] - xy[mine], axis=-1)
-        xy[mine[away.argmin(axis=0) == person]] += np.array(shift) * np.ptp(at[person, :, 1])
-        frames.append(replace(found, xy=xy))
+        found, at = detections[number], np.moveaxis(rig.project(people[number])[0], 0, 2)
+        height = np.ptp(at[..., 1], axis=1)[:, None, :, None]
+        moves = bias * height + larger * (at - at.mean(axis=1, keepdims=True))
+        who = np.linalg.norm(at[:, found.joint, found.view] - found.xy, axis=-1).argmin(axis=0)
+        frames.append(replace(found, xy=found.xy + moves[who, found.joint, found.view]))
     return Recording(detections.skeleton, frames)
+
+
+def lasting(rng: np.random.Generator, low: float, high: float, *shape: int) -> Array:
+    """(*shape, 2) biases in any direction, of such sizes."""
+    angle, size = rng.uniform(0, 2 * np.pi, shape), rng.uniform(low, high, shape)
+    return size[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]) -> Recording:
@@ -134,6 +143,17 @@ def turned(rig: Rig, view: int, degrees: float, axis: Array) -> Rig:
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
     return _changed(rig, (view,), lambda camera: replace(camera, wTc=camera.wTc @ turn))
+
+
+def moved(rig: Rig, view: int, metres: float, way: Array) -> Rig:
+    """One camera moved along `way` (3,) of its own, looking as it did."""
+    by = np.zeros((4, 4))
+
+    def change(camera: Camera) -> Camera:
+        by[:3, 3] = camera.wTc[:3, :3] @ way * metres / np.linalg.norm(way)
+        return replace(camera, wTc=camera.wTc + by)
+
+    return _changed(rig, (view,), change)
 
 
 def exchanged(rig: Rig, first: int, second: int) -> Rig:

@@ -22,6 +22,7 @@ from tests.setup_check.spoiled_setups import (
     delayed,
     exchanged,
     inverted,
+    lasting,
     listed_twice,
     resized,
     same_pose,
@@ -95,13 +96,47 @@ def test_mistakes_of_one_camera_are_told_apart(recording, room):
 @pytest.mark.slow
 @pytest.mark.parametrize(("right", "down"), [(0.08, 0.0), (-0.07, 0.07)])
 def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, down):
-    shift = right, down
-    diagnosis = diagnose(biased(recording, room, 2, people, 1, shift), room)
+    bias = np.zeros((3, 25, 5, 2))
+    bias[1, :, 2] = right, down
+    diagnosis = diagnose(biased(recording, room, people, bias), room)
     assert diagnosis.findings == ()
     (noted,) = diagnosis.biased
     assert noted.cameras == (2,)
     # Parts of a size that is spread, not height; the prior takes a little.
-    assert noted.amount == pytest.approx(np.hypot(*shift), rel=0.25)
+    assert noted.amount == pytest.approx(np.hypot(right, down), rel=0.25)
+
+
+@pytest.mark.parametrize("of", ["joint", *slow("person and joint", "one view", "size")])
+@pytest.mark.parametrize("largest", [0.12, *slow(0.04)])
+def test_a_detector_s_biases_accuse_no_camera(recording, room, people, of, largest):
+    """Of 2 % of the size or more, by joint and view: a joint is always seen beside where it is."""
+    shape, rng = (3, 25, 5), np.random.default_rng(0)
+    bias, larger = np.zeros((*shape, 2)), np.zeros((3, 1, 5, 1))
+    if of == "joint":
+        bias += lasting(rng, 0.02, largest, *shape[1:])
+    elif of == "person and joint":
+        bias += lasting(rng, 0.02, largest, *shape)
+    elif of == "one view":
+        bias[:, :, 2] = lasting(rng, 0.02, largest, 25)
+    else:
+        larger = rng.uniform(-largest, largest, larger.shape)
+    assert diagnose(biased(recording, room, people, bias, larger), room).findings == ()
+
+
+@pytest.mark.slow
+def test_real_detectors_accuse_no_camera(shared_data, shared_cases):
+    """Cameras that a board, or their own program, calibrated well."""
+    case, pizza, single = (
+        shared_cases / "caliscope_person",
+        shared_data / "pizza_video",
+        shared_data / "pose2sim_single",
+    )
+    for rig, seen in (
+        (read_rig(case / "camera_array_aniposelib_4cam.toml", up="x"), case / "detections"),
+        (read_rig(pizza / "calibration.json"), pizza / "detections"),
+        (read_rig(single / "Calib.qca.txt"), single / "openpose"),
+    ):
+        assert diagnose(read_detections(seen, rig), rig).findings == ()
 
 
 @pytest.mark.slow
@@ -266,14 +301,6 @@ def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
             assert each.named_by(diagnose(each.detections, each.rig).findings), each.what
             wanted.pop(each.what)
     assert len(wanted) == 0
-
-
-@pytest.mark.slow
-def test_pose2sim_s_recording_has_what_is_wrong_with_it(shared_data):
-    folder = shared_data / "pose2sim_single"
-    rig = read_rig(folder / "Calib.qca.txt")
-    findings = diagnose(read_detections(folder / "openpose", rig), rig).findings
-    assert [each.kind for each in findings] == [Kind.PRINCIPAL_POINT]
 
 
 def test_groups_of_frames_below_zero_are_those_of_any_others():

@@ -1,0 +1,45 @@
+"""Measure a detector's lasting biases (`shapepose_fg/setup_check/biases.py`) by a recording with good cameras.
+
+    python scripts/measure_biases.py calibration.json detections [--up z]
+
+Prints the sizes under which the residuals are likeliest: of a joint of one person in one view, of whole people's
+shifts and enlargements, of what all people have in common; parts of a person's size.
+"""
+
+import argparse
+from itertools import product
+from pathlib import Path
+
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.detections import read_detections
+from shapepose_fg.setup_check.biases import COMMON
+from shapepose_fg.setup_check.evidence import Look, gather
+from shapepose_fg.setup_check.small import Problem
+
+LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
+RATIOS = (0.3, 1.0, 3.0)
+"""Of shifts and enlargements, over a joint's bias."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("calibration", type=Path)
+    parser.add_argument("detections", type=Path)
+    parser.add_argument("--up", help="the axis that is up, where the calibration does not say it")
+    arguments = parser.parse_args()
+    rig = read_rig(arguments.calibration, up=arguments.up)
+    detections = read_detections(arguments.detections, rig)
+    problem = Problem.of(Look.given(gather(detections, range(len(detections)), len(rig)), rig))
+    found = []
+    for shift, larger in product(RATIOS, RATIOS):
+        marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger)
+        for (level, common), each in zip(product(LEVELS, COMMON), marginals, strict=True):
+            found.append((each.log, level, shift * level, larger * level, common * level))
+    best = max(found)[0]
+    print("log likelihood  joint  shift  enlargement  common")
+    for log, *sizes in sorted(found, reverse=True)[:6]:
+        print(f"{log - best:14.1f}", *(f"{size:8.4f}" for size in sizes))
+
+
+if __name__ == "__main__":
+    main()

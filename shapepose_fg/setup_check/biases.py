@@ -1,0 +1,203 @@
+"""What people say of small changes of cameras, whatever lasting biases the detector has.
+
+A detector may put a joint of a view always beside where it is: by the joint, by person and joint, and it shifts or
+enlarges whole people. Such biases are unknowns with Gaussian priors, and so are the joints' places. They are
+eliminated from the linearised residuals (Schur complements): what remains is information about cameras, and how
+likely the residuals are, for each of several sizes of biases.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Views
+from shapepose_fg.setup_check.evidence import triangulate
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q
+from shapepose_fg.setup_check.matching import median_over
+
+LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
+"""Sigmas of a lasting bias of a joint of a person in a view, parts of the person's size. On four recordings real
+detectors have 0.0025 to 0.02 (scripts/measure_biases.py)."""
+COMMON = (0.1, 1.0, 10.0)
+"""Sigma of a bias that all people have in common over that of one person's."""
+SHIFT, LARGER = 1.0, 3.0
+"""Sigmas of the shift of a whole person, and of the enlargement (a part of 1), over that of a joint; real ones are
+0.3 to 3."""
+_INDEPENDENT = 0.1
+"""Joints of one person, and of frames that follow each other, err alike: of ten detections one is independent."""
+_WEAK = 1e-6
+"""The information that a joint's place has without any view, over what it has: two rays may be parallel."""
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """How likely residuals r = J theta are under one size of the biases: log + g' theta - theta' H theta / 2."""
+
+    H: Array
+    """(C, C) information about cameras' parameters and single people's biases (`Residuals`)."""
+    g: Array
+    """(C,) its vector."""
+    log: float
+    """The likelihood's logarithm where these are 0, up to what all sizes of biases share."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Detections of N people of single frames, J joints, V cameras; P different people, K parts of a recording."""
+
+    xy: Array
+    """(N, J, V, 2) undistorted pixels; 0 where there is none."""
+    weight: Array
+    """(N, J, V) robust weight of each, 1 / pixels^2; 0 where there is none."""
+    size_px: Array
+    """(N, V) the person's size in each picture."""
+    points: Array
+    """(N, J, 3) where the cameras by which people were grouped put the joints."""
+    person: Index
+    """(N,) who each is, 0 to P - 1."""
+    part: Index
+    """(N,) part of the recording, 0 to K - 1: cameras may be turned otherwise in each."""
+
+    @classmethod
+    def of(cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index) -> "Residuals":
+        """Of what is `observed`. Weights are by how far a residual is from its median over the person's frames."""
+        xy, confidence, size = seen
+        scale, lasting = np.nan_to_num(size, nan=1.0)[:, None, :, None], np.zeros_like(xy)
+        for _ in range(4):
+            structure = triangulate(xy - lasting, confidence, size, views, 4)
+            used = (structure.weight > 0) & np.isfinite(structure.miss_px) & (structure.depth > 0)
+            away = (xy - lasting - _seen(structure.points, views)[0]) / scale
+            away[~used] = np.nan
+            for each in range(_count(person)):
+                mine = person == each
+                lasting[mine] += median_over(away[mine]) * scale[mine]
+        used &= used.sum(axis=-1, keepdims=True) >= 2
+        weight = _INDEPENDENT * np.where(used, structure.weight, 0.0)
+        points = np.where(used.any(axis=-1)[..., None], structure.points, 0.0)
+        return cls(np.nan_to_num(xy), weight, scale[:, 0, :, 0], points, person, part)
+
+    @property
+    def parts(self) -> int:
+        """K."""
+        return _count(self.part)
+
+    def camera(self, view: int, which: list[int], share: Array | float = 1.0) -> Array:
+        """(C, n) directions of parameters of a camera (`fit.PARAMETERS`), turns by a `share` (K,) in each part."""
+        V, K = self.size_px.shape[1], self.parts
+        directions = np.zeros((V, Q - 3 + 3 * K, Q))
+        for axis in TURN:
+            directions[view, Q - 3 + axis :: 3, axis] = share
+        directions[view, np.arange(Q - 3), np.arange(3, Q)] = 1.0
+        every = directions.reshape(-1, Q)[:, which]
+        return np.concatenate([every, np.zeros((3 * V * _count(self.person), len(which)))])
+
+    def of_person(self, person: int, view: int) -> Array:
+        """(C, 3) directions of a person's shift right and down, parts of the size, and enlargement in a view."""
+        V, P = self.size_px.shape[1], _count(self.person)
+        directions = np.zeros((P, 3 * V, 3))
+        directions[person, [2 * view, 2 * view + 1, 2 * V + view], [0, 1, 2]] = 1.0
+        cameras = np.zeros((V * (Q - 3 + 3 * self.parts), 3))
+        return np.concatenate([cameras, directions.reshape(-1, 3)])
+
+    def marginals(
+        self, views: Views, levels: Sequence[float] = LEVELS, shift: float = SHIFT, larger: float = LARGER
+    ) -> list[Marginal]:
+        """What is said against the cameras `views`, for each size of biases: `levels`, and in each `COMMON`."""
+        information = self._information(views)
+        return [each for n in levels for each in self._marginals(information, n, shift * n, larger * n)]
+
+    def _rows(self, views: Views) -> Array:
+        """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the enlargement, and residuals.
+
+        All are weighted, and without what moves along with the joint's place.
+        """
+        N, J, V = self.weight.shape
+        points, root = self.points, np.sqrt(self.weight)[..., None, None]
+        for _ in range(3):
+            projected, at, by_point = _seen(points, views)
+            r = (self.xy - projected)[..., None] * root
+            A = (by_point @ views.cTw[:, :, :3] * root).reshape(N, J, 2 * V, 3)
+            H = A.swapaxes(2, 3) @ A
+            H += np.eye(3) * (_WEAK * np.trace(H, axis1=2, axis2=3)[..., None, None] + 1e-300)
+            inverse = np.linalg.inv(H) @ A.swapaxes(2, 3)
+            points = points + (inverse @ r.reshape(N, J, 2 * V, 1))[..., 0]
+        there = self.weight[..., None] > 0
+        middle = np.where(there, self.xy, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        rows, bias = np.zeros((N, J, V, 2, V * (Q + 3) + 1)), V * Q
+        for v in range(V):
+            of_camera = rows[:, :, v, :, v * Q : v * Q + Q]
+            of_camera[..., TURN] = np.cross(at[:, :, v, None], by_point[:, :, v])
+            of_camera[..., MOVE], of_camera[..., CENTRE] = by_point[:, :, v], np.eye(2)
+            of_camera[..., FOCAL] = (projected[:, :, v] - views.K[v, :2, 2])[..., None]
+            rows[:, :, v, :, bias + 2 * v : bias + 2 * v + 2] = np.eye(2) * self.size_px[:, None, v, None, None]
+            rows[:, :, v, :, bias + 2 * V + v] = self.xy[:, :, v] - middle[:, None, v]
+        rows[..., -1:] = self.xy[..., None] - projected[..., None]
+        rows = (rows * root).reshape(N, J, 2 * V, -1)
+        return rows - A @ (inverse @ rows)
+
+    def _information(self, views: Views) -> Array:
+        """(P, J, n, n) squares of the rows of each person's joint, with a turn in each part."""
+        rows, V, J, K = self._rows(views), len(views), self.weight.shape[1], self.parts
+        found = np.zeros((_count(self.person), J, *[V * (Q - 3 + 3 * K) + 3 * V + 1] * 2))
+        for person, part in sorted({*zip(self.person.tolist(), self.part.tolist(), strict=True)}):
+            mine = (
+                rows[(self.person == person) & (self.part == part)].swapaxes(0, 1).reshape(J, -1, rows.shape[-1])
+            )
+            turn, rest = Q - 3 + 3 * part + np.arange(3), np.arange(Q - 3)
+            cameras = (np.arange(V)[:, None] * (Q - 3 + 3 * K) + np.concatenate([turn, rest])).ravel()
+            at = np.concatenate([cameras, V * (Q - 3 + 3 * K) + np.arange(3 * V + 1)])
+            found[person][:, at[:, None], at] += mine.swapaxes(1, 2) @ mine
+        return found
+
+    def _marginals(self, information: Array, level: float, shift: float, larger: float) -> list[Marginal]:
+        """One for each of `COMMON`, of biases with these sigmas."""
+        P, J, _, V = *information.shape[:3], self.size_px.shape[1]
+        C = V * (Q - 3 + 3 * self.parts)
+        # In this order: what people have in common, cameras, single people's shifts and enlargements, residual.
+        common = 2 * V * J
+        total, log = np.zeros((common + C + 3 * V * P + 1, common + C + 3 * V * P + 1)), 0.0
+        prior = np.repeat([shift**-2, larger**-2], [2 * V, V])
+        for person in range(P):
+            own = slice(C, C + 2 * V)
+            of_own = information[person][:, own]
+            known = of_own[:, :, own] + np.eye(2 * V) / level**2
+            left = information[person] - of_own.swapaxes(1, 2) @ np.linalg.solve(known, of_own)
+            log -= 0.5 * float(np.linalg.slogdet(known * level**2)[1].sum())
+            # A joint's bias is the person's own, the shift of the whole person, and what all people have.
+            to = np.zeros((J, information.shape[2], common + C + 3 * V + 1))
+            joints = np.arange(J)[:, None]
+            to[joints, C + np.arange(2 * V), 2 * V * joints + np.arange(2 * V)] = 1.0
+            to[:, np.arange(C), common + np.arange(C)] = 1.0
+            to[:, C + np.arange(3 * V), common + C + np.arange(3 * V)] = 1.0
+            to[:, -1, -1] = 1.0
+            whole = (to.swapaxes(1, 2) @ left @ to).sum(axis=0)
+            shared = slice(common + C, common + C + 3 * V)
+            known = whole[shared, shared] + np.diag(prior)
+            log -= 0.5 * float(np.linalg.slogdet(known / prior)[1])
+            whole -= whole[:, shared] @ np.linalg.solve(known, whole[shared])
+            begin = common + C + 3 * V * person
+            at = np.concatenate([np.arange(common + C), begin + np.arange(3 * V), [len(total) - 1]])
+            total[at[:, None], at] += whole
+        found = []
+        for ratio in COMMON:
+            known = total[:common, :common] + np.eye(common) / (ratio * level) ** 2
+            rest = total[common:, common:] - total[common:, :common] @ np.linalg.solve(
+                known, total[:common, common:]
+            )
+            likely = log - 0.5 * float(np.linalg.slogdet(known * (ratio * level) ** 2)[1] + rest[-1, -1])
+            found.append(Marginal(rest[:-1, :-1], rest[:-1, -1], likely))
+        return found
+
+
+def _count(number: Index) -> int:
+    return int(number.max(initial=-1)) + 1
+
+
+def _seen(points: Array, views: Views) -> tuple[Array, Array, Array]:
+    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and derivatives."""
+    at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
+    at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])
+    xy = np.einsum("vab,njvb->njva", views.K[:, :2], at / at[..., 2:])
+    return xy, at, (views.K[:, :2] - xy[..., None] * views.K[:, None, 2]) / at[..., 2, None, None]
