@@ -59,10 +59,16 @@ def test_what_nothing_determines_is_nan_and_other_chains_are_not():
     np.testing.assert_allclose(states[[0, 2]], 1.0)
 
 
-def window_of(rig, truth, kernel="cauchy", law=CONSTANT_VELOCITY, moving=False):
-    """A person's window of `truth` (T, 25, 3), seen with 3 px of noise, 25 frames a second; (T, 25, V) sigmas."""
+def window_of(rig, truth, kernel="cauchy", law=CONSTANT_VELOCITY, moving=False, same=False):
+    """A person's window of `truth` (T, 25, 3), seen with 3 px of noise, 25 frames a second; (T, 25, V) sigmas.
+
+    `same`: the lost joint has the same noise in every frame.
+    """
     rng, T, V = np.random.default_rng(0), len(truth), len(rig)
-    xy = np.moveaxis(rig.project(truth)[0], 0, 2) + rng.normal(0, 3, (T, 25, V, 2))
+    noise = rng.normal(0, 3, (T, 25, V, 2))
+    if same:
+        noise[:, LOST] = noise[0, LOST]
+    xy = np.moveaxis(rig.project(truth)[0], 0, 2) + noise
     xy[:, 7, 1] += 40.0
     sigmas = rng.uniform(3.0, 8.0, xy.shape[:3])
     seen = Observations(
@@ -77,9 +83,9 @@ def window_of(rig, truth, kernel="cauchy", law=CONSTANT_VELOCITY, moving=False):
 
 
 def test_a_joint_that_one_view_saw_takes_nothing_from_the_others(five_cameras, two_people):
-    """Its depth is not known in any frame, all else is; rays differ by noise: the system is all but singular."""
+    """The system is singular: its ray is one in all frames, and its depth not known in any; all else is."""
     truth = np.tile(two_people[0], (6, 1, 1))
-    window, sigmas = window_of(five_cameras, truth)
+    window, sigmas = window_of(five_cameras, truth, same=True)
     inlier = sigmas > 0
     inlier[:, LOST, 1:] = False
     nothing = Message(np.zeros(truth.shape), np.zeros((*truth.shape, 3)))
@@ -89,10 +95,9 @@ def test_a_joint_that_one_view_saw_takes_nothing_from_the_others(five_cameras, t
     for covariance in (positions, velocities):
         known = np.isfinite(covariance).all(axis=(2, 3))
         assert known[:, np.arange(25) != LOST].all()
-    # Others are known to a centimetre; this one at most to 0.3 m, and it is where it may be.
-    variance = np.trace(positions[:, LOST], axis1=1, axis2=2)
-    squared = np.sum((found - truth)[:, LOST] ** 2, axis=-1)
-    assert not (variance < 0.1).any() and not (squared > 16 * variance).any()
+    # A rounding may leave a variance, of square metres.
+    assert not (np.trace(positions[:, LOST], axis1=1, axis2=2) < 1.0).any()
+    assert np.abs(found[:, LOST] - truth[:, LOST]).max() < 1.0
 
 
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
