@@ -22,6 +22,8 @@ from shapepose_fg.pipeline.pipeline import Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs.manifest import open_run
 from tests.hostile import runs
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def task(dance) -> Iterator[Task]:
@@ -142,7 +144,6 @@ def test_what_has_the_right_digests_and_makes_no_sense_is_refused(parts, task, k
     assert re.search(sentence, text) and file.name in text
 
 
-@pytest.mark.slow
 def test_a_body_whose_shape_is_none_is_refused(task, whole, tmp_path):
     """Found by tests/hostile/fuzz.py: its digests were right."""
     kept = InFolder(shutil.copytree(whole / "parts", tmp_path / "parts"))
@@ -171,7 +172,6 @@ def test_a_pipe_or_a_link_among_the_parts_is_refused_at_once(parts, task, tmp_pa
     assert "a link that leads out of its folder" in refused(parts, task)
 
 
-@pytest.mark.slow
 def test_one_flipped_bit_is_the_same_bytes_or_one_sentence(stopped, task, whole, tmp_path):
     """And the result that is there already stays, whole, until a whole one takes its place."""
     rng, expected = random.Random(0), (whole / "people.npz").read_bytes()
