@@ -51,8 +51,8 @@ class WindowConfig(Settings):
     keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
     """People are followed and solved in frames at most so far apart (keyframes), and carried by motion through
     those between, whose detections are used only where a joint strays from its curve by 3 cm; 0: in every frame.
-    Errors of detectors last longer than a frame, so that little is lost. New people are sought in every third of
-    them, or every 0.1 s where that is longer."""
+    Errors of detectors last longer than a frame, so that little is lost. New people are sought in those that are
+    0.3 s or more apart."""
     again_over_time: RepeatsOrNone = 8
     """How often detections are reassociated around a draft of a window, at the most: it ends when hardly any
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
