@@ -31,12 +31,17 @@ class Detections:
     place: Index = None  # type: ignore[assignment]
     """(D,) the place of each among those of its view in the recording, whatever was left out since; counted here
     where it is not given."""
+    mirrored: Array = None  # type: ignore[assignment]
+    """(D,) how probably each is of the other side of the body (`tracking/sides.py`); 0 where it is not given."""
 
     def __post_init__(self) -> None:
         count = len(self.view)
         if self.place is None:
             object.__setattr__(self, "place", _place_in_view(self.view))
-        shapes = {"view": (count,), "joint": (count,), "xy": (count, 2), "confidence": (count,), "place": (count,)}
+        if self.mirrored is None:
+            object.__setattr__(self, "mirrored", np.zeros(count))
+        names = ("view", "joint", "confidence", "place", "mirrored")
+        shapes = dict[str, tuple[int, ...]].fromkeys(names, (count,)) | {"xy": (count, 2)}
         shapes |= {"pairs": (len(self.affinity), 2), "affinity": (len(self.affinity),)}
         for name, shape in shapes.items():
             if np.shape(getattr(self, name)) != shape:
@@ -97,6 +102,7 @@ class Detections:
             pairs[both],
             self.affinity[both],
             self.place[index],
+            self.mirrored[index],
         )
 
     @classmethod

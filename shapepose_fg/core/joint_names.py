@@ -159,3 +159,12 @@ def keypoint_names(skeleton: Skeleton) -> list[str]:
     if skeleton.keypoints is None:
         return list(skeleton.joints)
     return ["" if joint < 0 else skeleton.joints[joint] for joint in skeleton.keypoints]
+
+
+def mirrored(name: str) -> str:
+    """The joint of the other side of the body, by its name."""
+    for sides in (("left", "right"), ("Left", "Right"), ("L", "R")):
+        for one, other in (sides, sides[::-1]):
+            if name.startswith(one):
+                return other + name.removeprefix(one)
+    return name

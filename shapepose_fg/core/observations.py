@@ -35,6 +35,8 @@ class Observations(Table):
     """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
     probability: Annotated[Array, Column("N J V", missing=1.0)] = _LATER
     """(N, J, V) how probable it is that the observation is this person's; 1 where it is not said."""
+    mirrored: Annotated[Array, Column("N J V", missing=0.0)] = _LATER
+    """(N, J, V) how probably the observation is of the other side of the body; 0 where it is not said."""
     evidence: Annotated[Array, Column("N", missing=np.nan)] = _LATER
     """(N,) what speaks for the person being there at all: over time `tracking/presence.py`, `own_evidence`, frame
     by frame a probability; NaN where it is not said."""
@@ -48,9 +50,10 @@ class Observations(Table):
     def of(cls, candidate: Index, detections: Detections, initial: Array, **others: Any) -> "Observations":
         """The detections `candidate` (N, J, V) of one frame, -1 for none, as observations; with other columns."""
         seen = candidate >= 0
-        xy, confidence = np.zeros((*seen.shape, 2)), np.zeros(seen.shape)
+        xy, (confidence, mirrored) = np.zeros((*seen.shape, 2)), np.zeros((2, *seen.shape))
         xy[seen], confidence[seen] = detections.xy[candidate[seen]], detections.confidence[candidate[seen]]
-        return cls(xy, confidence, initial, candidate=candidate, **others)
+        mirrored[seen] = detections.mirrored[candidate[seen]]
+        return cls(xy, confidence, initial, candidate=candidate, mirrored=mirrored, **others)
 
     @property
     def seen(self) -> Mask:

@@ -90,7 +90,7 @@ def joined(parts: list[Detections]) -> Detections:
     first = np.cumsum([0, *(len(part) for part in parts)])
     columns = {
         name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("view", "joint", "xy", "confidence", "affinity", "place")
+        for name in ("view", "joint", "xy", "confidence", "affinity", "place", "mirrored")
     }
     pairs = np.concatenate([part.pairs + n for part, n in zip(parts, first, strict=False)])
     return replace(parts[0], pairs=pairs, **columns)

@@ -13,6 +13,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.joint_names import mirrored
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
@@ -326,7 +327,7 @@ def _looks_like(
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
     here = np.flatnonzero(people.frame == people.frame[row])
-    alike = np.array([j for j, name in enumerate(names) if name in (names[joint], _mirrored(names[joint]))])
+    alike = np.array([j for j, name in enumerate(names) if name in (names[joint], mirrored(names[joint]))])
     points, covariance = people.joints[here][:, alike], people.covariance[here][:, alike]
     xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(here).project(points))
     away, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
@@ -480,15 +481,6 @@ def _off(view: ViewReason) -> str:
 
 def _cameras(names: Sequence[str]) -> str:
     return f"Camera{'s' if len(names) > 1 else ''} {', '.join(names)}"
-
-
-def _mirrored(name: str) -> str:
-    """The joint of the other side of the body, by its name."""
-    for sides in (("left", "right"), ("Left", "Right"), ("L", "R")):
-        for one, other in (sides, sides[::-1]):
-            if name.startswith(one):
-                return other + name.removeprefix(one)
-    return name
 
 
 def _pair(values: Array) -> tuple[float, float] | None:

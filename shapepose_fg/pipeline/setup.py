@@ -138,7 +138,7 @@ class Setup:
         motion = MotionModel.load(skeleton.joints, config.motion, law)
         scale = BodyScale(longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law)
         find = (sure, hips) if config.temporal else (sure,)
-        told = {"drop": book.drop_in, "search": book.search}
+        told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
         return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
 
 

@@ -105,7 +105,7 @@ class Engine:
         """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
         decided, people = list[Decided](), 0
         for frame in frames:
-            decided.append((frame, alone(self.tracker, frame, people)))
+            decided.append(alone(self.tracker, frame, people))
             people += len(decided[-1][1])
         return Span(tuple(decided), 0, len(decided), alone=True)
 
