@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
@@ -87,7 +87,7 @@ def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> flo
     return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
 
 
-def scaled(rig: Rig, factor: float, fixed: ArrayLike = 0.0) -> Rig:
+def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
     """The rig with all distances from the `fixed` point (3,), by default the origin, `factor` times as large."""
     wTc = rig.wTc
     wTc[:, :3, 3] = fixed + factor * (wTc[:, :3, 3] - fixed)

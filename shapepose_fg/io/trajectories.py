@@ -35,7 +35,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
 
     def heads(line: int, words: list[str]) -> tuple[list[str], bool]:
         header = not is_number(words[0])
-        names = words if header else list(POSE)
+        names = words if header else [*map(str, POSE)]
         _check_columns(path, line, names)
         return names, header
 
