@@ -141,7 +141,7 @@ class Notebook:
         self._notes.seconds[name] = self._notes.seconds.get(name, 0.0) + whole - self._inner
         self._inner = outside + whole
 
-    def torn_off(self) -> Notes:
+    def flush(self) -> Notes:
         """What was noted since the last time, which is forgotten here."""
         notes, self._notes = self._notes, Notes()
         return notes
