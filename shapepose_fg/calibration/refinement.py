@@ -8,6 +8,7 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.levelling import scaled
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
@@ -80,13 +81,7 @@ class Refinement:
 
     def of_stature(self, stature_m: float) -> Rig:
         """The same, farther apart or nearer, so that people have this stature in the median."""
-        factor, middle = stature_m / self.stature_m, self.rig.centres.mean(axis=0)
-        cameras = []
-        for camera in self.rig.cameras:
-            wTc = camera.wTc.copy()
-            wTc[:3, 3] = middle + factor * (wTc[:3, 3] - middle)
-            cameras.append(replace(camera, wTc=wTc))
-        return replace(self.rig, cameras=tuple(cameras))
+        return scaled(self.rig, stature_m / self.stature_m, self.rig.centres.mean(axis=0))
 
     def change(self) -> dict[str, Array]:
         """(V,) how far each camera was adjusted: turn in degrees, move in mm, focal in %, centre in pixels."""

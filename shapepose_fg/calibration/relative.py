@@ -87,8 +87,11 @@ class _Together:
         """Which pairs of tracks (K,) are one person each, the best first, and what that is worth."""
         worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
         order = np.argsort(-worth, kind="stable")
-        kept = np.zeros(len(miss), dtype=np.bool_)
-        _choose(order[worth[order] > 0], self.tracks, *self.alike, kept)
+        kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
+        for n in order[worth[order] > 0].tolist():
+            # Nobody's track is that of two people at once.
+            rival = ((a == a[n]) & self.alike[1][b[n], b]) | ((b == b[n]) & self.alike[0][a[n], a])
+            kept[n] = not (kept & rival).any()
         return kept, float(worth[kept].sum() / max(self.possible, 1))
 
     def joints(self, kept: Mask) -> tuple[Array, Array, Array]:
@@ -274,19 +277,3 @@ def _misses(
             if seen >= MIN_JOINTS:
                 total[h, pair[n]] += miss / seen
                 count[h, pair[n]] += 1
-
-
-@kernel("i1 i2 b2 b2 b1")
-def _choose(order: Index, tracks: Index, same_a: Mask, same_b: Mask, kept: Mask) -> None:
-    """Marks in `kept` (K,) pairs of tracks in `order`, none that gives a track two people at once."""
-    for n in range(len(order)):
-        a, b = tracks[order[n], 0], tracks[order[n], 1]
-        free = True
-        for m in range(n):
-            other = order[m]
-            if kept[other]:
-                c, d = tracks[other, 0], tracks[other, 1]
-                if (a == c and same_b[b, d]) or (b == d and same_a[a, c]):
-                    free = False
-                    break
-        kept[order[n]] = free

@@ -8,7 +8,7 @@ from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, 
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast, get_type_hints
 
 import typer
 
@@ -233,21 +233,23 @@ class ProjectOptions(DetectionOptions):
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
 
+    def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
+        """The options with the places that a project says, and the project; `tell` is given its notes."""
+        if self.project is None:
+            return self, None
+        from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+
+        source = read_pose2sim_project(self.project)
+        tell(*source.notes)
+        calibration, detections = self.calibration or source.calibration, self.detections or source.detections
+        return replace(self, calibration=calibration, detections=detections), source
+
     def located(self) -> Located:
         """Where they are; InputError where that is not said."""
-        calibration, detections, source = self.calibration, self.detections, None
-        if self.project is not None:
-            from shapepose_fg.io.pose2sim_project import read_pose2sim_project
-
-            source = read_pose2sim_project(self.project)
-            note(*source.notes)
-            calibration, detections = calibration or source.calibration, detections or source.detections
-        if calibration is None or detections is None:
-            places = {"--calibration": calibration, "--detections": detections}
-            missing = " and ".join(name for name, place in places.items() if place is None)
-            raise InputError(f"{missing}: missing; give them, or --project with the folder of a Pose2Sim project")
-        given = {each.name: getattr(self, each.name) for each in fields(DetectionOptions)}
-        return Located(**given | {"calibration": calibration, "detections": detections, "source": source})
+        whole, source = self.completed()
+        refuse_missing({"--calibration": whole.calibration, "--detections": whole.detections})
+        given = {each.name: getattr(whole, each.name) for each in fields(DetectionOptions)}
+        return Located(**given, source=source)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,6 +340,14 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
     """How to go on, as a line to copy: `reconstruct` with those options that are given."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def refuse_missing(places: Mapping[str, Path | None]) -> None:
+    """InputError where one of the options, by their names, is not given, and no project says it."""
+    missing = [name for name, place in places.items() if place is None]
+    if missing:
+        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
+        raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
 
 
 def names_of(text: str | None) -> list[str] | None:

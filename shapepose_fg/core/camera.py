@@ -199,6 +199,11 @@ class Rig:
             self, cameras=cameras, dark=dark, doubted=doubted, trajectories=trajectories, unwanted=unwanted
         )
 
+    def at_poses(self, wTc: Array) -> "Rig":
+        """The rig with its cameras at world-from-camera poses (V, 4, 4)."""
+        cameras = (replace(camera, wTc=each) for camera, each in zip(self.cameras, wTc, strict=True))
+        return replace(self, cameras=tuple(cameras))
+
     def without(self, names: Iterable[str]) -> "Rig":
         """A rig with all cameras but those of these names; ValueError where there is no such camera."""
         return self.only(choose(self.names, without=list(names)))
@@ -254,6 +259,11 @@ class Rig:
         """(V, 3, 4) camera-from-world matrices."""
         # The order in memory is that of a copy in another process, so that both round alike.
         return np.ascontiguousarray(np.stack([camera.cTw for camera in self.cameras]))
+
+    @property
+    def wTc(self) -> Array:
+        """(V, 4, 4) poses of the cameras, world from camera; a copy."""
+        return np.stack([camera.wTc for camera in self.cameras])
 
     @cached_property
     def centres(self) -> Array:

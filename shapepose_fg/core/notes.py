@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from shapepose_fg.core.detections import Input
 
@@ -33,10 +33,9 @@ _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Frames = dict[str, list[_Count]]
 
 
-class _Kept(BaseModel):
+class _Kept(BaseModel, extra="forbid"):
     """Notes as plain values."""
 
-    model_config = ConfigDict(extra="forbid")
     frames: _Count
     seconds: dict[str, _Number]
     evidence: dict[_Count, tuple[_Number, Annotated[int, Field(gt=0)]]]

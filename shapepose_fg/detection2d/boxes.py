@@ -7,7 +7,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Real
 from shapepose_fg.core.errors import InputError
@@ -31,10 +31,9 @@ _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
 """Scores over which a box counts, as in rtmlib; the second where suppression is in the network."""
 
 
-class BoxForm(BaseModel):
+class BoxForm(BaseModel, extra="forbid"):
     """How a box network is to be read: the table `boxes` of a network's TOML file."""
 
-    model_config = ConfigDict(extra="forbid")
     network: str = ""
     """Its ONNX file."""
     size: tuple[Side, Side] = (640, 640)

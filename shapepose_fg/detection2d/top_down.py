@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.errors import InputError
@@ -26,10 +26,9 @@ _AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
 """How many axes the outputs of each decoding have."""
 
 
-class KeypointForm(BaseModel):
+class KeypointForm(BaseModel, extra="forbid"):
     """How a network of keypoints is to be read: a TOML file, RTMPose's kind where it says nothing else."""
 
-    model_config = ConfigDict(extra="forbid")
     network: str = ""
     """Its ONNX file."""
     skeleton: str | None = None

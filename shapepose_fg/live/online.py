@@ -29,7 +29,7 @@ from shapepose_fg.live.filtering import Filter
 from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
-from shapepose_fg.live.views import MOST_S, ViewsInStep, joined, with_pose
+from shapepose_fg.live.views import MOST_S, ViewsInStep, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.workers import workers as worker_processes
@@ -452,7 +452,9 @@ class OnlineReconstructor:
             return
         at_s = slot.given.time_s.copy()
         at_s[view] = time_s
-        both = joined([slot.given.detections, thinned(detections, self.rig, self._config.candidates)[0]])
+        both = Detections.joined(
+            [slot.given.detections, thinned(detections, self.rig, self._config.candidates)[0]]
+        )
         dark = tuple(each for each in slot.given.rig.dark if each != view)
         rig = replace(self._state.rig.at(at_s), dark=dark, doubted=slot.given.rig.doubted)
         slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)

@@ -265,7 +265,7 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Bytes of a recording's detections."""
-    known = prepare(entry.request, folder, tell=lambda _: None)
+    known = prepare(entry.request, folder, tell=lambda *_: None)
     asked = known.request
     _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)

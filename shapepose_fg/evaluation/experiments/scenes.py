@@ -76,10 +76,6 @@ class Segment:
         part = np.searchsorted(self.scene.cuts, truth.frame, side="right")
         return replace(truth, person=truth.person + part * (int(truth.person.max(initial=0)) + 1))
 
-    def shorter(self, frames: int) -> "Segment":
-        """Its first so many frames, or all that it has."""
-        return replace(self, span=self.span[:frames])
-
     def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
         """Reconstructed at the scene's rate."""
         scene = self.scene

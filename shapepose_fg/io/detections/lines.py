@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Len
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
@@ -24,13 +24,11 @@ _Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
 _Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
 
 
-class _Person(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+class _Person(BaseModel, strict=True, extra="allow"):
     pose_keypoints_2d: list[float]
 
 
-class _Line(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+class _Line(BaseModel, strict=True, extra="allow"):
     camera: str
     time_s: Annotated[FiniteFloat, Field(ge=-1e12, le=1e12)]
     people: list[_Person]

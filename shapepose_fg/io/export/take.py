@@ -162,9 +162,8 @@ def _moved(rig: Rig, origin: Array) -> Rig:
         shifted[..., :3, 3] -= origin
         return shifted
 
-    cameras = tuple(replace(camera, wTc=local(camera.wTc)) for camera in rig.cameras)
     trajectories = tuple(replace(each, wTb=local(each.wTb)) for each in rig.trajectories)
-    return replace(rig, cameras=cameras, trajectories=trajectories)
+    return replace(rig.at_poses(local(rig.wTc)), trajectories=trajectories)
 
 
 def _check_memory(persons: int, frames: int) -> None:

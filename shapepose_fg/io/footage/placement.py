@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
@@ -155,8 +155,7 @@ class CameraFootage:
 _Size = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
 
 
-class _Camera(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class _Camera(BaseModel, extra="forbid"):
     name: str
     path: str
     placement: PlacementKind
