@@ -29,8 +29,8 @@ RUN_ID = "run_id"
 """What ties them: a digest of all columns of people.npz."""
 T = TypeVar("T", bound=Table)
 _DIGITS = 32
-"""Number of digits of the run's id. The id depends on the people alone, so that an interrupted run that was resumed
-writes the same bytes as one that was not interrupted."""
+"""Number of digits of the run's id. The id depends on the people alone, so that an interrupted run that was
+resumed writes the same bytes as one that was not interrupted."""
 
 
 def results_folder(results: Path) -> Path:

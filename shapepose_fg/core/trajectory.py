@@ -36,8 +36,8 @@ class Trajectory:
     wTb: Array
     """(F, 4, 4) world from carrier, metres."""
     covariance: Array | None = None
-    """(F, 6, 6) covariance of each pose in the world, rotation before translation along the carrier's own axes, rad²
-    and m² (GTSAM's order); None for an odometry, whose start is known and which drifts."""
+    """(F, 6, 6) covariance of each pose in the world, rotation before translation along the carrier's own axes,
+    rad² and m² (GTSAM's order); None for an odometry, whose start is known and which drifts."""
     drift: float = DRIFT
     """How far an odometry errs after a metre, as a part of it; errors add up like steps of a random walk."""
     refined: bool = False
@@ -117,7 +117,9 @@ class Trajectory:
         return way[:, None, None] * np.diag(sigmas**2)
 
     def _between(self, values: Array, time_s: Array) -> Array:
-        """(M, ...) values (F, ...) interpolated linearly at times (M,), and constant before the first and after the last."""
+        """(M, ...) values (F, ...) interpolated linearly at times (M,), and constant before the first and after
+        the last.
+        """
         before, part = self._place(time_s)
         part = part.reshape(-1, *[1] * (values.ndim - 1))
         return (1 - part) * values[before] + part * values[before + 1]

@@ -75,8 +75,8 @@ class SolvingConfig(Settings):
     """N of Algorithm 1 frame by frame: how often the body is fitted and the joints are solved, at the most. Most
     frames are settled after one or two; the paper has 10."""
     window_alternations: Repeats = 1
-    """N of Algorithm 1 over time, where a window starts from initial estimates: a second round takes twice the time and
-    changed the mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
+    """N of Algorithm 1 over time, where a window starts from initial estimates: a second round takes twice the
+    time and changed the mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
     weight_shape: Factor = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model: less for people whom it does not fit,
     in wide clothes or with a load."""

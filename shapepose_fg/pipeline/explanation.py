@@ -60,9 +60,11 @@ class ViewReason:
     residual_px: tuple[float, float] | None
     """The projection of the joint as reported minus the detection, pixels."""
     off_px: float | None
-    """Distance from the detection to where everything *else* puts the joint, this detection not counted, pixels."""
+    """Distance from the detection to where everything *else* puts the joint, this detection not counted,
+    pixels."""
     off_sigma: float | None
-    """The distance `off_px` in standard deviations of the detection and of where everything else puts the joint."""
+    """The distance `off_px` in standard deviations of the detection and of where everything else puts the
+    joint."""
     share: float
     """Share of the information about the joint that this view gives, 0 to 1."""
     looks_like: str = ""

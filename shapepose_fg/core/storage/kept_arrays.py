@@ -94,10 +94,12 @@ def _mapped(arrays: Arrays) -> Arrays:
 
 
 class InFolder(KeptArrays):
-    """Arrays kept in a folder, one safetensors file per set: the format holds no code and gives single arrays and rows.
+    """Arrays kept in a folder, one safetensors file per set: the format holds no code and gives single arrays and
+    rows.
 
-    A file is on the disk when `keep` returns. It has a digest of each array, and one of these digests, its name and
-    its run: what is read is checked once, and again when the file has changed. InputError names a damaged file.
+    A file is on the disk when `keep` returns. It has a digest of each array, and one of these digests, its name
+    and its run: what is read is checked once, and again when the file has changed. InputError names a damaged
+    file.
     """
 
     lasting = True
