@@ -192,7 +192,9 @@ def bodies_between(
 
 
 def _quaternions(vectors: Array) -> Array:
-    """(B, K, 4) unit quaternions of rotation vectors (B, K, 3), radians; signs are those nearer to the row before."""
+    """(B, K, 4) unit quaternions of rotation vectors (B, K, 3), radians; signs are those nearer to the row
+    before.
+    """
     half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
     found = np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vectors], axis=-1)
     sign = np.sign((found[1:] * found[:-1]).sum(axis=-1, keepdims=True))
