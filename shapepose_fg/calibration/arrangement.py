@@ -31,11 +31,12 @@ class Edge:
     score: float
     """How well what both saw fits (`Relative.score`)."""
     covariance: Array
-    """(6, 6) of bTa, as GTSAM's poses change: in the first camera's frame."""
+    """(6, 6) covariance of bTa as GTSAM's poses change, in the first camera's frame: rotation, rad, then
+    translation, m."""
 
     @classmethod
     def of(cls, pair: Relative, metres: float) -> "Edge":
-        """Of a pair whose cameras are `metres` apart."""
+        """Edge of a pair whose cameras are `metres` apart."""
         bTa = np.eye(4)
         bTa[:3, :3], bTa[:3, 3] = pair.R, metres * pair.t
         way = pair.t / np.linalg.norm(pair.t)

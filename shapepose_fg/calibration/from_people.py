@@ -74,7 +74,8 @@ class Calibrated:
     apart_deg: Array
     """(V,) by how much the turns of halves of the recording differ, each found without the other."""
     apart_m: Array
-    """(V,) the same of the places."""
+    """(V,) distance between the places of each camera as halves of the recording give them, each without the
+    other, metres."""
     held_out_px: float
     """Median distance of a joint from where the other cameras put it, on halves that were not used."""
     counts: Index
@@ -82,7 +83,8 @@ class Calibrated:
     explained: Array
     """(V,) which part of the people that each saw another camera saw too."""
     missed_px: Array
-    """(N, V) the same distances one by one; NaN where unknown."""
+    """(N, V) distances of joints from where the other cameras put them, on halves that were not used, pixels;
+    NaN where unknown."""
     notes: tuple[str, ...] = field(default=())
     """What is weak, a sentence each."""
 

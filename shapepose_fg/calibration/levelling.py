@@ -69,7 +69,7 @@ class World:
     """How a rig was laid on the floor."""
 
     sigma_scale: float
-    """Of the scale, as a part of it, one sigma."""
+    """Standard deviation of the scale, as a share of the scale."""
     stature_m: float
     """Median stature of the people, metres, at this scale."""
     persons: int

@@ -55,7 +55,8 @@ class Refinement:
     """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
     used; given cameras."""
     after_px: float
-    """The same with cameras that were refined by the other half of the recording."""
+    """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
+    used; cameras refined on the other half of the recording."""
     counts: Index
     """(V,) people, one per frame, by whom each camera was adjusted."""
     notes: tuple[str, ...] = field(default=())
@@ -80,7 +81,7 @@ class Refinement:
         return self.adjusted.rig if self.better else self.given
 
     def of_stature(self, stature_m: float) -> Rig:
-        """The same, farther apart or nearer, so that people have this stature in the median."""
+        """Return `rig` scaled so that people have the median stature `stature_m`."""
         return scaled(self.rig, stature_m / self.stature_m, self.rig.centres.mean(axis=0))
 
     def change(self) -> dict[str, Array]:
@@ -95,7 +96,7 @@ class Refinement:
         return {name: np.array(each) for name, each in zip(_UNITS, (turn, move, focal, centre), strict=True)}
 
     def sigma(self) -> dict[str, Array]:
-        """(V,) of the same, in the same units."""
+        """(V,) standard deviations of what `change` gives, in the same units."""
         each = {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
         return each
 

@@ -39,7 +39,8 @@ _FINALISTS = 6
 """Guesses that are refined."""
 _STEPS = 8
 _DILUTION = 25.0
-"""So many errors of joints are one: those of a person at one moment, and of moments that are near each other."""
+"""Number of correlated errors of joints that count as one independent error: those of a person in one frame,
+and in frames that are near each other."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +50,13 @@ class Relative:
     R: Array
     """(3, 3) rotation."""
     t: Array
-    """(3,) of length one."""
+    """(3,) direction of the translation, of length one."""
     score: float
     """How much of what both saw at a time is matched, and how well: 1 if all is without error, 0 if nothing."""
     seconds: float
     """Person-seconds that are matched."""
     covariance: Array
-    """(6, 6) of a small turn w before R, rad, and of a change of t, which has none along t."""
+    """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along t."""
     points: Array
     """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN where not seen by both."""
 
@@ -170,7 +171,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
 
 
 def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Of the four poses that an essential matrix allows, that with most joints in front of both cameras."""
+    """Return that of the four poses of an essential matrix which has most joints in front of both cameras."""
     one, two, t = (np.asarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(E))
     ways = [(R, sign * t[:, 0]) for R, sign in product((one, two), (1.0, -1.0))]
     return max(ways, key=lambda way: int(_meeting(*way, a, b)[1].sum()))

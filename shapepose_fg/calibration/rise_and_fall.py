@@ -114,7 +114,7 @@ class _Rises(NamedTuple):
     """How fast the joints of one camera's tracks rise."""
 
     values: list[Array]
-    """(N, J) of each track, in parts of the person's size a frame, 0 where unknown."""
+    """Speeds (N, J) of each track, in parts of the person's size a frame; 0 where unknown."""
     begins: Index
     """(K,) the number of each track's first sample."""
 

@@ -38,7 +38,7 @@ def option(group: str, text: str, default: Any = None, *names: str, **more: Any)
 
 
 def argument(metavar: str, text: str) -> Any:
-    """The same, given by its place in the line."""
+    """Declare a positional argument of a command."""
     return field(metadata={"typer": typer.Argument(metavar=metavar, help=text)})
 
 
@@ -220,7 +220,7 @@ class Located(DetectionOptions):
         return replace(given, fps=self.source.fps)
 
     def given(self) -> dict[str, object]:
-        """The same for the next command, but for the calibration and what is said of it."""
+        """Options of the next command for the same detections and joints, the calibration left out."""
         if self.source is None:
             return {"--detections": self.detections, "--skeleton": self.skeleton}
         return {"--project": self.source.folder, "--skeleton": self.skeleton}
@@ -303,7 +303,7 @@ class RateOptions(TimeOptions):
         return recording, FrameTimes.assumed(count) if times is None else times, span
 
     def given(self) -> dict[str, object]:
-        """The same options for the next command."""
+        """Options of the next command for the same times and frames."""
         return {"--fps": self.fps, "--timestamps": self.timestamps, "--frames": self.frames}
 
 

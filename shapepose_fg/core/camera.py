@@ -382,7 +382,7 @@ class Views:
 
     @cached_property
     def focal(self) -> Array:
-        """(1, V) or (N, V), as many rows as `projection` has, the same as `focal_px`."""
+        """(1, V) or (N, V) focal lengths as in `focal_px`, with as many rows as `projection` has."""
         return np.array(np.broadcast_to(self.focal_px, self.projection.shape[:2]), order="C")
 
     def rows(self, index: Index) -> "Views":
@@ -406,7 +406,7 @@ class Views:
         return self.project_apart(points[:, :, None])
 
     def project_apart(self, points: Array) -> tuple[Array, Array, Array]:
-        """The same of `points` (N, J, V, 3) that differ from view to view."""
+        """Project `points` (N, J, V, 3) that differ from view to view; returns what `project` returns."""
         K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
         return project_with_jacobian(points, K, cTw)
 

@@ -35,17 +35,17 @@ _Frames = dict[str, list[_Count]]
 
 @dataclass
 class Notes:
-    """Of one window, or of all together."""
+    """Notes about one window, or about a whole run."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     frames: _Count = 0
-    """How many frames it is of."""
+    """Number of frames that the notes are about."""
     seconds: dict[str, _Number] = field(default_factory=dict)
     """Time per stage, over all processes."""
     evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
-    """Of each track the sum of its rows' evidence (`Observations.evidence`), and how many rows that is."""
+    """Sum of the evidence (`Observations.evidence`) of each track's rows, and the number of these rows."""
     probable: dict[str, _Count] = field(default_factory=dict)
-    """Frame by frame how many rows are so probable, by tenths rounded down."""
+    """Number of rows of single frames by their probability, in tenths rounded down."""
     dropped: _Frames = field(default_factory=dict)
     """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
     thinned_frames: _Frames = field(default_factory=dict)
@@ -127,7 +127,7 @@ class Notebook:
         self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
-        """The same frames; while one is worked on, it is the present frame."""
+        """Yield the frames; notes that are taken before the next one are about the frame yielded last."""
         for each in given:
             self._frame = each.frame
             yield each

@@ -24,7 +24,7 @@ _STRIDES = (8, 16, 32)
 _PERSON = 0
 """The number of people among COCO's classes."""
 _MOST_PEOPLE = 200
-"""Of one picture; the surest."""
+"""Maximum number of people in a picture; the boxes with the highest scores are kept."""
 _FARTHEST = 1e6
 """Pixels of the input: no box lies beyond."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
@@ -37,11 +37,11 @@ class BoxForm(BaseModel, extra="forbid"):
     network: str = ""
     """Its ONNX file."""
     size: tuple[Side, Side] = (640, 640)
-    """(width, height) of its input, where the ONNX file does not fix it."""
+    """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     min_score: _Share | None = None
-    """Less sure boxes are nobody's; None for rtmlib's own."""
+    """Minimum score of a box; None for rtmlib's own."""
     max_overlap: _Share = 0.45
-    """Of two boxes that share more of their union than this one goes."""
+    """Intersection over union of two boxes above which the one with the lower score is removed."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class KeypointForm(BaseModel, extra="forbid"):
     outputs: list[str] | None = None
     """Names of its outputs that are read: x and y of SimCC, otherwise one; None for the first ones."""
     size: tuple[Side, Side] = (192, 256)
-    """(width, height) of its input, where the ONNX file does not fix it."""
+    """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     colours: Literal["bgr", "rgb"] = "bgr"
     """Their order. RTMPose was trained on the other; so is it run by rtmlib, and by everybody since."""
     mean: _Three = (123.675, 116.28, 103.53)
@@ -72,7 +72,7 @@ class People:
         return int((self.score > 0).sum())
 
     def moved(self, xy: Array, inside: Mask) -> "People":
-        """The same at other positions; those that are not `inside` (P, K) are left out."""
+        """Return the people at other positions; joints that are not `inside` (P, K) get the score 0."""
         return replace(self, xy=xy, score=np.where(inside, self.score, 0.0))
 
 

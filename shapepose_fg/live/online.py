@@ -53,9 +53,10 @@ _MOST_SAID = 1000
 _OFF_CLOCK = 10
 """Views in a row whose time is elsewhere, after which a camera is named, and the frames of `push` are believed."""
 _STANDS = 30
-"""So many more views without a pose than with one say that a camera is where the rig has it after all."""
+"""Excess of views without a pose over views with one, after which a camera is taken to stand where the rig has
+it."""
 _BACK_S = 1.0
-"""Poses of cameras that move are kept for so much longer than a frame can wait to be solved."""
+"""Time for which poses of moving cameras are kept beyond the longest time that a frame waits to be solved, s."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class LiveReport:
     frames: int
     """Frames that were taken in."""
     late: int
-    """Of these, those that came after a later one."""
+    """Frames among `frames` that came after a later one."""
     dropped: int
     """Frames, or a camera's detections, that came too late, or twice: left out."""
     unrefined: int

@@ -58,7 +58,9 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
 def view_of(
     camera: str, time_s: float, flat: list[list[float]], place: str, rig: Rig, skeleton: Skeleton
 ) -> tuple[str, Detections, float]:
-    """The same of people whose keypoints are x, y, score one after the other, in pixels of the picture."""
+    """Return a camera's name, its detections and their time, from keypoints in a flat list of x, y, score, pixels
+    of the picture.
+    """
     if camera not in rig.names:
         raise InputError(f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}")
     K = skeleton.keypoint_count

@@ -40,7 +40,7 @@ class ViewCandidates:
     def of(
         cls, frame: Index, joint: Index, xy: Array, confidence: Array, pairs: Index, affinity: Array
     ) -> "ViewCandidates":
-        """Of columns as in `Detections`."""
+        """Candidates from columns as in `Detections`."""
         return cls(frame, Detections(np.zeros_like(joint), joint, xy, confidence, pairs, affinity))
 
     def only(self, keep: Mask) -> "ViewCandidates":

@@ -33,7 +33,7 @@ class PlacementKind(StrEnum):
     CROP = "crop"
     """Columns on the right and rows at the bottom were cut off, or added."""
     CROP_CENTRE = "crop-centre"
-    """The same, equally on both sides."""
+    """Columns on both sides, and rows above and below, were cut off, or added, equally many."""
     SCALE = "scale"
     """They were resized, each axis on its own."""
     LETTERBOX = "letterbox"
@@ -47,7 +47,7 @@ class Placement:
     kind: PlacementKind
     """Where it comes from."""
     picture_size: tuple[int, int]
-    """(width, height) of the pictures."""
+    """Width and height of the pictures, pixels."""
     calibrated_size: tuple[int, int]
     """(width, height) that the calibration is for."""
 
