@@ -15,7 +15,7 @@ from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
 _GATE = 0.06
 """Tracks whose rays miss each other by more than this part of the person's size are not one person."""
 _MOST_SAMPLES = 3000
-"""Of each pair of cameras, frames of tracks."""
+"""Maximum number of frames of tracks that are compared for a pair of cameras."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Pairwise:
     """Tracks of all cameras, and what is thought of their clocks."""
 
     tracks: list[Tracks]
-    """Of each camera."""
+    """Tracks of each camera."""
     views: Views
     """The cameras."""
     shift: Array
@@ -81,7 +81,9 @@ class Pairwise:
         return miss, np.einsum("njk,njk->nj", normal, speed) / size[:, None]
 
     def nearest(self, reach: float, step: float) -> "Pairwise":
-        """The same with shifts that fit best among those within `reach` frames, camera after camera."""
+        """Return a copy with the shifts that fit best among those within `reach` frames, found camera after
+        camera.
+        """
         V, shift = len(self.tracks), self.shift.copy()
         pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
         tried = np.arange(-reach, reach + step / 2, step)
@@ -154,9 +156,14 @@ def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, 
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
     for start, stop in zip([0, *edges], [*edges, len(one)], strict=True):
-        there = known[start:stop].astype(np.float64)
-        weight = np.maximum(gaussian_filter1d(there, width, axis=0, mode="constant"), 1e-9)
+        there = known[start:stop]
         for each in result:
-            mean = gaussian_filter1d(each[start:stop], width, axis=0, mode="constant") / weight
-            each[start:stop] = np.where(known[start:stop], each[start:stop] - mean, 0.0)
+            each[start:stop] = np.where(there, without_means(each[start:stop], there, width), 0.0)
     return result
+
+
+def without_means(values: Array, known: Mask, width: float) -> Array:
+    """Values (T, ...) less the means of those that are `known` over the time around: `width` steps, one sigma."""
+    weight = gaussian_filter1d(known.astype(np.float64), width, axis=0, mode="constant")
+    mean = gaussian_filter1d(np.where(known, values, 0.0), width, axis=0, mode="constant")
+    return values - mean / np.maximum(weight, 1e-9)

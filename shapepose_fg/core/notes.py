@@ -1,13 +1,12 @@
 """What a run notes down for run.json, window by window: times, who is how probable, dropped, or not solved."""
 
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from shapepose_fg.core.detections import Input
 
@@ -30,58 +29,47 @@ class Problem:
 
 _Count = Annotated[int, Field(ge=0, lt=2**53)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
+_Rows = Annotated[int, Field(gt=0)]
 _Frames = dict[str, list[_Count]]
-
-
-class _Kept(BaseModel):
-    """Notes as plain values."""
-
-    model_config = ConfigDict(extra="forbid")
-    frames: _Count
-    seconds: dict[str, _Number]
-    evidence: dict[_Count, tuple[_Number, Annotated[int, Field(gt=0)]]]
-    probable: dict[str, _Count]
-    dropped: _Frames
-    thinned_frames: _Frames
-    repeated_pictures: _Frames
-    problems: list[Problem]
-    factors: dict[str, tuple[_Count, _Count]] = {}
 
 
 @dataclass
 class Notes:
-    """Of one window, or of all together."""
+    """Notes about one window, or about a whole run."""
 
-    frames: int = 0
-    """How many frames it is of."""
-    seconds: Counter[str] = field(default_factory=Counter)
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    frames: _Count = 0
+    """Number of frames that the notes are about."""
+    seconds: dict[str, _Number] = field(default_factory=dict)
     """Time per stage, over all processes."""
-    evidence: dict[int, Sequence[float]] = field(default_factory=dict)
-    """Of each track the sum of its rows' evidence (`Observations.evidence`), and how many rows that is."""
-    probable: Counter[str] = field(default_factory=Counter)
-    """Frame by frame how many rows are so probable, by tenths rounded down."""
-    dropped: dict[str, list[int]] = field(default_factory=dict)
+    evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
+    """Sum of the evidence (`Observations.evidence`) of each track's rows, and the number of these rows."""
+    probable: dict[str, _Count] = field(default_factory=dict)
+    """Number of rows of single frames by their probability, in tenths rounded down."""
+    dropped: _Frames = field(default_factory=dict)
     """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
-    thinned_frames: dict[str, list[int]] = field(default_factory=dict)
+    thinned_frames: _Frames = field(default_factory=dict)
     """The frames of which something was left out, because it was too much."""
-    repeated_pictures: dict[str, list[int]] = field(default_factory=dict)
+    repeated_pictures: _Frames = field(default_factory=dict)
     """The frames in which a camera, by its name, showed the picture before once more."""
     problems: list[Problem] = field(default_factory=list)
     """What could not be solved."""
-    factors: dict[str, tuple[int, int]] = field(default_factory=dict)
+    factors: dict[str, tuple[_Count, _Count]] = field(default_factory=dict)
     """How many factors each function of the user's made, and how many of them were inactive."""
 
     def add(self, other: "Notes") -> None:
         """Take in the notes of what comes next."""
         self.frames += other.frames
-        for mine, more in ((self.seconds, other.seconds), (self.probable, other.probable)):
-            mine.update(more)
+        both: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
+        for mine, more in both:
+            for name, amount in more.items():
+                mine[name] = mine.get(name, 0) + amount
         for kind in ("dropped", "thinned_frames", "repeated_pictures"):
             for name, frames in getattr(other, kind).items():
                 getattr(self, kind).setdefault(name, []).extend(frames)
         for track, (evidence, rows) in other.evidence.items():
-            before = self.evidence.get(track, [0.0, 0])
-            self.evidence[track] = [before[0] + evidence, before[1] + rows]
+            before = self.evidence.get(track, (0.0, 0))
+            self.evidence[track] = before[0] + evidence, before[1] + rows
         self.problems += other.problems
         for name, counts in other.factors.items():
             before = self.factors.get(name, (0, 0))
@@ -95,11 +83,10 @@ class Notes:
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
         """What `as_dict` gave; ValueError where `values` are something else."""
         try:
-            made: dict[str, Any] = vars(_Kept.model_validate(values))
+            return TypeAdapter(cls).validate_python(values)
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
             raise ValueError(f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}") from None
-        return cls(**{**made, "seconds": Counter(made["seconds"]), "probable": Counter(made["probable"])})
 
 
 class Notebook:
@@ -140,7 +127,7 @@ class Notebook:
         self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
-        """The same frames; while one is worked on, it is the present frame."""
+        """Yield the frames; notes that are taken before the next one are about the frame yielded last."""
         for each in given:
             self._frame = each.frame
             yield each
@@ -151,10 +138,10 @@ class Notebook:
         start, outside, self._inner = time.perf_counter(), self._inner, 0.0
         yield
         whole = time.perf_counter() - start
-        self._notes.seconds[name] += whole - self._inner  # type: ignore[assignment]
+        self._notes.seconds[name] = self._notes.seconds.get(name, 0.0) + whole - self._inner
         self._inner = outside + whole
 
-    def torn_off(self) -> Notes:
+    def flush(self) -> Notes:
         """What was noted since the last time, which is forgotten here."""
         notes, self._notes = self._notes, Notes()
         return notes

@@ -88,18 +88,17 @@ class Setup:
             number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
             problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
             solution = replace(solution, observations=replace(rows, track=number), problems=problems)
-        notes = Notes(
-            len(own), Counter(solution.seconds), problems=list(solution.problems), factors=solution.factors
-        )
+        notes = Notes(len(own), dict(solution.seconds), problems=list(solution.problems), factors=solution.factors)
         if dropped := sorted(frame for frame in left.elements() if frame in own):
             notes.dropped[_FALSE_POSITIVE] = dropped
         said = np.isfinite(rows.evidence)
         if self.config.temporal:
             for track in np.unique(rows.track[said]).tolist():
                 evidence = rows.evidence[said & (rows.track == track)]
-                notes.evidence[track] = [float(evidence.sum()), len(evidence)]
+                notes.evidence[track] = float(evidence.sum()), len(evidence)
         else:
-            notes.probable = Counter(f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+            tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+            notes.probable = dict(Counter(tenths))
         if len(given) == len(every):
             return Part(self._result(solution, given, rig), notes)
         frame, time_s = np.array([each.frame for each in every]), np.array([each.time_s.mean() for each in every])
@@ -110,7 +109,7 @@ class Setup:
             anew = np.unique(part.rows.frame)
             carried = Reconstruction.concatenate([carried.rows(~np.isin(carried.frame, anew)), part.rows])
             notes.problems = [each for each in notes.problems if each.frame not in anew] + part.notes.problems
-            notes.seconds.update(part.notes.seconds)
+            notes.add(Notes(seconds=part.notes.seconds))
         carried = carried.rows(np.lexsort((carried.person, carried.frame)))
         return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
 

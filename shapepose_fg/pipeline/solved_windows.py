@@ -30,7 +30,7 @@ class SolvedWindows:
     detections: ThinnedFrames
     """What the cameras saw."""
     pictures: WithoutRepeats
-    """The same before it was thinned."""
+    """The recording before it was thinned, without repeated pictures."""
     times: FrameTimes
     """When."""
     frames: range
@@ -79,7 +79,7 @@ class SolvedWindows:
 
         def spans() -> Iterator[Span]:
             for span, behind in self._followed(begin):
-                waiting.append((self.book.torn_off(), behind))
+                waiting.append((self.book.flush(), behind))
                 yield span
 
         for part in pool.map(Setup.solve, spans()):
@@ -117,7 +117,7 @@ class SolvedWindows:
             for chunk in chunks:
                 if chunk.own.start >= begin.frame:
                     given = tuple(self.read(frame) for frame in range(chunk.first, chunk.until))
-                    waiting.append((chunk, self.book.torn_off()))
+                    waiting.append((chunk, self.book.flush()))
                     yield chunk, given
 
         identities = Identities(begin.next_id, begin.border)
@@ -153,9 +153,9 @@ class SolvedChunk:
     notes: Notes
     """What is to be said about following its people."""
     begins: Border
-    """Who is where at its beginning."""
+    """Tracks at the beginning of the chunk."""
     ends: Border
-    """And at its end."""
+    """Tracks at the end of the chunk."""
 
 
 def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk:
@@ -173,6 +173,6 @@ def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk
     if frames != list(chunk.own):
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {chunk.own}")
     parts = tuple(map(setup.solve, spans))
-    notes = book.torn_off()
+    notes = book.flush()
     notes.dropped = {why: [each for each in of if each in chunk.own] for why, of in notes.dropped.items()}
     return SolvedChunk(parts, notes, Border.of(spans[0]), Border.of(spans[-1]))
