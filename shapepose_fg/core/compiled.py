@@ -8,7 +8,7 @@ each other; what else a kernel has from another file, a number say, must not cha
 import logging
 import shutil
 from collections.abc import Callable, Sequence
-from functools import cached_property, update_wrapper
+from functools import update_wrapper
 from threading import RLock
 from typing import Any, TypeVar, cast
 
@@ -83,11 +83,6 @@ class Kernel:
         folder = module_folder(self.py_func.__module__)
         return folder is not None and (folder / self.py_func.__qualname__).exists()
 
-    @cached_property
-    def inner(self) -> Any:
-        """The function as other kernels call it; it is compiled, and kept, with them."""
-        return _njit()(self.py_func)
-
     def _read_or_compile(self) -> Any:
         """Numba's function with its cache; None where nothing can be kept. A damaged cache is removed."""
         for _ in range(2):
@@ -116,7 +111,7 @@ class Kernel:
 
 @typeof_impl.register(Kernel)
 def _type_within_kernels(kernel: Kernel, context: Any) -> Any:
-    return typeof_impl(kernel.inner, context)
+    return typeof_impl(kernel.load(), context)
 
 
 def _njit(**options: Any) -> Any:
