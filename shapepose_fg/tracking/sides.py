@@ -31,6 +31,8 @@ _FITS = 3.0
 """Mean squared distance in variances up to which a 2D person is that of a predicted one."""
 _EXCHANGED = 0.02
 """Probability that a view has a person's sides, or a part's, exchanged: on Shelf 22 of 1,573 times."""
+_AGREES = 0.99
+"""Least probability with which another view must have a part's sides as predicted, where they are exchanged."""
 _CHANGES_HZ = 0.05
 """How often that changes, a second."""
 _LOST = 0.001
@@ -82,8 +84,11 @@ class _Compared:
         return cls(groups, who, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
-        """(G, K) which parts most probably have their sides exchanged."""
-        return exchanges(skeleton)[self.log.argmax(axis=1)]
+        """(G, K) which parts have sides exchanged, most probably, and another view has them as predicted."""
+        states = exchanges(skeleton)
+        right = np.exp(self.log) @ ~states > _AGREES
+        same = (self.who[:, None] == self.who) & (self.who >= 0)
+        return states[self.log.argmax(axis=1)] & (same @ right)
 
     def of_person(self, number: int) -> Array:
         """(G', S) `log` of the 2D people of one person."""
@@ -96,13 +101,14 @@ class _Compared:
         probability (K,) that this is wrong. All others have their sides right.
         """
         found, mirror, part = given.detections, np.array(skeleton.mirror), paired_parts(skeleton)
-        wrong, mirrored = np.zeros(len(found), dtype=bool), found.mirrored.copy()
+        wrong, mirrored, right = np.zeros(len(found), dtype=bool), found.mirrored.copy(), np.zeros(part.max())
         for group, who, exchanged in zip(self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True):
             if who >= 0:
-                of = part[found.joint[group]]
-                wrong[group] = np.append(False, exchanged != own[who][0] if who in own else exchanged)[of]
+                of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
                 if who in own:
-                    mirrored[group] = np.append(0.0, own[who][1])[of]
+                    mirrored[group] = np.append(0.0, doubt)[of]
+                if not _doubtful(doubt, skeleton):
+                    wrong[group] = np.append(False, exchanged != turned)[of]
         if not wrong.any() and (mirrored == found.mirrored).all():
             return given
         first, second = found.pairs.T
@@ -198,12 +204,9 @@ def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool =
         if views.argmax(axis=1).any():
             look = _Look(given.frame, 0.0, joints.rows(np.array([row])), views)
             (turned,), (doubt,) = _own_sides(tracker, [look], followed=followed)
-            if (
-                not followed and np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED
-            ):  # the person may be a mixture of views that contradict
-                turned, seen.log[seen.who == number] = np.zeros_like(turned), _prior(views.shape[1])
             own[number], order = (turned, doubt), _order(turned, skeleton)
-            mean[row], covariance[row] = mean[row, order], covariance[row, order]
+            if not _doubtful(doubt, skeleton):
+                mean[row], covariance[row] = mean[row, order], covariance[row, order]
     return replace(tracks, joints=JointStates(mean, covariance)), seen.corrected(given, own, skeleton)
 
 
@@ -246,6 +249,14 @@ def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array
     squared = np.square(fit.joints.reshape(places.shape) - places).sum(axis=-1)
     squared = np.nan_to_num(squared / (np.square(sigma_m) + MODEL_SIGMA_M**2), nan=_FARTHEST)
     return -np.where(known, np.minimum(squared, _FARTHEST), 0.0).sum(axis=-1) / 2
+
+
+def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
+    """Whether the sides of most joints are uncertain, by the probability (K,) that a part's are wrong.
+
+    The person may be a mixture of views, or people, that contradict each other, and is left as it is.
+    """
+    return bool(np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED)
 
 
 def _order(exchanged: Array, skeleton: Skeleton) -> Index:
