@@ -84,11 +84,12 @@ class _Compared:
         return cls(groups, who, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
-        """(G, K) which parts have sides exchanged, most probably, and another view has them as predicted."""
+        """(G, K) which parts have sides exchanged, most probably, where another view has not, or all have."""
         states = exchanges(skeleton)
         right = np.exp(self.log) @ ~states > _AGREES
         same = (self.who[:, None] == self.who) & (self.who >= 0)
-        return states[self.log.argmax(axis=1)] & (same @ right)
+        found = states[self.log.argmax(axis=1)]
+        return found & ((same @ right) | ~(same @ ~found) & (same.sum(axis=1, keepdims=True) > 1))
 
     def of_person(self, number: int) -> Array:
         """(G', S) `log` of the 2D people of one person."""
