@@ -150,8 +150,7 @@ def _followed(seen: Sightings) -> list[Index]:
         if open_:
             last = np.array([each[-1] for each in open_])
             away = np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1) / seen.size_px[rows][:, None]
-            both = np.isfinite(away)
-            cost = np.where(both.sum(axis=-1) >= MIN_JOINTS, np.minimum(median_of(away, both), 1.0), 1.0)
+            cost = np.minimum(median_of(away, MIN_JOINTS), 1.0)
             for one, other in zip(*linear_sum_assignment(cost), strict=True):
                 if cost[one, other] < _SAME:
                     open_[one].append(int(rows[other]))

@@ -14,11 +14,12 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.pieces import add_view, project, solved
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
+from shapepose_fg.setup_check.fit import Others, match, possible_matches
 from shapepose_fg.setup_check.matching import (
     GATE,
     Groups,
     Pairs,
+    Pinhole,
     Sightings,
     centres_of,
     distances,
@@ -316,17 +317,17 @@ class Look:
     def beside_biases(self, view: int) -> float:
         """How well a camera fits the others' people, as `Match.score`, where the detector's errors last."""
         others, seen, camera = self.others(view), self.seen_by(view), self.camera(view)
-        person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw)
+        person, sighting, error = distances(others.frame, others.points, seen, camera)
         near = least_of_each(person, error)
         near = near[error[near] < 2 * GATE]
         person, sighting = person[near], sighting[near]
-        at = others.points[person] @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
-        away = (seen.xy[sighting] - at[..., :2] / at[..., 2:]) / seen.size_px[sighting][:, None, None]
+        away = seen.xy[sighting] - camera.project(others.points[person])[0]
+        away /= seen.size_px[sighting][:, None, None]
         who = followed(others.frame, others.points)[person]
         for each in np.unique(who).tolist():
             away[who == each] -= median_over(away[who == each])
         miss = np.linalg.norm(away, axis=-1)
-        left = np.maximum(1 - median_of(miss, ~np.isnan(miss)) / GATE, 0.0)
+        left = np.maximum(1 - median_of(miss) / GATE, 0.0)
         return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
 
     @property
@@ -349,6 +350,6 @@ class Look:
         """How well everything fits: 1 if every sighting is a person without error, 0 if none is anybody."""
         groups, structure = self.structure(steps=3)
         error = np.moveaxis(structure.miss_px / structure.size_px[:, None], 1, 2)
-        median = median_of(error, ~np.isnan(error))
+        median = median_of(error)
         worth = np.maximum(1 - median / GATE, 0.0)
         return float(worth[groups.member >= 0].sum() / max(len(self.sightings), 1))

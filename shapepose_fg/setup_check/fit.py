@@ -10,7 +10,7 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import nearest_rotation
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pinhole, Sightings, distances, same_frame
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
 """Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the
@@ -42,16 +42,6 @@ class Others:
 
     def __len__(self) -> int:
         return len(self.frame)
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """One camera without its lens."""
-
-    K: Array
-    """(3, 3)."""
-    cTw: Array
-    """(3, 4)."""
 
 
 Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
@@ -101,7 +91,7 @@ def likelihood(score: float, worth: float, freedom: int) -> float:
 
 def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Match:
     """Each sighting with the person nearest to it, where it is the nearest to that person too."""
-    person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw, lag)
+    person, sighting, error = distances(others.frame, others.points, seen, camera, lag)
     best_of_person, best_of_sighting = np.full(len(others), np.inf), np.full(len(seen), np.inf)
     np.minimum.at(best_of_person, person, error)
     np.minimum.at(best_of_sighting, sighting, error)
@@ -152,20 +142,20 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 def centred_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera whose principal point lies where it sees `points` (N, 3) at `xy` (N, 2), median."""
-    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
-    if not (at[:, 2] > 0).all():
+    at, depth = camera.project(points)
+    if not (depth > 0).all():
         return None
     K = camera.K.copy()
-    K[:2, 2] += np.median(xy - at[:, :2] / at[:, 2:], axis=0)
+    K[:2, 2] += np.median(xy - at, axis=0)
     return Pinhole(K, camera.cTw)
 
 
 def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
     """The camera `scaled` by how much farther from `centre` (2,) than it says `points` (N, 3) are seen at `xy`."""
-    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
-    if not (at[:, 2] > 0).all():
+    at, depth = camera.project(points)
+    if not (depth > 0).all():
         return None
-    direction = at[:, :2] / at[:, 2:] - centre
+    direction = at - centre
     factor = float((direction * (xy - centre)).sum() / (direction**2).sum())
     return scaled(camera, factor, centre) if 0.1 < factor < 10 else None
 

@@ -11,8 +11,16 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
-from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
+from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, independent, likelihood, match
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    MIN_JOINTS,
+    Pinhole,
+    Sightings,
+    least_of_each,
+    miss_px,
+    same_frame,
+)
 from shapepose_fg.setup_check.over_time import stories
 from shapepose_fg.setup_check.small import ONE, Problem, named, probable
 
@@ -107,7 +115,7 @@ class _Nearest:
 
 def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
     person, sighting = same_frame(others.frame, seen.frame - lag)
-    error = miss_px(others.points[person], seen.xy, sighting, camera.K, camera.cTw)
+    error = miss_px(others.points[person], seen.xy[sighting], camera)
     error /= seen.size_px[sighting][:, None]
     both = ~np.isnan(error)
     mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)

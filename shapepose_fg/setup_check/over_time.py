@@ -15,8 +15,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import POSE, TURN, Others, Pinhole, independent, likelihood, match
-from shapepose_fg.setup_check.matching import GATE, Sightings
+from shapepose_fg.setup_check.fit import POSE, TURN, Others, independent, likelihood, match
+from shapepose_fg.setup_check.matching import GATE, Pinhole, Sightings
 
 _PIECES = 12
 _LEAST_PEOPLE = 6
@@ -115,8 +115,7 @@ class _Pieces:
             few, mine = _during(others, seen, first, last)
             found = match(few, mine, camera)
             points, xy = few.points[found.person], mine.xy[found.sighting]
-            at = points @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
-            off = (xy - at[..., :2] / at[..., 2:]) / mine.size_px[found.sighting][:, None, None]
+            off = (xy - camera.project(points)[0]) / mine.size_px[found.sighting][:, None, None]
             score.append(found.score)
             enough = found.possible >= _LEAST_PEOPLE
             told.append(enough)

@@ -170,9 +170,8 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
         others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
-        out_px = miss_px(points, mine.xy, matched.sighting, camera.K, camera.cTw)
-        depth = points @ camera.cTw[2, :3] + camera.cTw[2, 3]
-        out_px = np.where(np.isfinite(out_px), out_px, np.nan)
+        depth = camera.project(points)[1]
+        out_px = miss_px(points, mine.xy[matched.sighting], camera)
         figures = CameraFigures(
             camera=name,
             people=int(seen[view]),
