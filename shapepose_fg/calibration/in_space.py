@@ -73,7 +73,7 @@ class InSpace:
         xy, whose = np.concatenate(xy), np.concatenate(track)
         seen = Sightings(np.concatenate(time), np.concatenate(view), xy, np.isfinite(xy[..., 0]).astype(float))
         enough = np.isfinite(xy[..., 0]).sum(axis=1) >= MIN_JOINTS
-        seen, whose = seen.only(enough), whose[enough]
+        seen, whose = seen.rows(enough), whose[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
         member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
         agree = np.zeros(member.shape)

@@ -69,7 +69,7 @@ class Footage:
         chosen = frames.start + np.unique(wanted)
         sightings = seen_at(detections, chosen.tolist())
         thin = -(-len(sightings) // _MOST_SIGHTINGS)
-        sightings = sightings.only(np.isin(sightings.frame, chosen[::thin]))
+        sightings = sightings.rows(np.isin(sightings.frame, chosen[::thin]))
         xy = sightings.xy.copy()
         for view, camera in enumerate(rig.cameras):
             here = sightings.view == view
@@ -79,7 +79,7 @@ class Footage:
 
     def at(self, frames: Index) -> "Footage":
         """Some of the frames."""
-        return replace(self, sightings=self.sightings.only(np.isin(self.sightings.frame, frames)))
+        return replace(self, sightings=self.sightings.rows(np.isin(self.sightings.frame, frames)))
 
     def undistorted(self, rig: Rig) -> Sightings:
         """The sightings under the lenses of `rig`."""

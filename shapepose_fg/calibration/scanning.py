@@ -39,11 +39,11 @@ class Scan:
     @classmethod
     def of(cls, sightings: Sightings, views: Views, a: int, b: int) -> "Scan":
         """Of the cameras `a` and `b`."""
-        one, other = (sightings.only(sightings.view == view) for view in (a, b))
+        one, other = (sightings.rows(sightings.view == view) for view in (a, b))
         taken = np.unique(one.frame)
         wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
-        one = one.only(np.isin(one.frame, wanted))
-        other = other.only(np.argsort(other.frame, kind="stable"))
+        one = one.rows(np.isin(one.frame, wanted))
+        other = other.rows(np.argsort(other.frame, kind="stable"))
         begin = int(other.frame[0])
         first = np.searchsorted(other.frame, np.arange(begin, other.frame[-1] + 2))
         size = other.size_px / views.focal_px[b]

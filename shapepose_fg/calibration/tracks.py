@@ -66,7 +66,7 @@ class Tracks:
     @classmethod
     def of(cls, sightings: Sightings, views: Views, view: int, fps: float) -> "Tracks":
         """What camera `view` saw, followed and smoothed."""
-        seen = sightings.only(sightings.view == view)
+        seen = sightings.rows(sightings.view == view)
         rays, size = rays_of(seen, views), seen.size_px / views.focal_px[view]
         shortest = max(4, round(_SHORTEST_S * fps))
         parts = [rows for rows in _followed(seen) if len(rows) >= shortest]
@@ -99,7 +99,7 @@ class OneClock:
 
     def at(self, frames: Iterable[int]) -> Sightings:
         """What was seen at some moments."""
-        return self.sightings.only(np.isin(self.sightings.frame, np.fromiter(frames, np.intp)))
+        return self.sightings.rows(np.isin(self.sightings.frame, np.fromiter(frames, np.intp)))
 
 
 def on_one_clock(sightings: Sightings, following: Index, shift: Array, skeleton: Skeleton) -> OneClock:
@@ -126,7 +126,7 @@ def next_of(sightings: Sightings) -> Index:
     following = np.full(len(sightings), -1, dtype=np.intp)
     for view in np.unique(sightings.view):
         rows = np.flatnonzero(sightings.view == view)
-        for track in _followed(sightings.only(rows)):
+        for track in _followed(sightings.rows(rows)):
             one, other = rows[track[:-1]], rows[track[1:]]
             near = sightings.frame[other] - sightings.frame[one] == 1
             following[one[near]] = other[near]

@@ -44,9 +44,8 @@ def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gr
 @part
 def _eigen(A, values, vectors):
     """Eigenvalues, rising, and eigenvectors (columns) of a symmetric (3, 3), which is lost: Jacobi's rotations."""
-    for a in range(3):
-        for b in range(3):
-            vectors[a, b] = 1.0 if a == b else 0.0
+    vectors[:] = 0.0
+    vectors[0, 0] = vectors[1, 1] = vectors[2, 2] = 1.0
     for _ in range(12):
         if not abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2]) > _ROUNDING * (A[0, 0] + A[1, 1] + A[2, 2]):
             break
@@ -83,17 +82,13 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
     for n in range(len(points)):
         at = n if len(cameras) > 1 else 0
         for j in range(points.shape[1]):
-            seen = 0
-            for v in range(xy.shape[2]):
-                if confidence[n, j, v] > 0.0:
-                    seen += 1
-            if seen < 2 or not math.isnan(points[n, j, 0] + points[n, j, 1] + points[n, j, 2]):
+            if (confidence[n, j] > 0.0).sum() < 2 or not np.isnan(points[n, j]).any():
                 continue
             agree = triangulated(
                 cameras[at], focal[at], xy[n, j], confidence[n, j], scale_m, reach_m, least_depth, weight, x
             )
             if agree >= 2:
-                points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
+                points[n, j] = x
 
 
 @kernel("f3 f4 f2 f4 f3 f0 f0 f0 b0 i0 f0 b3 f4 f4 f3 f3 f2")
@@ -131,10 +126,8 @@ def look(
                     else:
                         weight *= robust_weight(robust, far * weight / (width * width))
                     add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
-            for a in range(3):
-                target[n, j, a] = x[a]
-                for b in range(3):
-                    A[a, b] = H[a, b]
+            target[n, j] = x
+            A[:] = H
             _eigen(A, values, vectors)
             for k in range(3):
                 if values[k] > _LEAST_KNOWN * max(values[2], 1e-12):
@@ -152,12 +145,10 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, wi
 
     `at` (3,) is anything.
     """
-    T, d = state.shape
+    T = len(state)
+    g[:T] = right
+    H[:] = diagonal
     for t in range(T):
-        for a in range(d):
-            g[t, a] = right[t, a]
-            for b in range(d):
-                H[t, a, b] = diagonal[t, a, b]
         for n in range(weight.shape[2]):
             camera, w = cameras[t if cameras.shape[0] > 1 else 0, n], weight[t, joint, n]
             if w > 0.0:
@@ -240,9 +231,7 @@ def _solve(H, Z, g, x):
                 farthest = abs(g[t, k] - x[t, k])
     if not farthest < _FARTHEST_M:
         return 0.0
-    for t in range(T):
-        for k in range(d):
-            x[t, k] = g[t, k]
+    x[:] = g[:T]
     return farthest
 
 
@@ -274,9 +263,7 @@ def _marginals(H, Z, M, G, S, covariance):
                 for k in range(a, d):
                     total += M[a, k] * M[b, k]
                 S[a, b] = S[b, a] = total
-        for a in range(d):
-            for b in range(d):
-                covariance[t, a, b] = S[a, b]
+        covariance[t] = S
 
 
 @kernel("f3 i1 f4 f4 f3 f4 f4 f3 f3 i0 f0 i0 f0 f4")
@@ -309,7 +296,4 @@ def solve_chains(
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):
-            for t in range(T):
-                for a in range(d):
-                    for b in range(d):
-                        covariance[c, t, a, b] = np.nan
+            covariance[c] = np.nan

@@ -206,7 +206,7 @@ class Filter:
             "count": blank,
         }
         both = {name: np.concatenate([getattr(now, name), columns[name]]) for name in OF_TRACKS}
-        now = replace(now, tracks=tracks.joined(new), next_track=now.next_track + count, **both)
+        now = replace(now, tracks=Tracks.concatenate([tracks, new]), next_track=now.next_track + count, **both)
         return now, np.concatenate([candidate, own])
 
     def _with_names(self, now: Moment) -> Moment:

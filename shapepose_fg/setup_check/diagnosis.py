@@ -62,8 +62,8 @@ def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
 def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> bool:
     """Whether two cameras saw the same pixels; as the pictures were, with the bend of their lenses."""
     every = evidence.sightings
-    every = every.only(np.isin(every.frame, evidence.anchors))
-    one, other = (every.only(every.view == view) for view in (first, second))
+    every = every.rows(np.isin(every.frame, evidence.anchors))
+    one, other = (every.rows(every.view == view) for view in (first, second))
     if min(len(one), len(other)) < 5:
         return False
     i, j = same_frame(one.frame, other.frame)
@@ -243,7 +243,7 @@ def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
             findings.append(found)
     if gone:
         seen = evidence.sightings
-        evidence = replace(evidence, sightings=seen.only(~np.isin(seen.view, list(gone))))
+        evidence = replace(evidence, sightings=seen.rows(~np.isin(seen.view, list(gone))))
     return findings, evidence
 
 

@@ -87,7 +87,7 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():
         stopped[list(pictures.repeated(frame))] += 1 / len(wanted)
-    here = sightings.only(np.isin(sightings.frame, spread))
+    here = sightings.rows(np.isin(sightings.frame, spread))
     _, each = np.unique(here.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
@@ -246,7 +246,7 @@ class Look:
         """The same with other detections of one camera."""
         every = self.evidence.sightings
         mine = np.flatnonzero(every.view == view)
-        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.only(mine))
+        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
         xy[mine], confidence[mine] = new.xy, new.confidence
         return replace(
             self, evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence))
@@ -267,7 +267,7 @@ class Look:
     @cached_property
     def sightings(self) -> Sightings:
         """Those at the frames that are looked at."""
-        return self.shifted.only(np.isin(self.shifted.frame, self.evidence.anchors))
+        return self.shifted.rows(np.isin(self.shifted.frame, self.evidence.anchors))
 
     @cached_property
     def pairs(self) -> Pairs:
@@ -287,7 +287,7 @@ class Look:
     def seen_by(self, view: int, every_frame: bool = False) -> Sightings:
         """What one camera saw."""
         sightings = self.shifted if every_frame else self.sightings
-        return sightings.only(sightings.view == view)
+        return sightings.rows(sightings.view == view)
 
     def groups(self, without: tuple[int, ...] = ()) -> Groups:
         """People as they are found without some of the cameras."""

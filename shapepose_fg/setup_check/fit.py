@@ -10,6 +10,7 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pinhole, Sightings, distances, same_frame
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
@@ -32,16 +33,13 @@ CORNER = np.array([-0.5, -0.5])
 
 
 @dataclass(frozen=True)
-class Others:
+class Others(Rows):
     """The people that all cameras but some see."""
 
     frame: Index
     """(P,) frame of each person."""
     points: Array
     """(P, J, 3) joints, the calibration's unit; NaN where not placed."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
@@ -173,7 +171,7 @@ def best_of(
 ) -> Pinhole | None:
     """Of the cameras that fit one person exactly, the one that fits all people best."""
     step = max(1, len(others) // 40)
-    few = Others(others.frame[::step], others.points[::step])
+    few = others.rows(slice(None, None, step))
     tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
     score, best = max(
         ((match(few, seen, each).score, each) for each in tried), key=lambda pair: pair[0], default=(0, None)

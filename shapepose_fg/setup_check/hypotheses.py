@@ -83,7 +83,7 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
     others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
     worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
-    others = Others(others.frame[::step], others.points[::step])
+    others = others.rows(slice(None, None, step))
     still = _nearest(others, seen, camera, 0)
 
     def tried(lag: int) -> Lag:

@@ -10,10 +10,11 @@ from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.people_2d import group_people
 
@@ -24,7 +25,7 @@ _STATURE_PER_SPREAD = 3.4
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Sightings(Rows):
     """S people as single cameras saw them, J core joints each."""
 
     frame: Index
@@ -36,9 +37,6 @@ class Sightings:
     confidence: Array
     """(S, J) the detector's score; 0 where not seen."""
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
     @cached_property
     def size_px(self) -> Array:
         """(S,) how large a person is in the picture, about the height of one who stands, pixels."""
@@ -47,15 +45,10 @@ class Sightings:
     @classmethod
     def of(cls, detections: DetectionSequence, frames: Iterable[int]) -> "Sightings":
         """The 2D people of some `frames`, grouped by affinities of their own picture; the core joints only."""
-        parts = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
         joints = len(detections.skeleton.core)
         none = cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints)))
-        names = ("frame", "view", "xy", "confidence")
-        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names))
-
-    def only(self, keep: Mask | Index) -> "Sightings":
-        """Some of the sightings."""
-        return Sightings(self.frame[keep], self.view[keep], self.xy[keep], self.confidence[keep])
+        found = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
+        return cls.concatenate([none, *found])
 
 
 @dataclass(frozen=True)
@@ -115,16 +108,13 @@ _MIN_ANGLE = np.deg2rad(4.0)
 
 
 @dataclass(frozen=True)
-class Groups:
+class Groups(Rows):
     """P people: the sighting of each camera."""
 
     frame: Index
     """(P,) frame."""
     member: Index
     """(P, V) the sighting of each camera, -1 where it does not see the person."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 @dataclass(frozen=True)
@@ -242,7 +232,7 @@ def _others(sightings: Sightings, views: Views, members: Index, points: Array) -
         of_view = np.flatnonzero(sightings.view == view)
         beside = np.flatnonzero((sightings.view[members] != view).all(axis=1))
         person, sighting, error = distances(
-            frame[beside], points[beside], sightings.only(of_view), Pinhole(views.K[view], views.cTw[view])
+            frame[beside], points[beside], sightings.rows(of_view), Pinhole(views.K[view], views.cTw[view])
         )
         best = least_of_each(person, error)
         third[beside[person[best]], view] = of_view[sighting[best]]

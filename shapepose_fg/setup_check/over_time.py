@@ -168,8 +168,8 @@ class _Pieces:
 
 def _during(others: Others, seen: Sightings, first: int, last: int) -> tuple[Others, Sightings]:
     """What is of some frames only."""
-    here = (others.frame >= first) & (others.frame < last)
-    return Others(others.frame[here], others.points[here]), seen.only((seen.frame >= first) & (seen.frame < last))
+    there, here = ((each.frame >= first) & (each.frame < last) for each in (others, seen))
+    return others.rows(there), seen.rows(here)
 
 
 def _bumped(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Way, int]:

@@ -115,9 +115,7 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
                     _linearise(at, candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j])
                     _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
-            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, 0
-            for v in range(views):
-                seen_by[j] += inlier[j, v]
+            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, inlier[j].sum()
         tear(mean[a], trusted, seen_by, longest_m, parents, FARTHEST_M, above, way_m, count, too_long, torn)
         twice, most = 0, 0
         for j in range(joints):
@@ -130,11 +128,7 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
             elif core[j] and seen_by[j] >= 2:
                 twice += 1
         for v in range(views):
-            in_view = 0
-            for j in range(joints):
-                if core[j] and candidate[a, j, v] >= 0:
-                    in_view += 1
-            most = max(most, in_view)
+            most = max(most, (core & (candidate[a, :, v] >= 0)).sum())
         evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
 
 

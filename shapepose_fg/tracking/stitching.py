@@ -9,6 +9,7 @@ from annotated_types import Interval
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 
 _BONE_SIGMA_M = 0.015
@@ -36,7 +37,7 @@ class StitchingConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Trace:
+class Trace(Rows):
     """What stitching looks at, of the N solved rows of one track."""
 
     track: int
@@ -57,12 +58,6 @@ class Trace:
         centre = np.where(known, joints[:, core], 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
         return cls(track, time_s, centre, length)
-
-    @classmethod
-    def concatenate(cls, parts: Sequence["Trace"]) -> "Trace":
-        """The rows of several parts of a track, one after the other."""
-        names = ("time_s", "centre", "bones")
-        return cls(parts[0].track, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ def with_sides_held(tracker: Tracker, frames: Sequence[Input], carried: Tracks) 
             places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
             if len(places) > 0:
                 new = np.zeros(len(places), dtype=np.intp)
-                tracks = replace(tracks, time_s=time_s).joined(tracker.at(places, new, new, time_s))
+                tracks = Tracks.concatenate([replace(tracks, time_s=time_s), tracker.at(places, new, new, time_s)])
         held.append(frame)
     return held
 
@@ -270,7 +270,7 @@ def _follow(
         tracks = replace(tracks, time_s=time_s)
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
-            tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
+            tracks, candidate = Tracks.concatenate([tracks, own]), np.concatenate([candidate, theirs])
         if abs(time_s - looked_s) < _TWINS_S:
             continue
         looked_s = time_s
@@ -292,7 +292,7 @@ def _follow(
                 )
                 log.add(t, new, theirs)
                 born.append((world, Seed(t, new, theirs, births=False), new.ids))
-                tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+                tracks, candidate = Tracks.concatenate([tracks, new]), np.concatenate([candidate, theirs])
     return born
 
 

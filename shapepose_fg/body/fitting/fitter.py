@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 from annotated_types import Interval
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, RepeatsOrNone, Seconds, Settings
+from shapepose_fg.core.rows import Rows
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -79,28 +80,6 @@ class FitStatus(StrEnum):
 
 STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
 """Of arrays that hold any `FitStatus`: one made of a shorter text would cut off the others."""
-
-
-class Rows:
-    """Arrays of one length."""
-
-    def __len__(self) -> int:
-        return len(next(iter(vars(self).values())))
-
-    def rows(self, index: Any) -> Self:
-        """The rows `index` (R,)."""
-        return type(self)(*(value[index] for value in vars(self).values()))
-
-    def put(self, index: Any, other: Self) -> None:
-        """Write the rows of `other` over the rows `index` (R,)."""
-        for name, values in vars(self).items():
-            values[index] = vars(other)[name]
-
-    def with_rows(self, index: Any, other: Self) -> Self:
-        """The same, with the rows `index` (R,) from `other`."""
-        changed = type(self)(*(value.copy() for value in vars(self).values()))
-        changed.put(index, other)
-        return changed
 
 
 @dataclass(frozen=True)
