@@ -8,7 +8,7 @@ from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
+from shapepose_fg.estimation.limbs import ARMS_AND_LEGS, on_both_sides
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
 
 CERTAIN = 0.99
@@ -30,9 +30,7 @@ def limbs_to_exchange(joints: Sequence[str]) -> Index:
     A foot goes with its ankle.
     """
     named = [(far, near, far) for near, far in ARMS_AND_LEGS] + [(foot, "Knee", "Ankle") for foot in _FEET]
-    limbs = [tuple(f"{side}{name}" for name in limb) for side in "RL" for limb in named]
-    there = [[joints.index(name) for name in limb] for limb in limbs if {*limb} <= set(joints)]
-    return np.array(there, dtype=np.intp).reshape(-1, 3)
+    return np.array(on_both_sides(named, joints), dtype=np.intp).reshape(-1, 3)
 
 
 def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) -> Array:

@@ -3,7 +3,7 @@
 Duplicates, the people's build and the sizes of pictures are told without comparing places.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Axis, Camera, Rig
+from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.trust import BELIEVED, Trust
@@ -67,39 +67,37 @@ def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> b
     if min(len(one), len(other)) < 5:
         return False
     i, j = same_frame(one.frame, other.frame)
-    raw = [_distorted(seen.xy, rig.cameras[view]) for seen, view in ((one, first), (other, second))]
-    distance = np.linalg.norm(raw[0][i] - raw[1][j], axis=-1)
+    raw = [rig.cameras[view].distort(seen.xy.reshape(-1, 2)) for seen, view in ((one, first), (other, second))]
+    distance = np.linalg.norm(raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1)
     there = ~np.isnan(distance)
     alike = (there & (distance < _SAME_PX)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
     alike &= there.sum(axis=1) >= 3
     return bool(len(np.unique(i[alike])) >= _SAME_SHARE * len(one))
 
 
-def _distorted(xy: Array, camera: Camera) -> Array:
-    seen = ~np.isnan(xy[..., 0])
-    raw = np.full_like(xy, np.nan)
-    raw[seen] = camera.distort(xy[seen])
-    return raw
-
-
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
     """Cameras whose videos, or pictures, are not of the calibrated size; `given` as `find_footage` takes it."""
-    found = []
-    for view, path in enumerate(find_footage(given, rig.names)[0]):
-        is_video = path.suffix.lower() in VIDEOS and path.is_file()
-        width, height = glance(path)[0] if is_video else open_footage(path).size
-        if (width, height) != rig.cameras[view].image_size:
-            found.append(Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(width), float(height)),)))
-    return tuple(found)
+    return _unlike(
+        {
+            name: glance(path)[0] if path.suffix.lower() in VIDEOS and path.is_file() else open_footage(path).size
+            for name, path in zip(rig.names, find_footage(given, rig.names)[0], strict=True)
+        },
+        rig,
+    )
 
 
 def detected_sizes(file: Path, rig: Rig) -> tuple[Finding, ...]:
     """Cameras that `detect` was told another calibrated size of, by the footage.json that it wrote."""
-    sizes = {each.name: each.placement.calibrated_size for each in read_used_footage(file)}
+    return _unlike({each.name: each.placement.calibrated_size for each in read_used_footage(file)}, rig)
+
+
+def _unlike(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> tuple[Finding, ...]:
+    """Cameras whose pictures have other `sizes`, by name, than the calibrated."""
+    found = [(view, sizes.get(each.name, each.image_size)) for view, each in enumerate(rig.cameras)]
     return tuple(
-        Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(sizes[each.name][0]), float(sizes[each.name][1])),))
-        for view, each in enumerate(rig.cameras)
-        if sizes.get(each.name, each.image_size) != each.image_size
+        Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(width), float(height)),))
+        for view, (width, height) in found
+        if (width, height) != rig.cameras[view].image_size
     )
 
 

@@ -96,14 +96,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
 
 
 def _other_side(skeleton: Skeleton) -> Index:
-    core = [skeleton.joints[joint] for joint in skeleton.core]
-    other = {"L": "R", "R": "L"}
-    return np.array(
-        [
-            core.index(name) if (name := other.get(each[0], "") + each[1:]) in core else n
-            for n, each in enumerate(core)
-        ]
-    )
+    core, mirror = skeleton.core, skeleton.mirror
+    return np.array([core.index(mirror[j]) if mirror[j] in core else n for n, j in enumerate(core)])
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,12 @@ class Trace(Rows):
         length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
         return cls(track, time_s, centre, length)
 
+    @property
+    def build(self) -> Array:
+        """(B,) median length of each bone, metres; NaN where it is known in too few rows."""
+        enough = np.isfinite(self.bones).sum(axis=0) >= LEAST_ROWS
+        return np.where(enough, np.nanmedian(np.where(enough, self.bones, 0.0), axis=0), np.nan)
+
 
 @dataclass(frozen=True)
 class Ends:
@@ -76,22 +82,10 @@ class Ends:
     @classmethod
     def of(cls, traces: Iterable[Trace]) -> "Ends":
         """Of tracks, of which one at a time is in memory."""
-        tracks, times, places, bones = [], [], [], []
-        for each in traces:
-            tracks.append(each.track)
-            times.append(each.time_s[[0, -1]])
-            places.append(each.centre[[0, -1]])
-            enough = np.isfinite(each.bones).sum(axis=0) >= LEAST_ROWS
-            median = np.full(each.bones.shape[1], np.nan)
-            median[enough] = np.nanmedian(each.bones[:, enough], axis=0)
-            bones.append(median)
-        count = len(tracks)
-        return cls(
-            np.array(tracks, dtype=np.intp),
-            np.array(times).reshape(count, 2),
-            np.array(places).reshape(count, 2, 3),
-            np.array(bones) if count > 0 else np.zeros((0, 0)),
-        )
+        rows = [(each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces]
+        if len(rows) == 0:
+            return cls(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0)))
+        return cls(*map(np.array, zip(*rows, strict=True)))
 
 
 def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
