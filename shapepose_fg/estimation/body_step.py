@@ -8,7 +8,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence
+from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 MODEL_SIGMA_M = 0.02
@@ -66,7 +66,7 @@ class BodyStep:
         fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
-    def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> Message:
+    def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> JointTargets:
         """What the bodies say of the joints `pulled` (R, J): E_shape of Eq. 3."""
         xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
         ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
@@ -86,7 +86,7 @@ class BodyStep:
         information = np.zeros_like(covariance)
         sigma_m = self.config.graph.shape_sigma_m
         information[pulled] = np.eye(3) / sigma_m**2 if sigma_m > 0 else np.linalg.inv(covariance[pulled])
-        return Message(np.where(pulled[..., None], xyz, np.nan), information)
+        return JointTargets(np.where(pulled[..., None], xyz, np.nan), information)
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:

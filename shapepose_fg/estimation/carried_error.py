@@ -3,9 +3,10 @@
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, ViewEvidence, inverses
+from shapepose_fg.estimation.linearisation import ObservationConfig, ViewEvidence, inverses
 
 _NOTHING = 1.0
 """What a joint of which nothing is known is known to, 1/m²: a metre."""
@@ -14,7 +15,7 @@ POSES_LAST_S = 3.0
 
 
 def carried_covariance(
-    evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
+    evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
     """(N, J, 3, 3) covariance of joints, m², that comes of their cameras' poses; zero where all stand still."""
     if views.carried is None or len(evidence.points) == 0:
@@ -24,7 +25,7 @@ def carried_covariance(
 
 
 def goes_with_poses(
-    evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
+    evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
     """(N, J, B, 3, 6) how joints go with the poses of the B carriers of cameras, of which there is one.
 

@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS, on_both_sides
-from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
+from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
 
 CERTAIN = 0.99
 """Observations that are more probably the person's make no alternatives: four in five."""
@@ -59,7 +60,7 @@ def association_spread(
     observations: Observations,
     sigmas: Array,
     evidence: ViewEvidence,
-    body: Message,
+    body: JointTargets,
     views: Views,
     config: ObservationConfig,
 ) -> Array:

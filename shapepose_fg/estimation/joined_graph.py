@@ -17,13 +17,14 @@ from factors import (
     reported_factor,
     robust_kernel,
 )
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.carried_error import goes_with_poses
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.trajectory_graph import dilution
 
@@ -103,7 +104,7 @@ class JoinedPeople:
         """(N, J, B, 3, 6) how the joints as they are reported go with the poses of carriers."""
         sigmas = observation_sigmas(rows, people.joints, views, self._config, people.joint_names.tolist())
         evidence = linearise(rows, sigmas, people.joints, views, self._config)
-        nothing = Message(people.joints, np.zeros((*people.joints.shape, 3)))
+        nothing = JointTargets(people.joints, np.zeros((*people.joints.shape, 3)))
         return goes_with_poses(evidence, nothing, sigmas, views, self._config)
 
     def _report(self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 from annotated_types import Interval
 
 from factors import DEFAULT_WIDTH_SIGMA, KernelName
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -95,31 +96,6 @@ statistics of real ones, and these, each view of Shelf against the others, give 
 (docs/evaluation.md)."""
 
 
-@dataclass(frozen=True)
-class Message:
-    """What is said of the joints of T frames (or of N rows), by the views or by the body, as Gaussians."""
-
-    xyz: Array
-    """(T, J, 3) where they are, metres; anything where the information is zero."""
-    information: Array
-    """(T, J, 3, 3) 1/m², positive semi-definite; zero where nothing is said."""
-
-    @property
-    def known(self) -> Mask:
-        """(T, J) of which joints anything is said."""
-        return np.asarray(self.information.any(axis=(2, 3)))
-
-    def rows(self, index: Index | slice) -> "Message":
-        """Some of the rows."""
-        return Message(self.xyz[index], self.information[index])
-
-    def where(self, chosen: Mask, times: float = 1.0) -> "Message":
-        """What is said of the `chosen` (T, J) joints, information `times` this number; nothing of others."""
-        chosen = chosen & self.known
-        information = np.where(chosen[..., None, None], self.information * times, 0.0)
-        return Message(np.where(chosen[..., None], self.xyz, 0.0), information)
-
-
 def inverses(A: Array) -> Array:
     """Inverses (..., 3, 3) of symmetric matrices, by their cofactors; nothing is raised for singular ones."""
     a, b, c, d, e, f = (A[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
@@ -157,9 +133,9 @@ class ViewEvidence:
     """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
 
     @property
-    def message(self) -> Message:
+    def message(self) -> JointTargets:
         """The same as Gaussians."""
-        return Message(self.target, self.information)
+        return JointTargets(self.target, self.information)
 
 
 def weakest_sigma(information: Array) -> Array:

@@ -15,14 +15,7 @@ from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.in_time import carried, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
-from shapepose_fg.estimation.linearisation import (
-    Message,
-    ViewEvidence,
-    inverses,
-    linearise,
-    mean_confidence,
-    weakest_sigma,
-)
+from shapepose_fg.estimation.linearisation import ViewEvidence, inverses, linearise, mean_confidence, weakest_sigma
 from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
@@ -228,6 +221,6 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     )
 
 
-def _pull(message: Message, X: Array) -> Array:
+def _pull(message: JointTargets, X: Array) -> Array:
     """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
-from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
@@ -19,7 +19,6 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.minimise import undetermined_key
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.out_of_step import carried_to_frames
@@ -126,7 +125,7 @@ class PersonGraph:
     """(T, J, 3, 3) and how surely: marginals of its graph, m²."""
     lasting: Lasting
     """How the error goes on that is in the report and not in the solver's graph."""
-    body: Message
+    body: JointTargets
     """(T, J) what the body says of each joint without the joint's own views; nothing where it does not pull."""
     together: "list[PersonGraph]" = field(default_factory=list, repr=False)
     """The people whom factors of your own tie to this one, and this one (`tied`); none where nobody is."""

@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import MODEL_SIGMA_M
 from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import Message, linearise, observation_sigmas
+from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.filtering import Moment
 from shapepose_fg.tracking.motion_filter import JointStates
@@ -55,7 +55,7 @@ def of_poses(rows: Observations, joints: JointStates, rig: Rig, config: Estimato
     places, views = joints.position, Views.of(rig, rows.time_s)
     sigmas = observation_sigmas(rows, places, views, config.observations, config.joints)
     evidence = linearise(rows, sigmas, places, views, config.observations)
-    nothing = Message(places, np.zeros((*places.shape, 3)))
+    nothing = JointTargets(places, np.zeros((*places.shape, 3)))
     return carried_covariance(evidence, nothing, sigmas, views, config.observations)
 
 

@@ -103,6 +103,17 @@ class JointTargets(Rows):
         object.__setattr__(self, "xyz", xyz)
         object.__setattr__(self, "information", information)
 
+    @property
+    def known(self) -> Mask:
+        """(B, J) joints that have a target."""
+        return np.asarray(self.information.any(axis=(2, 3)))
+
+    def where(self, chosen: Mask, times: float = 1.0) -> "JointTargets":
+        """The targets of the `chosen` (B, J) joints, their information `times` this number; none for others."""
+        chosen = chosen & self.known
+        information = np.where(chosen[..., None, None], self.information * times, 0.0)
+        return JointTargets(np.where(chosen[..., None], self.xyz, 0.0), information)
+
     def larger(self, size: Array) -> "JointTargets":
         """The same people `size` (B,) times as large, in a world that is."""
         size = size[:, None, None]
