@@ -91,6 +91,28 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
                 points[n, j] = x
 
 
+@part
+def add_detection(x, camera, focal, at, sigma, fixed_depth, least_depth, reach, by_reach, robust, width, H, g):
+    """Add what a detection `at` (2,), of this `sigma` in pixels, says of a joint at `x` to its information and
+    gradient, if it is within `reach`: whether it is, and the residual, NaN for a joint that is too near or behind
+    the camera. With `by_reach` all are, under a Geman-McClure kernel of that width.
+    """
+    u, v, depth = project(camera, x)
+    if not depth >= least_depth:
+        return False, np.nan, np.nan
+    to_u, to_v = u - at[0], v - at[1]
+    far, reach_px = to_u * to_u + to_v * to_v, reach * focal / (fixed_depth if fixed_depth > 0.0 else depth)
+    if not (by_reach or math.sqrt(far) < reach_px):
+        return False, to_u, to_v
+    weight = 1.0 / (sigma * sigma)
+    if by_reach:
+        weight *= robust_weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
+    else:
+        weight *= robust_weight(robust, far * weight / (width * width))
+    add_view(camera, u, v, depth, to_u, to_v, weight, H, g)
+    return True, to_u, to_v
+
+
 @kernel("f3 f4 f2 f4 f3 f0 f0 f0 b0 i0 f0 b3 f4 f4 f3 f3 f2")
 def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
@@ -107,25 +129,12 @@ def look(
         for j in range(J):
             x, H, g = points[n, j], information[n, j], gradient[n, j]
             for v in range(V):
-                if not sigmas[n, j, v] > 0.0:
-                    continue
-                camera = cameras[n if cameras.shape[0] > 1 else 0, v]
-                at_u, at_v, depth = project(camera, x)
-                if not depth >= least_depth:
-                    continue
-                to_u, to_v = at_u - xy[n, j, v, 0], at_v - xy[n, j, v, 1]
-                residual[n, j, v, 0], residual[n, j, v, 1] = to_u, to_v
-                far = to_u * to_u + to_v * to_v
-                reach_px = reach * focal[n if focal.shape[0] > 1 else 0, v]
-                reach_px /= fixed_depth if fixed_depth > 0.0 else depth
-                inlier[n, j, v] = by_reach or math.sqrt(far) < reach_px
-                if inlier[n, j, v]:
-                    weight = 1.0 / (sigmas[n, j, v] * sigmas[n, j, v])
-                    if by_reach:
-                        weight *= robust_weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
-                    else:
-                        weight *= robust_weight(robust, far * weight / (width * width))
-                    add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
+                if sigmas[n, j, v] > 0.0:
+                    camera = cameras[n if cameras.shape[0] > 1 else 0, v]
+                    of_view = focal[n if focal.shape[0] > 1 else 0, v], xy[n, j, v], sigmas[n, j, v]
+                    inlier[n, j, v], residual[n, j, v, 0], residual[n, j, v, 1] = add_detection(
+                        x, camera, *of_view, fixed_depth, least_depth, reach, by_reach, robust, width, H, g
+                    )
             target[n, j] = x
             A[:] = H
             _eigen(A, values, vectors)

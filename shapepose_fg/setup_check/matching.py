@@ -77,19 +77,27 @@ def size_of(xy: Array) -> Array:
     return np.asarray(np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0))
 
 
+def people_of(found: Detections, place: Index, count: int, least: int) -> tuple[Index, Array, Array]:
+    """The 2D people of one frame of whom `least` joints are seen: views (N,), pixels (N, K, 2) and scores (N, K).
+
+    K is the `count` of joints; pixels are NaN and scores 0 where not seen. `place` (J,) says where among the K each
+    of the detector's joints is, -1 for none.
+    """
+    groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found)]
+    groups = [rows for rows in groups if len(rows) >= least]
+    xy, confidence = np.full((len(groups), count, 2), np.nan), np.zeros((len(groups), count))
+    for person, rows in enumerate(groups):
+        xy[person, place[found.joint[rows]]] = found.xy[rows]
+        confidence[person, place[found.joint[rows]]] = found.confidence[rows]
+    return np.array([found.view[rows[0]] for rows in groups], dtype=np.intp), xy, confidence
+
+
 def _of_frame(found: Detections, frame: int, skeleton: Skeleton) -> Sightings:
     """The 2D people of one frame."""
     place = np.full(len(skeleton), -1)
     place[list(skeleton.core)] = np.arange(len(skeleton.core))
-    groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found) if len(rows) >= MIN_JOINTS]
-    groups = [rows for rows in groups if len(rows) >= MIN_JOINTS]
-    xy = np.full((len(groups), len(skeleton.core), 2), np.nan)
-    confidence = np.zeros(xy.shape[:2])
-    for person, rows in enumerate(groups):
-        xy[person, place[found.joint[rows]]] = found.xy[rows]
-        confidence[person, place[found.joint[rows]]] = found.confidence[rows]
-    view = np.array([found.view[rows[0]] for rows in groups], dtype=np.intp)
-    if len(groups) > _MOST_IN_A_PICTURE:
+    view, xy, confidence = people_of(found, place, len(skeleton.core), MIN_JOINTS)
+    if len(view) > _MOST_IN_A_PICTURE:
         surest = np.lexsort((-confidence.sum(axis=1), view))
         place_in_view = np.arange(len(view)) - np.searchsorted(view[surest], view[surest])
         keep = np.sort(surest[place_in_view < _MOST_IN_A_PICTURE])

@@ -7,7 +7,8 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
+from shapepose_fg.core.pieces import ROBUST, project, triangulated
+from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
@@ -159,18 +160,9 @@ def _linearise(place, candidate, sigma_px, cameras, focal, xy, numbers, L, g, in
         g[i] = L[i, 0] = L[i, 1] = L[i, 2] = 0.0
     for v in range(len(sigma_px)):
         inlier[v] = False
-        if sigma_px[v] == 0:
-            continue
-        (x, y, depth), d = project(cameras[v], place), candidate[v]
-        if not depth >= MIN_DEPTH_M:
-            continue
-        to_x, to_y = x - xy[d, 0], y - xy[d, 1]
-        squared = to_x * to_x + to_y * to_y
-        inlier[v] = np.sqrt(squared) < rho_m * focal[v] / (fixed_m if fixed_m > 0 else depth)
-        if inlier[v]:
-            weight = 1 / (sigma_px[v] * sigma_px[v])
-            weight *= robust_weight(robust, squared * weight / (width * width))
-            add_view(cameras[v], x, y, depth, to_x, to_y, weight, L, g)
+        if sigma_px[v] > 0:
+            of_view = place, cameras[v], focal[v], xy[candidate[v]], sigma_px[v]
+            inlier[v] = add_detection(*of_view, fixed_m, MIN_DEPTH_M, rho_m, False, robust, width, L, g)[0]
 
 
 @part
