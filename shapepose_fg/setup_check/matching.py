@@ -80,8 +80,8 @@ def size_of(xy: Array) -> Array:
 def people_of(found: Detections, place: Index, count: int, least: int) -> tuple[Index, Array, Array]:
     """The 2D people of one frame of whom `least` joints are seen: views (N,), pixels (N, K, 2) and scores (N, K).
 
-    K is the `count` of joints; pixels are NaN and scores 0 where not seen. `place` (J,) says where among the K each
-    of the detector's joints is, -1 for none.
+    K is the `count` of joints; pixels are NaN and scores 0 where not seen. `place` (J,) says where among the K
+    each of the detector's joints is, -1 for none.
     """
     groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found)]
     groups = [rows for rows in groups if len(rows) >= least]
