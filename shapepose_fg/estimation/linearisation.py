@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,6 +21,8 @@ MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
 LEAST_PROBABILITY = 0.01
 """An observation that is less probably the person's counts as if it were this."""
+_DAMPING = 1e-7
+"""Share of the information of the joint that is added in all directions: a ray's length stays as it is."""
 _DEPTH_M = 8.0
 """Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
 the paper's setting."""
@@ -123,14 +126,20 @@ class ViewEvidence:
     gradient: Array
     """(N, J, 3) J^T W r over the inliers, 1/m."""
 
-    target: Array
-    """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
+    @cached_property
+    def target(self) -> Array:
+        """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
 
-    A joint that one view saw stays at its depth and moves onto the ray: directions below 1e-6 of the strongest are
-    left out. NaN where `points` is.
-    """
-    sigma_m: Array
-    """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
+        A joint that one view saw stays at its depth and moves onto the ray. NaN where `points` is.
+        """
+        scale = np.trace(self.information, axis1=-2, axis2=-1)[..., None, None]
+        known = np.where(scale > 0, self.information + _DAMPING * scale * np.eye(3), np.eye(3))
+        return self.points - (inverses(known) @ self.gradient[..., None])[..., 0]
+
+    @cached_property
+    def sigma_m(self) -> Array:
+        """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
+        return weakest_sigma(self.information)
 
     @property
     def message(self) -> JointTargets:
@@ -189,15 +198,14 @@ def linearise(
     shape, kernel = observations.confidence.shape, config.robust_kernel
     inlier, residual = np.zeros(shape, dtype=bool), np.full((*shape, 2), np.nan)
     information, gradient = np.zeros((*shape[:2], 3, 3)), np.zeros((*shape[:2], 3))
-    target, sigma_m = np.empty((*shape[:2], 3)), np.empty(shape[:2])
     look(
         ready(points), views.projection, views.focal, ready(observations.xy),
         ready(np.where(observations.seen, sigmas, 0.0)), config.fixed_depth_m, MIN_DEPTH_M,
         config.rho_2d_m if reach_m is None else reach_m, reach_m is not None, ROBUST[kernel],
         1.0 if kernel is None else DEFAULT_WIDTH_SIGMA[kernel],
-        inlier, residual, information, gradient, target, sigma_m,
+        inlier, residual, information, gradient,
     )  # fmt: skip
-    return ViewEvidence(points, inlier, residual, information, gradient, target, sigma_m)
+    return ViewEvidence(points, inlier, residual, information, gradient)
 
 
 def mean_confidence(observations: Observations, inlier: Mask) -> Array:
