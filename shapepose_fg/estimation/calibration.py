@@ -5,7 +5,7 @@ from importlib.resources import as_file, files
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask, Whole
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
 
 LASTS_S = 0.25
@@ -26,7 +26,7 @@ WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
 class Clues:
     """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
 
-    The last four are means over the frames around (`lasting_mean`).
+    The last four are means over the frames around (`in_time.smoothed_in_time`).
     """
 
     frame: Whole
@@ -111,16 +111,3 @@ def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: A
     away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]
     both = np.eye(3) + information @ np.where(known[..., None, None], covariance, 0.0)
     return np.asarray((away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0], dtype=np.float64)
-
-
-def lasting_mean(values: Array, times_s: Array, where: Mask | None = None) -> Array:
-    """Values (T, J, ...) of one person's joints, averaged over the frames around in which they are `where` (T, J).
-
-    What leads a joint astray in one frame does so in the next; and a joint that is not seen is where doubtful
-    frames left it.
-    """
-    where = np.ones(values.shape[:2], dtype=bool) if where is None else where
-    near = np.exp(-0.5 * ((times_s[:, None] - times_s) / LASTS_S) ** 2) + 1e-9
-    total, flat = np.maximum(near @ where, 1e-9), values.reshape(*where.shape, -1) * where[..., None]
-    whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
-    return (whole / total[..., None]).reshape(values.shape)

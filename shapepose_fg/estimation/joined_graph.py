@@ -26,7 +26,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.carried_error import goes_with_poses
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.trajectory_graph import dilution
+from shapepose_fg.estimation.trajectory_graph import Mounted, dilution
 
 _MAP_S = 15.0
 """Landmarks hold a map together for as long as a detector's errors last, and longer."""
@@ -129,11 +129,9 @@ class JoinedPeople:
 
     def _cameras(self, frame: int, time_s: Array) -> list[gtsam.PinholeCameraCal3_S2 | PosedCamera]:
         """The cameras of a frame whose views are of `time_s` (V,)."""
-        own, middle = self._rig.poses(time_s), np.full(1, time_s.mean())
+        sensors = Mounted(self._rig, np.array([frame]), time_s[None]).sensors[0]
         cameras: list[gtsam.PinholeCameraCal3_S2 | PosedCamera] = list(self._still)
-        for view, on in enumerate(self._rig.carrier.tolist()):
-            if on >= 0:
-                carrier = self._rig.trajectories[on]
-                sensor = gtsam.Pose3(np.linalg.inv(carrier.at(middle)[0]) @ own[view])
-                cameras[view] = PosedCamera(self._lenses[view], self._pose_key(carrier.name, frame), sensor)
+        for view in np.flatnonzero(self._rig.carrier >= 0).tolist():
+            key = self._pose_key(self._rig.trajectories[self._rig.carrier[view]].name, frame)
+            cameras[view] = PosedCamera(self._lenses[view], key, gtsam.Pose3(sensors[view]))
         return cameras

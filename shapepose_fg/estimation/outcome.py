@@ -10,10 +10,10 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
-from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
+from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues, from_body
 from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
-from shapepose_fg.estimation.in_time import carried, waited_s
+from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import ViewEvidence, inverses, linearise, mean_confidence, weakest_sigma
 from shapepose_fg.estimation.motion_model import LOST_M
@@ -138,9 +138,9 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     for person in state.people:
         mine, times_s = person.rows, person.times_s
         alone[mine] = not person.temporal
-        association[mine] = lasting_mean(association[mine], times_s, count[mine] > 0)
+        association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
-            clue[mine] = lasting_mean(clue[mine], times_s)
+            clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
     clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
     return np.where(
         alone[:, None, None, None],
