@@ -11,7 +11,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.pieces import add_view, project, solved
+from shapepose_fg.core.pieces import add_view, project, solved, triangulated
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.fit import Others, match, possible_matches
@@ -21,7 +21,6 @@ from shapepose_fg.setup_check.matching import (
     Pairs,
     Pinhole,
     Sightings,
-    centres_of,
     distances,
     followed,
     least_of_each,
@@ -135,67 +134,40 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     xy, prior = np.ascontiguousarray(xy), np.ascontiguousarray(prior)
     points = np.empty((*prior.shape[:2], 3))
     miss_px, depth, weight = (np.empty(prior.shape) for _ in range(3))
-    to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ np.linalg.inv(views.K)
-    cameras = (views.K @ views.cTw, to_world, centres_of(views))
-    _triangulate(xy, prior, *cameras, steps, points, miss_px, depth, weight)
+    _triangulate(xy, prior, views.K @ views.cTw, views.focal[0], steps, points, miss_px, depth, weight)
     return Structure(points, xy, miss_px, depth, size, weight)
 
 
-@kernel("f4 f3 f3 f3 f2 i0 f3 f3 f3 f3")
+@kernel("f4 f3 f3 f1 i0 f3 f3 f3 f3")
 def _triangulate(
     xy: Array,
     prior: Array,
     cameras: Array,
-    to_world: Array,
-    centres: Array,
+    focal: Array,
     steps: int,
     points: Array,
     miss_px: Array,
     depth: Array,
     weight: Array,
 ) -> None:
-    """`triangulate` with K [R t] as `cameras` (V, 3, 4), from pixels to rays (V, 3, 3), and `centres` (V, 3)."""
-    A, b, x, ray, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    views = len(cameras)
+    """`triangulate` with K [R t] as `cameras` (V, 3, 4), and their `focal` lengths (V,)."""
+    A, b, x, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    views, room = len(cameras), np.empty(len(cameras))
     for p in range(prior.shape[0]):
         for j in range(prior.shape[1]):
-            # The point nearest to all rays d from c: sum of (1 - d d') x = sum of (1 - d d') c.
-            seen = 0
-            for i in range(3):
-                b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
-            for v in range(views):
-                weight[p, j, v] = prior[p, j, v]
-                if prior[p, j, v] > 0:
-                    seen += 1
-                    for i in range(3):
-                        ray[i] = to_world[v, i, 0] * xy[p, j, v, 0] + to_world[v, i, 1] * xy[p, j, v, 1]
-                        ray[i] += to_world[v, i, 2]
-                    length = math.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-                    along = (ray[0] * centres[v, 0] + ray[1] * centres[v, 1] + ray[2] * centres[v, 2]) / length
-                    for i in range(3):
-                        b[i] += centres[v, i] - ray[i] / length * along
-                        for k in range(3):
-                            A[i, k] += (1.0 if i == k else 0.0) - ray[i] * ray[k] / length**2
-            for i in range(3):
-                A[i, i] += 1e-12
-            if seen >= 2:
-                solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], x)
-            else:
-                x[0] = x[1] = x[2] = math.nan
+            x[:] = math.nan
+            if (prior[p, j] > 0).sum() >= 2:
+                triangulated(cameras, focal, xy[p, j], prior[p, j], math.inf, math.inf, -math.inf, room, x)
             for step in range(steps + 1):
                 for i in range(3):
                     b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
                 for v in range(views):
                     u, w, z = project(cameras[v], x)
-                    depth[p, j, v], miss_px[p, j, v] = z, math.nan
-                    if step < steps:
-                        weight[p, j, v] = 0.0
-                    if not (z > 0 and prior[p, j, v] > 0):
-                        continue
-                    du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
-                    square = du * du + dw * dw
-                    miss_px[p, j, v] = math.sqrt(square)
-                    if step < steps:
+                    depth[p, j, v], miss_px[p, j, v], weight[p, j, v] = z, math.nan, 0.0
+                    if z > 0 and prior[p, j, v] > 0:
+                        du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
+                        square = du * du + dw * dw
+                        miss_px[p, j, v] = math.sqrt(square)
                         weight[p, j, v] = prior[p, j, v] / (1 + prior[p, j, v] * square)
                         add_view(cameras[v], u, w, z, du, dw, weight[p, j, v], A, b)
                 if step < steps:
@@ -205,7 +177,7 @@ def _triangulate(
                     solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], step_m)
                     for i in range(3):
                         x[i] -= step_m[i]
-            points[p, j, 0], points[p, j, 1], points[p, j, 2] = x[0], x[1], x[2]
+            points[p, j] = x
 
 
 @dataclass(frozen=True, eq=False)
