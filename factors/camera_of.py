@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 Camera = gtsam.PinholeCameraCal3_S2
 
 _LEAST, _TRIED = 16, 4000
-"""So many points before the camera are enough, and so many are looked at, ever farther away."""
+"""Visible points that the fit needs, and the most points that are tried, ever farther away."""
 _STEP = 1e-6
 _EXACT_PX = 1e-10
 

@@ -52,7 +52,7 @@ class Sighting:
     xy: Array
     """(J, V, 2) where each camera saw them, undistorted pixels; NaN: it did not."""
     sigmas_px: Array
-    """(J, V) and how surely, pixels."""
+    """(J, V) standard deviation of these places per axis, pixels."""
     density: Array
     """(J,) power spectral density of their accelerations, m²/s³."""
     cameras: Sequence[gtsam.PinholeCameraCal3_S2 | PosedCamera]

@@ -27,9 +27,9 @@ class KeySpace:
     space: str | range
     """A character, as in `gtsam.symbol("p", 0)`; or integers, with a step of 1."""
     people: int = 1000
-    """So many identities are told apart."""
+    """Largest number of identities with distinct keys."""
     joints: int = 200
-    """So many joints may a person have."""
+    """Largest number of joints of a person."""
 
     def __post_init__(self) -> None:
         if isinstance(self.space, str):

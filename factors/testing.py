@@ -99,7 +99,7 @@ def _of_linear(factor: gtsam.LinearContainerFactor, values: gtsam.Values) -> NDA
 
 
 def _moved(values: gtsam.Values, key: int, delta: NDArray[np.float64]) -> gtsam.Values:
-    """The same values with one variable moved by `delta` in its tangent space."""
+    """Return the values with one variable moved by `delta` in its tangent space."""
     step = values.zeroVectors()
     step.update(_single(key, delta))
     return values.retract(step)

@@ -31,7 +31,7 @@ class Rows:
             values[index] = getattr(other, name)
 
     def with_rows(self, index: Any, other: Self) -> Self:
-        """The same, with the rows `index` (R,) from `other`."""
+        """Return a copy whose rows `index` (R,) are those of `other`."""
         changed = replace(cast(Any, self), **{name: value.copy() for name, value in self._columns().items()})
         changed.put(index, other)
         return changed

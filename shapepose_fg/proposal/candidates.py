@@ -138,7 +138,7 @@ class _Rays(NamedTuple):
     ray: Array
     """(D, 3) the way of the ray, in the world."""
     length: Array
-    """(D,) of the ray."""
+    """(D,) length of the ray's direction."""
     normal: Array
     """(D, 3, 4) B^T (B, c), where (B, c) are the view's two rows of A: x P_3 - P_1 and y P_3 - P_2."""
 

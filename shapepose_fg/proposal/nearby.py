@@ -39,7 +39,7 @@ class Sight(NamedTuple):
     of_view: Index
     """(D,) which view saw each detection."""
     of_joint: Index
-    """(D,) of which joint."""
+    """(D,) index of the joint of each detection."""
     xy: Array
     """(D, 2) undistorted pixels."""
     confidence: Array
@@ -49,7 +49,7 @@ class Sight(NamedTuple):
     rank: Array
     """(D,) `Detections.rank`."""
     begin: Index
-    """(D + 1,) and the next two (2 E,): `Detections.ties`."""
+    """(D + 1,); `other` and `value` are (2 E,): see `Detections.ties`."""
     other: Index
     value: Array
     limb: Index
@@ -109,8 +109,9 @@ class Nearby:
         return chosen, claims
 
     def with_tied(self, own: Index, unplaced: Mask, sight: Sight) -> "Nearby":
-        """And detections of joints that are `unplaced` (A, J), infinitely far, which affinities tie to people's
-        `own` (A, J, V).
+        """Add detections of `unplaced` joints (A, J) that affinities tie to people's detections `own` (A, J, V).
+
+        Their distance is infinite.
         """
         person, joint, view = np.nonzero(own >= 0)
         mine, views = own[person, joint, view], len(sight.cameras)

@@ -13,7 +13,7 @@ from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connect
 _LEAST_JOINTS = 3
 """Joints of two 2D people that meet, and hang together: two hips may meet by chance."""
 _LEAST_SHARE = 0.25
-"""Of the joints that both have, those that meet: a 2D person may be put together of two people's halves."""
+"""Least share of the joints seen by both views whose rays meet. Below it, halves of two people may be joined."""
 _LEAST_AFFINITY = 0.2
 """Affinities below tie nobody together: unrelated pairs are mostly 0, true ones above 0.4 (as `growth.doubt`)."""
 _SAME_M = 0.2

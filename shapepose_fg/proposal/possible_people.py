@@ -44,7 +44,7 @@ class Frame:
 
     @cached_property
     def sight(self) -> Sight:
-        """The same as kernels take it."""
+        """The frame's arrays as the kernels take them."""
         return Sight.of(self.detections, self.rig, self.skeleton)
 
     @cached_property
@@ -99,7 +99,7 @@ class PossiblePeople:
         return PossiblePeople(*(np.concatenate(each) for each in both))
 
     def completed(self, person: int, part: "PossiblePeople") -> "PossiblePeople":
-        """The same with the joints of `part`, which is one, for those that `person` lacks."""
+        """Return the hypotheses with the joints that `person` lacks taken from `part`, a single one."""
         lacks = np.zeros((*self.places.shape[:2], 1), dtype=bool)
         lacks[person] = np.isnan(self.places[person, :, :1]) & np.isfinite(part.places[0, :, :1])
         both = zip(self._arrays, part._arrays, strict=True)

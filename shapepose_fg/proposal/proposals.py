@@ -196,7 +196,7 @@ class Search:
         return free if enough else None
 
     def among(self, free: Mask) -> "Search":
-        """The same search among some candidates only; what it drops is not counted."""
+        """Return the search restricted to the candidates `free`; what it drops is not counted."""
         both = free[self.links.ends].all(axis=1)
         links = Links(self.links.ends[both], self.links.score[both])
         hidden = replace(self.candidates, joint=np.where(free, self.candidates.joint, -1))

@@ -18,14 +18,14 @@ _ROUNDS = 8
 _PASSES = 2
 """How often detections are given out around the joints of those who were chosen."""
 _SHARED = 0.2
-"""Of its joints, those that a missing part of somebody has in common with that person at most."""
+"""Largest share of its joints that a missing part may have in common with the person that it completes."""
 _SCALE = 0.27
 """Evidence to log-odds: logistic fit to 1561 hypotheses on simulated crowds (two to six cameras); 1240 on the real
 operating room of MVOR gave 0.23."""
 _PRIOR = -1.75
 """Log-odds of a hypothesis without evidence; the same fit (-1.2 in the operating room)."""
 PRIOR_WITH_BODY = -0.3
-"""The same for one whose joints a body could be fitted to, and whose detections were given out again."""
+"""Log-odds of a hypothesis without evidence, after a body was fitted to its joints and detections reassociated."""
 _GAP_M = 0.03
 """How a detection's worth falls off with the gap between its ray and the joint: sigma of a Gaussian."""
 _SINGLE = 0.1
@@ -35,7 +35,7 @@ _BESIDE = 0.5
 _MISSED = 0.2
 """Price of a place where a joint should be seen and is not, in a view that sees the person else."""
 _HIDDEN = 0.07
-"""The same in a view that does not see the person at all: there may be something in between."""
+"""Price of such a place in a view that does not see the person at all: something may hide the person."""
 _TAKEN = 0.07
 """Price of a detection that is better explained by somebody else."""
 _BROKEN = 0.5

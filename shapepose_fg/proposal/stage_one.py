@@ -36,7 +36,7 @@ class StageOne:
     """Where it takes notes."""
 
     def by_hips(self) -> "StageOne":
-        """The same with people sought by their hips, as in the paper, and not judged by evidence."""
+        """Return a stage that grows people from their hips, as in the paper, without judging them by evidence."""
         return replace(self, proposals=replace(self.proposals, evidence=False))
 
     def of_few(self) -> "StageOne":

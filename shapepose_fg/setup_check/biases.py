@@ -166,13 +166,12 @@ class Residuals:
             left = information[person] - of_own.swapaxes(1, 2) @ np.linalg.solve(known, of_own)
             log -= 0.5 * float(np.linalg.slogdet(known * level**2)[1].sum())
             # A joint's bias is the person's own, the shift of the whole person, and what all people have.
-            to = np.zeros((J, information.shape[2], common + C + 3 * V + 1))
-            joints = np.arange(J)[:, None]
-            to[joints, C + np.arange(2 * V), 2 * V * joints + np.arange(2 * V)] = 1.0
-            to[:, np.arange(C), common + np.arange(C)] = 1.0
-            to[:, C + np.arange(3 * V), common + C + np.arange(3 * V)] = 1.0
-            to[:, -1, -1] = 1.0
-            whole = (to.swapaxes(1, 2) @ left @ to).sum(axis=0)
+            whole = np.zeros((common + left.shape[1], common + left.shape[1]))
+            whole[common:, common:] = left.sum(axis=0)
+            for joint in range(J):
+                bias = slice(2 * V * joint, 2 * V * (joint + 1))
+                whole[bias, bias], whole[bias, common:] = left[joint, own, own], left[joint, own]
+                whole[common:, bias] = left[joint, :, own]
             shared = slice(common + C, common + C + 3 * V)
             known = whole[shared, shared] + np.diag(prior)
             log -= 0.5 * float(np.linalg.slogdet(known / prior)[1])

@@ -33,7 +33,7 @@ class SequenceFitter:
     """Fits one shape per group and poses linked in time, from bodies that were found row by row."""
 
     energy: BodyEnergy
-    """Of a row."""
+    """Energy of a row."""
     starts: Callable[[Evidence], tuple[Array, Array, Mask]]
     """Bodies of rows (R) by themselves: parameters (R, P) around their centres, around which angles (R, A) they
     are held, which are good."""

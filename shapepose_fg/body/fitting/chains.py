@@ -63,7 +63,7 @@ class Links:
     """
 
     diagonal: Array
-    """(T, N) of half the Hessian: couplings of one number with itself only."""
+    """(T, N) diagonal of half the Hessian: a parameter is coupled with itself in other rows only."""
     beyond: Array
     """(T, N, n) coupling of a row with the next, the one after, and so on."""
 
@@ -139,9 +139,9 @@ class ChainRows:
     """R rows whose energies are minimised, with the motion prior between them; rows of a chain have one origin."""
 
     energy: BodyEnergy
-    """Of a row."""
+    """Energy of a row."""
     kernel_scale: float
-    """Of the robust kernel."""
+    """Width of the robust kernel, in standard deviations."""
     targets: EnergyTargets
     """(R) where the joints should be."""
     angles: Array
@@ -197,11 +197,11 @@ class _Normal:
     energy: float
     """In squared standard deviations."""
     system: Array
-    """(T, M, P) of each row (`body/kernels/solving.py`)."""
+    """(T, M, P) normal equations of each row (`body/kernels/solving.py`)."""
     pull: Array
     """(T, N) half the gradient of the links."""
     away: Array
-    """(10,) of the betas from their prior."""
+    """(10,) betas minus the mean of their prior."""
 
 
 class _Chain:

@@ -50,7 +50,7 @@ class Held(FitRows):
     """(B, A) free angles."""
 
     def at_shape(self, betas: Array, settled: Mask) -> "Held":
-        """The same, but next to immovable at shapes `betas` (B, 10) in the rows that are `settled` (B,)."""
+        """Return these priors with shapes all but fixed at `betas` (B, 10) in `settled` rows (B,)."""
         stiffness = np.where(settled, SETTLED, self.stiffness)
         return Held(np.where(settled[:, None], betas, self.betas), stiffness, self.angles)
 
@@ -95,8 +95,9 @@ class Evaluated(FitRows):
         solved(self.system, np.full(len(self), -1.0), self.step, self.left)
 
     def covariances(self) -> tuple[Array, Array]:
-        """Of the keypoints of the systems (B, N, 3, 3), m², and of the betas (B, 10, 10): Laplace. Reduces the
-        rest of the systems.
+        """Return the covariances of the systems' keypoints (B, N, 3, 3), m², and of the betas (B, 10, 10).
+
+        Laplace approximation. The rest of the systems is reduced in place.
         """
         B, M, P = self.system.shape
         covariance, shape = np.zeros((B, (M - P - 11) // 3, 3, 3)), np.zeros((B, 10, 10))

@@ -40,7 +40,7 @@ class Evidence(Rows):
 
     @property
     def total_information(self) -> Array:
-        """(B,) of all joints of a row, mean over the axes, 1/m²."""
+        """(B,) information about all joints of a row together, mean over the axes, 1/m²."""
         return np.asarray(np.trace(self.information, axis1=2, axis2=3).sum(axis=1) / 3)
 
 

@@ -79,7 +79,7 @@ class FitStatus(StrEnum):
 
 
 STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
-"""Of arrays that hold any `FitStatus`: one made of a shorter text would cut off the others."""
+"""Type of arrays that hold any `FitStatus`; NumPy would cut longer texts off in a type inferred from one."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class JointTargets(Rows):
         return JointTargets(np.where(chosen[..., None], self.xyz, 0.0), information)
 
     def larger(self, size: Array) -> "JointTargets":
-        """The same people `size` (B,) times as large, in a world that is."""
+        """Return the targets with people and world scaled by `size` (B,)."""
         size = size[:, None, None]
         return JointTargets(self.xyz * size, self.information / size[..., None] ** 2)
 
@@ -217,11 +217,11 @@ class BodyFitter(ABC):
         """
 
     def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """The same bodies where `prior_xyz` and `prior_covariance` are not needed, which may be NaN: faster."""
+        """Fit as `fit` does, but faster: `prior_xyz` and `prior_covariance` may be NaN."""
         return self.fit(targets, initial)
 
     def with_keypoint_offsets(self, offsets: "KeypointOffsets") -> "BodyFitter":
-        """The same fitter for a detector that puts its joints so far from the body's."""
+        """Return a fitter for a detector whose joints have these offsets from the body's."""
         raise NotImplementedError(f"{type(self).__name__} has a model and no with_keypoint_offsets")
 
     def fit_sequence(

@@ -88,7 +88,7 @@ class SmplFitter(BodyFitter):
         self.law = law
         """How bodies of a person move from row to row."""
         self.weights = weights
-        """Of the network; None: it is off."""
+        """Weights of the network; None: no network is used."""
         self.energy = BodyEnergy(self.model, self.prior)
         plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
         names = self.model.keypoint_names
@@ -106,7 +106,7 @@ class SmplFitter(BodyFitter):
         return left_out_sets(self.energy, self.prior)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "SmplFitter":
-        """The same fitter for a detector that puts its joints so far from the body's."""
+        """Return a fitter for a detector whose joints have these offsets from the body's."""
         model = self.model.with_keypoint_offsets(offsets)
         return SmplFitter(model, self.prior, self.config, self.weights, self.law)
 
@@ -119,7 +119,7 @@ class SmplFitter(BodyFitter):
         return self._fit(targets, initial, groups, leave_out=True)
 
     def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """The same bodies in a fraction of the time, without `prior_xyz` and `prior_covariance`, which are NaN."""
+        """Fit as `fit` does in a fraction of the time; `prior_xyz` and `prior_covariance` are NaN."""
         fit = self._fit(targets, initial, None, leave_out=False)
         fit.prior_xyz[:], fit.prior_covariance[:] = np.nan, np.nan
         return fit
@@ -207,7 +207,7 @@ class SmplFitter(BodyFitter):
         return np.concatenate([free for free, _ in found]), Held(*map(np.concatenate, held))
 
     def _one_shape(self, passes: Passes, free: Array, held: Held) -> tuple[Array, Held]:
-        """The same starts, and what holds passes (M), at the shapes upon which those of each pool agree.
+        """Return starts and priors of passes (M) with one shape for each pool of rows.
 
         The passes that vote are fitted by themselves first.
         """

@@ -11,11 +11,11 @@ from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SETS = 6
-"""So many sets: more cost more passes, and leave fewer joints out at a time."""
+"""Number of sets. More sets cost more passes and leave fewer joints out at a time."""
 _POSES = 8
 """Poses of the prior at which the coupling of joints is linearised."""
 _ROOT_INFORMATION = 1e-2
-"""Of the root's rotation and place in that linearisation, 1/rad² and 1/m²: next to nothing."""
+"""Prior information about the root's rotation, 1/rad², and place, 1/m², in that linearisation: negligible."""
 
 
 @dataclass(frozen=True)

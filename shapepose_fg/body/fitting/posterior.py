@@ -18,7 +18,7 @@ class JointPosterior(Rows):
     xyz: Array
     """(B, J, 3) joints, metres."""
     covariance: Array
-    """(B, N, 3, 3) of the joints that were asked for (`Passes.asked`), m² (Laplace)."""
+    """(B, N, 3, 3) covariances of the joints that were asked for (`Passes.asked`), m² (Laplace)."""
     squared: Array
     """(B, J) squared Mahalanobis distance of each joint to its target."""
     left: Array

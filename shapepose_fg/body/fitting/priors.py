@@ -72,7 +72,7 @@ class PosePrior:
         return PosePrior(*(value.astype(np.float64) for value in arrays), provenance=str(data["provenance"]))
 
     def widened(self, factor: float) -> "PosePrior":
-        """The same with standard deviations `factor` times as large."""
+        """Return this prior with standard deviations `factor` times as large."""
         return replace(self, covariance=factor**2 * self.covariance)
 
     def marginal_precision(self, angles: Index) -> Array:
@@ -110,9 +110,9 @@ class MotionPrior:
     """
 
     acceleration: Array
-    """(75,) of the acceleration: rad²/s³, of the place m²/s³."""
+    """(75,) power spectral density of the acceleration: angles rad²/s³, place m²/s³."""
     velocity: Array
-    """(75,) of the velocity: rad²/s, of the place m²/s."""
+    """(75,) power spectral density of the velocity: angles rad²/s, place m²/s."""
     provenance: str
     """Where the motions came from and how the prior was made."""
 

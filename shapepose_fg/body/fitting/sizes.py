@@ -30,16 +30,16 @@ def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a body model says of sizes."""
+    """Stature of a body model by its shape."""
 
     stature_m: float
-    """Of the mean body."""
+    """Stature of the mean body, metres."""
     taller: Array
     """(10,) metres of stature for each beta."""
 
     @classmethod
     def of(cls, body: BodyModel) -> "Sizes":
-        """Of a body model."""
+        """Measure a body model."""
         template, shapes = body.arrays.template, body.arrays.shapes
         top, sole = template[:, 1].argmax(), template[:, 1].argmin()
         return cls(float(template[top, 1] - template[sole, 1]), shapes[top, 1] - shapes[sole, 1])

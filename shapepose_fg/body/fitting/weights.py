@@ -23,7 +23,7 @@ from shapepose_fg.core.storage.files import open_regular, user_cache, write_cont
 _DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
 _KINDS = ("F32", "F64")
-"""Of numbers, as safetensors calls them."""
+"""Number types that are read, by their safetensors names."""
 _CURE = "train or fetch it again"
 _FRAME, _SPREAD = "frame.", "spread"
 

@@ -22,7 +22,7 @@ class Limbs(NamedTuple):
     by_shape: Array
     """(10, 3 L) metres per unit of each beta."""
     shape: Array
-    """(L, 3, 10) the same in another order."""
+    """(L, 3, 10) `by_shape` in another order of axes."""
     by_pose: Array
     """(3 L, 207) metres per unit of each entry of R - I; (0, 207) without pose blend shapes."""
     root: Array
@@ -32,7 +32,7 @@ class Limbs(NamedTuple):
     share: Array
     """(K,) how much of the translation a point takes."""
     parent: Index
-    """(24,) of each bone."""
+    """(24,) index of each bone's parent."""
     column: Index
     """(24,) where the unknowns of each rotation begin; -1 where it is none."""
 
@@ -72,7 +72,7 @@ class Rows(NamedTuple):
     xyz: Array
     """(B, K, 3) targets, metres."""
     information: Array
-    """(B, K, 3, 3) of these, 1/m²."""
+    """(B, K, 3, 3) inverse covariances of the targets, 1/m²."""
     betas: Array
     """(B, 10) around which shape."""
     stiffness: Array
@@ -106,7 +106,7 @@ class Linear(NamedTuple):
 
     @property
     def jacobian(self) -> Array:
-        """(B, 3 N, P) of these keypoints."""
+        """(B, 3 N, P) derivatives of the keypoints by the parameters."""
         return self.system[:, self.system.shape[2] + 1 : -10]
 
 
@@ -125,7 +125,7 @@ class Work(NamedTuple):
     inside: Array
     """(3 L,) the terms in the frames of their bones, metres."""
     term: Array
-    """(3 L,) and in the world."""
+    """(3 L,) the terms in the world, metres."""
     force: Array
     """(3 L,) on them, in the frames of the bones."""
     torque: Array

@@ -117,11 +117,11 @@ class BodyModel:
         return cls(read_smpl_file(Path(path), keypoint_regressor))
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "BodyModel":
-        """The same body with its keypoints where a detector puts them; takes the place of offsets it has."""
+        """Return this body with a detector's keypoint offsets, which replace those that it has."""
         return self._with(offsets=offsets)
 
     def with_keypoints(self, names: tuple[str, ...]) -> "BodyModel":
-        """The same body with other keypoints: a skeleton of `TARGET_SKELETONS`, or any of `BODY_POINTS`."""
+        """Return this body with other keypoints: a skeleton of `TARGET_SKELETONS`, or any of `BODY_POINTS`."""
         return self._with(keypoint_names=names)
 
     def _with(self, **changed: Any) -> "BodyModel":

@@ -12,9 +12,9 @@ _ANKLES, _KNEES = ([SMPL_24.index(f"{side}_{name}") for side in ("right", "left"
 SINK_M = 0.01
 """Bodies may be this far below the floor: flesh and soles give way."""
 _BEND_RAD = 0.6
-"""So far an ankle is bent for it at the most."""
+"""Largest angle by which an ankle is bent to lift a foot, rad."""
 _OF_FEET, _BEYOND = 3, 10
-"""Of the feet's vertices every third is looked at, of the rest of the skin every tenth, 1 to 3 cm apart."""
+"""Every third vertex of the feet is tested, and every tenth of the rest of the skin: 1 to 3 cm apart."""
 _ROWS = 8
 """Bodies whose vertices are made at a time."""
 
@@ -38,7 +38,7 @@ def lowest_of_feet(model: BodyModel, bodies: Bodies, up: Array) -> Array:
 
 
 def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> Bodies:
-    """The same bodies, none of them much deeper than `SINK_M` below the floor `normal` x = `height_m`.
+    """Return the bodies moved so that none is much deeper than `SINK_M` below the floor `normal` x = `height_m`.
 
     A foot that points into it is bent at the ankle, of which views say least; what sinks then is lifted, by
     millimetres mostly. In simulated recordings of 3 to 6 cameras the bodies' joints are as near to the truth as

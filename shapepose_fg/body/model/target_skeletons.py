@@ -18,7 +18,7 @@ TARGET_SKELETONS: dict[str, tuple[str, ...]] = {
 
 
 def _mirrored(name: str) -> str:
-    """The same point on the other side of the body."""
+    """Return the corresponding point on the other side of the body."""
     if name in SMPL_24:
         side, _, part = name.partition("_")
         swap = {"left": "right", "right": "left"}
@@ -27,7 +27,7 @@ def _mirrored(name: str) -> str:
 
 
 MIRROR: tuple[int, ...] = tuple(BODY_POINTS.index(_mirrored(name)) for name in BODY_POINTS)
-"""(K,) the same point on the other side of the body; one in the middle is its own mirror."""
+"""(K,) index of the corresponding point on the other side of the body; of itself for points in the middle."""
 
 
 def slots(names: tuple[str, ...]) -> tuple[int, ...]:
