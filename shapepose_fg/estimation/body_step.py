@@ -8,7 +8,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import ViewEvidence
+from shapepose_fg.estimation.linearisation import ViewEvidence, squared_distance
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 MODEL_SIGMA_M = 0.02
@@ -111,21 +111,9 @@ def disagreement(evidence: ViewEvidence, fit: BodyFit) -> Array:
     the joint of the body that was fitted with it, whose robust kernel stays away from what no pose reaches. Where
     the views leave a direction open, they cannot disagree in it. 0 for rows without a body.
     """
-    model = MODEL_SIGMA_M**2 * np.eye(3)
-    prior = _sigmas_apart(evidence, fit.prior_xyz, fit.prior_covariance)
-    fitted = _sigmas_apart(evidence, fit.joints, np.nan_to_num(fit.covariance) + model)
-    return np.where(fit.ok[:, None], np.fmin(prior, fitted), 0.0)
-
-
-def _sigmas_apart(evidence: ViewEvidence, xyz: Array, covariance: Array) -> Array:
-    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
-    unknown.
-    """
-    known = np.asarray(np.isfinite(xyz).all(axis=2))
-    apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
-    other = np.where(known[..., None, None], covariance, np.eye(3))
-    # (L^-1 + C)^-1 = L (I + C L)^-1, which holds for information L that is singular, too.
-    information = evidence.information
-    weight = information @ np.linalg.inv(np.eye(3) + other @ information)
-    squared = np.einsum("...i,...ij,...j->...", apart, weight, apart)
-    return np.where(known, np.sqrt(np.maximum(squared, 0.0)), np.nan)
+    fitted = np.nan_to_num(fit.covariance) + MODEL_SIGMA_M**2 * np.eye(3)
+    squared = [
+        squared_distance(evidence.message, *body)
+        for body in ((fit.prior_xyz, fit.prior_covariance), (fit.joints, fitted))
+    ]
+    return np.where(fit.ok[:, None], np.sqrt(np.maximum(np.fmin(*squared), 0.0)), 0.0)

@@ -5,8 +5,10 @@ from importlib.resources import as_file, files
 
 import numpy as np
 
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.estimation.linearisation import squared_distance
 
 LASTS_S = 0.25
 """Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
@@ -107,7 +109,4 @@ def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: A
     """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where
     the body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
     """
-    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
-    away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]
-    both = np.eye(3) + information @ np.where(known[..., None, None], covariance, 0.0)
-    return np.asarray((away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0], dtype=np.float64)
+    return np.nan_to_num(squared_distance(JointTargets(prior_xyz, information), joints, covariance))

@@ -4,6 +4,7 @@ import numpy as np
 
 from factors import kernel_weight
 from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.linearisation import ObservationConfig, ViewEvidence, inverses
@@ -55,13 +56,6 @@ def goes_with_poses(
         R, t = carried.wTb[:, number, :3, :3], carried.wTb[:, number, :3, 3]
         arm = points - t[:, None]
         # With a turn w and a way v along the carrier's axes a point goes by R w x arm + R v.
-        goes = np.concatenate([-_cross(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
+        goes = np.concatenate([-hat(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
         found[:, :, number] = gain @ goes
     return found
-
-
-def _cross(v: Array) -> Array:
-    """(..., 3, 3) the matrices of the cross products with vectors (..., 3)."""
-    x, y, z = (v[..., n] for n in range(3))
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
