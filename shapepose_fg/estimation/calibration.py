@@ -5,10 +5,8 @@ from importlib.resources import as_file, files
 
 import numpy as np
 
-from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
-from shapepose_fg.estimation.linearisation import squared_distance
 
 LASTS_S = 0.25
 """Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
@@ -40,7 +38,7 @@ class Clues:
     covariance: Array
     """(N, J, 3, 3) of the graph, errors that last in it, m²."""
     disagreement: Array
-    """(N, J) squared Mahalanobis distance of the joint from where the body has it (`from_body`)."""
+    """(N, J) squared Mahalanobis distance of the joint from where the body has it (`linearisation.squared_distance`)."""
     association: Array
     """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
     draft: Array
@@ -103,10 +101,3 @@ class Calibration:
         added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
         whole = times[..., None, None] * clues.covariance + added
         return np.exp(self.person * clues.person)[..., None, None] * whole
-
-
-def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:
-    """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where
-    the body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
-    """
-    return np.nan_to_num(squared_distance(JointTargets(prior_xyz, information), joints, covariance))

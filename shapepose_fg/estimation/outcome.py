@@ -10,12 +10,19 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
-from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues, from_body
+from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
 from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
-from shapepose_fg.estimation.linearisation import ViewEvidence, inverses, linearise, mean_confidence, weakest_sigma
+from shapepose_fg.estimation.linearisation import (
+    ViewEvidence,
+    inverses,
+    linearise,
+    mean_confidence,
+    squared_distance,
+    weakest_sigma,
+)
 from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
@@ -129,7 +136,7 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
     calibration = Calibration.load(joints)
-    of_body = from_body(state.joints, covariance, body.xyz, body.information)
+    of_body = np.nan_to_num(squared_distance(body, state.joints, covariance))
     association = association_spread(rows, state.sigmas, final, body, state.views, state.config.observations)
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
