@@ -10,12 +10,12 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.setup_check.diagnosis import Diagnosis, build_of, diagnose
-from shapepose_fg.setup_check.findings import SURE, Kind
+from shapepose_fg.setup_check.diagnosis import build_of, put_right
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.small import Problem
 
@@ -140,8 +140,8 @@ def refine(
     The scale is that of the cameras' places beforehand. InputError where hardly anybody is seen by two cameras.
     """
     freedom = Freedom() if freedom is None else freedom
-    diagnosis = diagnose(detections, rig, frames)
-    footage, start = Footage.of(detections, rig, times, frames), _found_again(diagnosis, rig)
+    given, right, findings = put_right(detections, rig, frames)
+    footage, start = Footage.of(detections, rig, times, frames), _found_again(findings, right.views, rig)
     taken = np.unique(footage.sightings.frame)
     halves = np.array_split(taken, 2)
     spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
@@ -171,15 +171,15 @@ def refine(
     sure = 1.0
     if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
         order = [*range(6), 7, 8, 6]  # in which the check has the parameters
-        sure = Problem.of(diagnosis.look).off(freedom.sigmas[order], reference)
+        sure = Problem.of(given).off(freedom.sigmas[order], reference)
     return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature, sure)
 
 
-def _found_again(diagnosis: Diagnosis, rig: Rig) -> Rig:
+def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
     """The rig with cameras that look somewhere else, by degrees, turned to where they see the others' people."""
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
-    turned = {view for each in diagnosis.findings if each.kind in kinds for view in each.cameras}
-    cameras, found = list(rig.cameras), diagnosis.corrected.views
+    turned = {view for each in findings if each.kind in kinds for view in each.cameras}
+    cameras = list(rig.cameras)
     for view in turned:
         camera = rig.cameras[view]
         right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # hardly told from a turn

@@ -38,7 +38,7 @@ class Clues:
     covariance: Array
     """(N, J, 3, 3) of the graph, errors that last in it, m²."""
     disagreement: Array
-    """(N, J) squared Mahalanobis distance of the joint from where the body has it (`linearisation.squared_distance`)."""
+    """(N, J) squared Mahalanobis distance of the joint from where the body has it."""
     association: Array
     """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
     draft: Array

@@ -189,23 +189,30 @@ class Diagnosis:
     """Which cameras a reconstruction is better without."""
 
 
-def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
-    """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
-    evidence = gather(detections, range(len(detections)) if frames is None else frames, len(rig))
+def put_right(detections: DetectionSequence, rig: Rig, frames: range) -> tuple[Look, Look, list[Finding]]:
+    """The set-up as it is given, the same with gross mistakes of cameras put right, and these mistakes."""
+    evidence = gather(detections, frames, len(rig))
     given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
     findings += _blind(given) + _stopped(given)
     look = given if evidence is given.evidence else replace(given, evidence=evidence)  # what it found stays
-    if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
-        return Diagnosis(tuple(findings), given, look)
-    rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
+    rng, enough = np.random.default_rng(0), len(rig) > 1 and len(look.sightings) >= MIN_SIGHTINGS
+    while enough and len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
         findings.append(change.finding)
         look = change.look
+    return given, look, findings
+
+
+def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
+    """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
+    frames = range(len(detections)) if frames is None else frames
+    given, look, findings = put_right(detections, rig, frames)
+    if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
+        return Diagnosis(tuple(findings), given, look)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
         findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
-        trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
+        trust = trust_of(findings, given, look, frames)
         return Diagnosis(tuple(findings), given, look, trust=trust)
     problem = Problem.of(look)
     remaining = lags(refined := replace(look, views=problem.relaxed()))
@@ -215,7 +222,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
             break
         view = max(late, key=lambda view: remaining[view].gain)
         before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
-        if abs(settled[0].lag[view]) > evidence.most_lag:  # it would run on: chance, and no offset
+        if abs(settled[0].lag[view]) > look.evidence.most_lag:  # it would run on: chance, and no offset
             break
         look, problem = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
@@ -228,7 +235,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
     findings += order or _of_people(build, rig)  # joints that are others say nothing of unit and up
-    trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
+    trust = trust_of(findings, given, refined, frames)
     return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 
 
