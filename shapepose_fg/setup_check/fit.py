@@ -194,42 +194,50 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
 
 def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
     """The camera, fitted robustly (Cauchy) to points (N, 3) seen at xy (N, 2)."""
-    ahead = points @ camera.cTw[2, :3] + camera.cTw[2, 3] > 0
+    ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
         return camera
-    points, xy, width_px = points[ahead], xy[ahead], width_px[ahead, None]
+    points, xy, width_px = points[ahead, None], xy[ahead, None, None], width_px[ahead, None, None, None]
 
-    def errors(camera: Pinhole) -> tuple[Array, Array]:
-        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
-        at[:, 2] = np.maximum(at[:, 2], 1e-9)
-        h = at @ camera.K.T
-        return at, (h[:, :2] / h[:, 2:] - xy) / width_px
+    def linearised(views: Views) -> tuple[float, Array, Array]:
+        at, place, by_point = seen_by(points, views)
+        error = (at - xy) / width_px
+        cost = float(np.log1p(error**2).sum()) if (place[..., 2] > 0).all() else np.inf
+        return cost, error, by_parameters(at, place, by_point, views)[..., columns] / width_px[..., None]
 
-    def cost(error: Array) -> float:
-        return float(np.log1p(error**2).sum())
-
-    at, error = errors(camera)
+    views = Views(camera.K[None], camera.cTw[None])
+    cost, error, J = linearised(views)
     for _ in range(_STEPS):
-        by_point = (camera.K[:2] - (xy + width_px * error)[..., None] * camera.K[2]) / at[:, 2, None, None]
-        J = np.empty((len(at), 2, Q))
-        J[..., TURN] = np.cross(at[:, None], by_point)
-        J[..., 3:6], J[..., CENTRE] = by_point, np.eye(2)
-        J[..., FOCAL] = (camera.K[:2, :2] @ (at[:, :2] / at[:, 2:]).T).T[..., None]
-        J = J[..., columns] / width_px[..., None]
-        weight = 1 / (1 + error**2)
-        H = np.einsum("nij,ni,nik->jk", J, weight, J)
-        step = np.zeros((1, Q))
-        step[0, columns] = -np.linalg.lstsq(H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12)[0]
+        weight, step = 1 / (1 + error**2), np.zeros((1, Q))
+        H = np.einsum("...ij,...i,...ik->jk", J, weight, J)
+        step[0, columns] = -np.linalg.lstsq(H, np.einsum("...ij,...i,...i->j", J, weight, error), rcond=1e-12)[0]
         for part in (1.0, 0.25, 0.06):
-            new = changed(Views(camera.K[None], camera.cTw[None]), part * step)
-            tried = Pinhole(new.K[0], new.cTw[0])
-            new_at, new_error = errors(tried)
-            if cost(new_error) < cost(error):
-                camera, at, error = tried, new_at, new_error
+            tried = changed(views, part * step)
+            new = linearised(tried)
+            if new[0] < cost:
+                views, (cost, error, J) = tried, new
                 break
         else:
             break
-    return camera
+    return Pinhole(views.K[0], views.cTw[0])
+
+
+def seen_by(points: Array, views: Views) -> tuple[Array, Array, Array]:
+    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and derivatives of pixels
+    by these places (N, J, V, 2, 3).
+    """
+    at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
+    at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])
+    xy = np.einsum("vab,njvb->njva", views.K[:, :2], at / at[..., 2:])
+    return xy, at, (views.K[:, :2] - xy[..., None] * views.K[:, None, 2]) / at[..., 2, None, None]
+
+
+def by_parameters(xy: Array, at: Array, by_point: Array, views: Views) -> Array:
+    """(N, J, V, 2, Q) derivatives of pixels by the cameras' `PARAMETERS`, where they are as `seen_by` says."""
+    J = np.empty((*xy.shape, Q))
+    J[..., TURN], J[..., MOVE] = np.cross(at[..., None, :], by_point), by_point
+    J[..., CENTRE], J[..., FOCAL] = np.eye(2), (xy - views.K[:, :2, 2])[..., None]
+    return J
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:
