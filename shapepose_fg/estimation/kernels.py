@@ -45,13 +45,17 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
     for n in range(len(points)):
         at = n if len(cameras) > 1 else 0
         for j in range(points.shape[1]):
-            if (confidence[n, j] > 0.0).sum() < 2 or not np.isnan(points[n, j]).any():
+            seen = 0
+            for v in range(xy.shape[2]):
+                if confidence[n, j, v] > 0.0:
+                    seen += 1
+            if seen < 2 or not math.isnan(points[n, j, 0] + points[n, j, 1] + points[n, j, 2]):
                 continue
             agree = triangulated(
                 cameras[at], focal[at], xy[n, j], confidence[n, j], scale_m, reach_m, least_depth, weight, x
             )
             if agree >= 2:
-                points[n, j] = x
+                points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
 
 
 @part
@@ -105,10 +109,12 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, wi
 
     `at` (3,) is anything.
     """
-    T = len(state)
-    g[:T] = right
-    H[:] = diagonal
+    T, d = state.shape
     for t in range(T):
+        for a in range(d):
+            g[t, a] = right[t, a]
+            for b in range(d):
+                H[t, a, b] = diagonal[t, a, b]
         for n in range(weight.shape[2]):
             camera, w = cameras[t if cameras.shape[0] > 1 else 0, n], weight[t, joint, n]
             if w > 0.0:
@@ -191,7 +197,9 @@ def _solve(H, Z, g, x):
                 farthest = abs(g[t, k] - x[t, k])
     if not farthest < _FARTHEST_M:
         return 0.0
-    x[:] = g[:T]
+    for t in range(T):
+        for k in range(d):
+            x[t, k] = g[t, k]
     return farthest
 
 
@@ -223,7 +231,9 @@ def _marginals(H, Z, M, G, S, covariance):
                 for k in range(a, d):
                     total += M[a, k] * M[b, k]
                 S[a, b] = S[b, a] = total
-        covariance[t] = S
+        for a in range(d):
+            for b in range(d):
+                covariance[t, a, b] = S[a, b]
 
 
 @kernel("f3 i1 f4 f4 f3 f4 f4 f3 f3 i0 f0 i0 f0 f4")
@@ -256,4 +266,7 @@ def solve_chains(
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):
-            covariance[c] = np.nan
+            for t in range(T):
+                for a in range(d):
+                    for b in range(d):
+                        covariance[c, t, a, b] = np.nan

@@ -223,8 +223,8 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
 
 
 def seen_by(points: Array, views: Views) -> tuple[Array, Array, Array]:
-    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and derivatives of pixels
-    by these places (N, J, V, 2, 3).
+    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and the derivatives of
+    pixels by these places (N, J, V, 2, 3).
     """
     at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
     at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])

@@ -129,7 +129,7 @@ def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after
     for a in range(people):
         # What nothing is known of stands still: it must not drift along a ray.
         certain = 1 / TRUSTED_M**2
-        velocity[:] = 0.0
+        velocity[0] = velocity[1] = velocity[2] = 0.0
         for j in range(joints):
             if core[j]:
                 certainty = 1 / sigma(covariance[a, j]) ** 2
@@ -139,7 +139,8 @@ def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after
         any_placed = False
         for j in range(joints):
             unseen, was_m = sigma(covariance[a, j]) > _FOLLOW_SIGMA_M, _across(covariance[a, j])
-            moving[:] = mean[a, j]
+            for k in range(size):
+                moving[k] = mean[a, j, k]
             if unseen:
                 for x in range(3):
                     common = velocity[x] / certain

@@ -137,11 +137,12 @@ def _assign(
     """
     gate_m, reach_m, chosen, before = gates[0], gates[1], both[0], both[1]
     nearness, tied, key = reals[0], reals[1], reals[2]
-    before[:] = -1
-    people_count, joints = chosen.shape[:2]
+    people_count, joints, views = chosen.shape
     for a in range(people_count):
         for j in range(joints):
             gate_m[a, j] = 0.0 if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
+            for v in range(views):
+                before[a, j, v] = -1
             reach_m[a, j] = _REACH_M if lost[a, j] or sight.swings[j] else max(gate_m[a, j], OVERLAP_M)
     begins, person, detection, distance_m, score, possible = near
     count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
@@ -166,9 +167,14 @@ def _assign(
             begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied, score,
             possible, key, queue, taken, chosen,
         )  # fmt: skip
-        if (chosen == before).all():
+        changed = False
+        for a in range(people_count):
+            for j in range(joints):
+                for v in range(views):
+                    changed = changed or chosen[a, j, v] != before[a, j, v]
+                    before[a, j, v] = chosen[a, j, v]
+        if not changed:
             break
-        before[:] = chosen
     share(begins, person, detection, distance_m, tied, chosen)
     for e in range(count):
         possible[e] = possible[e] or distance_m[e] < gate_m[person[e], of_joint[detection[e]]]
