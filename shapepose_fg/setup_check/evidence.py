@@ -155,8 +155,11 @@ def _triangulate(
     views, room = len(cameras), np.empty(len(cameras))
     for p in range(prior.shape[0]):
         for j in range(prior.shape[1]):
-            x[:] = math.nan
-            if (prior[p, j] > 0).sum() >= 2:
+            x[0] = x[1] = x[2] = math.nan
+            seen = 0
+            for v in range(views):
+                seen += prior[p, j, v] > 0
+            if seen >= 2:
                 triangulated(cameras, focal, xy[p, j], prior[p, j], math.inf, math.inf, -math.inf, room, x)
             for step in range(steps + 1):
                 for i in range(3):
@@ -177,7 +180,7 @@ def _triangulate(
                     solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], step_m)
                     for i in range(3):
                         x[i] -= step_m[i]
-            points[p, j] = x
+            points[p, j, 0], points[p, j, 1], points[p, j, 2] = x[0], x[1], x[2]
 
 
 @dataclass(frozen=True, eq=False)
