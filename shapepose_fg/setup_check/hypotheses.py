@@ -157,15 +157,13 @@ def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Near
     return Lag(lag, gain, gain / ERROR * worth, agreement, followed)
 
 
-Fit = Callable[[Array, Array, Pinhole], Pinhole | None]
-
 _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
     Kind.INVERTED: lambda R, t: (R.T, -R.T @ t),
     Kind.TRANSPOSED: lambda R, t: (R.T, t),
     Kind.AXES: lambda R, t: (np.diag([1.0, -1.0, -1.0]) @ R, t * (1.0, -1.0, -1.0)),
 }
 """What a pose is after the usual misunderstandings of its file: of one camera, or of all."""
-_FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
+_FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
     (Kind.PRINCIPAL_POINT, fit.centred_to, fit.CENTRE),

@@ -171,10 +171,7 @@ def lasting(times_s: Array) -> Array:
     """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for
     one.
     """
-    if len(times_s) < 2:
-        return np.ones(len(times_s))
-    step = np.diff(times_s)
-    return (np.append(step[:1], step) + np.append(step, step[-1:])) / 2
+    return np.gradient(times_s) if len(times_s) > 1 else np.ones(len(times_s))
 
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
