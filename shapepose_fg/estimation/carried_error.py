@@ -1,5 +1,7 @@
 """What it means for joints that poses of cameras that move are not known exactly."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from factors import kernel_weight
@@ -7,7 +9,14 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
-from shapepose_fg.estimation.linearisation import ObservationConfig, ViewEvidence, inverses
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    ViewEvidence,
+    inverses,
+    linearise,
+    observation_sigmas,
+)
 
 _NOTHING = 1.0
 """What a joint of which nothing is known is known to, 1/m²: a metre."""
@@ -23,6 +32,15 @@ def carried_covariance(
         return np.zeros((*evidence.points.shape, 3))
     goes = goes_with_poses(evidence, body, sigmas, views, config)
     return np.einsum("njbik,nbkl,njbml->njim", goes, views.carried.covariance, goes, optimize=True)
+
+
+def reported_with_poses(
+    rows: Observations, joints: Array, views: Views, config: ObservationConfig, names: Sequence[str]
+) -> Array:
+    """(N, J, B, 3, 6) how `joints` (N, J, 3) called `names`, as they are reported, go with the poses of carriers."""
+    sigmas = observation_sigmas(rows, joints, views, config, names)
+    nothing = JointTargets(joints, np.zeros((*joints.shape, 3)))
+    return goes_with_poses(linearise(rows, sigmas, joints, views, config), nothing, sigmas, views, config)
 
 
 def goes_with_poses(

@@ -17,14 +17,12 @@ from factors import (
     reported_factor,
     robust_kernel,
 )
-from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.carried_error import goes_with_poses
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.carried_error import reported_with_poses
+from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.trajectory_graph import Mounted, dilution
 
@@ -80,12 +78,11 @@ class JoinedPeople:
         density = self._together * motion.density(np.linalg.norm(np.nan_to_num(people.velocity), axis=-1))
         rows = table.observations(people.joints, people.time_s)
         views = Views.of(self._rig, rows.time_s)
-        sigmas = np.sqrt(self._together) * observation_sigmas(
-            rows, people.joints, views, self._config, people.joint_names.tolist()
-        )
+        seen = rows, people.joints, views, self._config, people.joint_names.tolist()
+        sigmas = np.sqrt(self._together) * observation_sigmas(*seen)
         # Where a joint would have been seen at the row's time, by the camera where it was at its own.
         xy = np.where(table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan)
-        goes = self._goes_with_poses(people, rows, views) if views.carried is not None else None
+        goes = reported_with_poses(*seen) if views.carried is not None else None
         for frame in np.unique(people.frame).tolist():
             here = np.flatnonzero(people.frame == frame)
             cameras = self._cameras(frame, rows.time_s[here[0]])
@@ -99,13 +96,6 @@ class JoinedPeople:
             for n in here.tolist():
                 self._report(people, n, views, None if goes is None else goes[n], made)
             yield frame, made
-
-    def _goes_with_poses(self, people: Reconstruction, rows: Observations, views: Views) -> Array:
-        """(N, J, B, 3, 6) how the joints as they are reported go with the poses of carriers."""
-        sigmas = observation_sigmas(rows, people.joints, views, self._config, people.joint_names.tolist())
-        evidence = linearise(rows, sigmas, people.joints, views, self._config)
-        nothing = JointTargets(people.joints, np.zeros((*people.joints.shape, 3)))
-        return goes_with_poses(evidence, nothing, sigmas, views, self._config)
 
     def _report(self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment) -> None:
         """Add the joints of a row as they are reported."""

@@ -11,14 +11,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
-from shapepose_fg.estimation.carried_error import POSES_LAST_S, goes_with_poses
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.carried_error import POSES_LAST_S, reported_with_poses
+from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.window_solution import PersonGraph
 
 if TYPE_CHECKING:
@@ -244,9 +243,7 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
     views = Views.of(rig, seen.time_s)
     assert views.carried is not None
-    sigmas = observation_sigmas(seen, own.joints, views, config, own.joint_names.tolist())
-    evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
-    goes = goes_with_poses(evidence, JointTargets(own.joints, nothing), sigmas, views, config)
+    goes = reported_with_poses(seen, own.joints, views, config, own.joint_names.tolist())
     goes = goes[np.arange(len(rows)), numbers] @ symmetric_root(views.carried.covariance)
     ends = symmetric_root(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(goes, 1, 2).reshape(
         len(rows), 3, -1

@@ -393,7 +393,7 @@ class WindowGraph:
             share = self._motion.views.white_share
             variance = 1.0 / np.maximum(np.linalg.eigvalsh(views.information)[..., 0], 1.0)
             speed, turning = motion_of(near, variance, self.times_s)
-            density = self._motion.density_of(speed, turning)
+            density = self._motion.density(speed, turning=turning)
             if lost is not None:
                 around = near_in_time(lost, self.times_s, self._motion.around_s)
                 of_body = self.present & (self.with_offsets | around)

@@ -197,20 +197,20 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
     ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
         return camera
-    points, xy, width_px = points[ahead, None], xy[ahead, None, None], width_px[ahead, None, None, None]
+    points, xy, width_px = points[ahead, None], xy[ahead], width_px[ahead, None]
 
     def linearised(views: Views) -> tuple[float, Array, Array]:
         at, place, by_point = seen_by(points, views)
-        error = (at - xy) / width_px
+        error = (at[:, 0, 0] - xy) / width_px
         cost = float(np.log1p(error**2).sum()) if (place[..., 2] > 0).all() else np.inf
-        return cost, error, by_parameters(at, place, by_point, views)[..., columns] / width_px[..., None]
+        return cost, error, by_parameters(at, place, by_point, views)[:, 0, 0][..., columns] / width_px[..., None]
 
     views = Views(camera.K[None], camera.cTw[None])
     cost, error, J = linearised(views)
     for _ in range(_STEPS):
         weight, step = 1 / (1 + error**2), np.zeros((1, Q))
-        H = np.einsum("...ij,...i,...ik->jk", J, weight, J)
-        step[0, columns] = -np.linalg.lstsq(H, np.einsum("...ij,...i,...i->j", J, weight, error), rcond=1e-12)[0]
+        H = np.einsum("nij,ni,nik->jk", J, weight, J)
+        step[0, columns] = -np.linalg.lstsq(H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12)[0]
         for part in (1.0, 0.25, 0.06):
             tried = changed(views, part * step)
             new = linearised(tried)
