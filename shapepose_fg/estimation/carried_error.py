@@ -37,7 +37,7 @@ def carried_covariance(
 def reported_with_poses(
     rows: Observations, joints: Array, views: Views, config: ObservationConfig, names: Sequence[str]
 ) -> Array:
-    """(N, J, B, 3, 6) how `joints` (N, J, 3) called `names`, as they are reported, go with the poses of carriers."""
+    """(N, J, B, 3, 6) how `joints` (N, J, 3), which are called `names`, go with the poses of carriers."""
     sigmas = observation_sigmas(rows, joints, views, config, names)
     nothing = JointTargets(joints, np.zeros((*joints.shape, 3)))
     return goes_with_poses(linearise(rows, sigmas, joints, views, config), nothing, sigmas, views, config)
