@@ -32,10 +32,10 @@ def person(five_cameras, two_people) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def message(known, xyz, covariance) -> JointTargets:
-    """What is said of the joints of `known` (..., J); the rest may be NaN."""
+    """What is said of the joints of `known` ([T,] J); the rest may be NaN."""
     information = np.zeros(np.shape(covariance))
     information[known] = np.linalg.inv(covariance[known])
-    return JointTargets(np.array(xyz), information)
+    return JointTargets(np.reshape(xyz, (-1, 25, 3)), information.reshape(-1, 25, 3, 3))
 
 
 def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowGraph:
@@ -70,8 +70,7 @@ class OneFrame:
         self.body = message(pulled, mean, covariance)
 
     def solve(self, initial):
-        body = JointTargets(self.body.xyz[None], self.body.information[None])
-        return self.window.solve(self.inlier[None], body, body, initial[None])[0]
+        return self.window.solve(self.inlier[None], self.body, self.body, initial[None])[0]
 
     def covariance(self):
         return state_covariances([self.window])[0][0][0]
@@ -437,8 +436,7 @@ def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_ca
     graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
     pulled = np.arange(25) == 4
     body = message(pulled, truth + 0.1, np.tile(0.01**2 * np.eye(3), (25, 1, 1)))
-    whole = JointTargets(body.xyz[None], body.information[None])
-    asked = np.ones((1, *sigmas.shape), dtype=bool), whole, whole, truth[None]
+    asked = np.ones((1, *sigmas.shape), dtype=bool), body, body, truth[None]
     plain = graph.window.solve(*asked).copy()
     np.testing.assert_array_equal(graph.window.solve(*asked, pulled[None]), plain)
     assert np.linalg.norm(plain[0, 4] - truth[4]) > 0.02, "it is pulled"
