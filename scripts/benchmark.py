@@ -132,7 +132,9 @@ def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
 
 
 def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
-    """So many frames of a recording, played forwards and backwards in turn: no person jumps."""
+    """A recording of `frames` frames: `recording` played forwards and backwards in turn, so that no person
+    jumps.
+    """
     count = len(recording)
     turns = (divmod(frame, count) for frame in range(frames))
     return Recording(recording.skeleton, [recording[p if turn % 2 == 0 else count - 1 - p] for turn, p in turns])

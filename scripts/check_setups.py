@@ -4,7 +4,7 @@
 
 Simulated rooms of 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same faults are made with a
 detector of the usual errors, and none with detectors that have lasting biases; run from a clone.
-docs/setup_checks.md has the results. About a minute and a half a room on one core.
+docs/evaluation.md has the results. About a minute and a half a room on one core.
 """
 
 import argparse

@@ -41,7 +41,7 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
 those of `tune` there were none for long."""
 FRAMES, FPS = 120, 30.0
 SHARES = (0.5, 0.7, 1.0)
-"""Of joints that no view, one, and more see."""
+"""Shares in the log score of joints that no view, one view, and more views see."""
 FAR = 30.0
 """Squared Mahalanobis distance beyond which the log score's loss grows with its logarithm only."""
 AT_95 = 7.815

@@ -16,11 +16,14 @@ PAGE = ROOT / "docs" / "licences.md"
 EXTRAS = ("detect", "export", "view", "archive", "photos", "cluster", "ros", "hdf5", "train")
 HEAD = """# Licences of what is installed with it
 
-`pip install shapepose-fg` brings the first list, its extras the second, named as each package's own metadata do.
-None asks that programs which use it be under its own licence. opencv-python-headless carries FFmpeg's libraries
-(LGPL-2.1) beside its own; they are separate files that may be exchanged.
+With this page you can check the licences of all packages that are installed. `pip install shapepose-fg` installs
+the first list, and its extras the second. The names of the licences are those in the metadata of the packages.
 
-Our code is MIT; what the body and priors are made from is in the [README](../README.md#licence-and-credits).
+None of them requires that programs which use it have the same licence. opencv-python-headless contains the
+libraries of FFmpeg (LGPL-2.1); they are separate files that may be exchanged.
+
+Our code is under the MIT licence. The sources of the body and the priors are in the
+[README](../README.md#licence-and-credits).
 """
 _SHORT = {
     "apache software license": "Apache-2.0",

@@ -18,7 +18,7 @@ from shapepose_fg.setup_check.small import Problem
 
 LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 RATIOS = (0.3, 1.0, 3.0)
-"""Of shifts and enlargements, over a joint's bias."""
+"""Standard deviations of shifts and of enlargements, relative to that of a joint's bias."""
 
 
 def main() -> None:

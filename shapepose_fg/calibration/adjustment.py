@@ -26,7 +26,8 @@ Q = 13
 _HELD = 1e-6
 """Sigma of what must not change, as a part of what it would be."""
 _HELD_PX = 0.1
-"""The same of what lenses hold, pixels; tighter constraints of single numbers would damp what they share."""
+"""Standard deviation that is added to those of the intrinsics and of the lens, pixels; tighter constraints of
+single numbers would damp what they share."""
 _ANYWHERE_M = 10.0
 _STEPS = 6
 _ENOUGH = 1e-4
@@ -51,7 +52,7 @@ class Freedom:
 
     @property
     def sigmas(self) -> Array:
-        """(Q,) of each parameter of a camera, one sigma."""
+        """(Q,) prior standard deviation of each parameter of a camera."""
         turn, move = np.radians(self.turn_deg) / np.sqrt(3), self.move_m / np.sqrt(3)
         return np.array([turn] * 3 + [move] * 3 + [self.focal] + [self.centre_px] * 2 + [self.lens] * 4)
 
@@ -63,14 +64,15 @@ class Adjusted:
     rig: Rig
     """The cameras."""
     covariance: Array
-    """(V, Q, V, Q) of their parameters as against the rig as a whole: where that stands is the given rig's."""
+    """(V, Q, V, Q) covariance of the cameras' parameters relative to the rig as a whole, whose place is that of
+    the given rig."""
     people: People
     """Their joints moved to where the cameras see them."""
     scale: float
     """The detector's errors as a part of what was measured of detectors: robust, from the residuals."""
 
     def sigma(self, part: slice) -> Array:
-        """(V,) of a part of the parameters, root of the summed variances."""
+        """(V,) standard deviation of some of the parameters together: root of their summed variances."""
         variance = np.einsum("vqvq->vq", self.covariance)[:, part]
         return np.sqrt(np.maximum(variance, 0.0).sum(axis=1))
 
@@ -218,7 +220,7 @@ def _information(
 
 
 def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | None, scaled: bool) -> Array:
-    """(V, Q, V, Q) of the cameras' parameters, without what the rig may move, or grow, as a whole."""
+    """(V, Q, V, Q) covariance of the cameras' parameters, without what moves, or scales, the rig as a whole."""
     V = len(rig)
     prior = np.tile(sigmas, (V, 1))
     if reference is not None:

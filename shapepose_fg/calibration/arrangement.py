@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from factors.noise import gaussian, robust_kernel
 from shapepose_fg.calibration.relative import Relative
@@ -29,11 +31,12 @@ class Edge:
     score: float
     """How well what both saw fits (`Relative.score`)."""
     covariance: Array
-    """(6, 6) of bTa, as GTSAM's poses change: in the first camera's frame."""
+    """(6, 6) covariance of bTa as GTSAM's poses change, in the first camera's frame: rotation, rad, then
+    translation, m."""
 
     @classmethod
     def of(cls, pair: Relative, metres: float) -> "Edge":
-        """Of a pair whose cameras are `metres` apart."""
+        """Edge of a pair whose cameras are `metres` apart."""
         bTa = np.eye(4)
         bTa[:3, :3], bTa[:3, 3] = pair.R, metres * pair.t
         way = pair.t / np.linalg.norm(pair.t)
@@ -99,9 +102,6 @@ def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
 
 def parts(pairs: Mapping[tuple[int, int], object], views: int) -> list[list[int]]:
     """The cameras that are connected by `pairs`, part by part, the largest first."""
-    part = list(range(views))
-    for a, b in pairs:
-        old, new = part[b], part[a]
-        part = [new if each == old else each for each in part]
-    found = [[view for view in range(views) if part[view] == name] for name in dict.fromkeys(part)]
-    return sorted(found, key=len, reverse=True)
+    ends = np.array(list(pairs), dtype=np.intp).reshape(-1, 2).T
+    count, part = connected_components(coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(views, views)))
+    return sorted((np.flatnonzero(part == n).tolist() for n in range(count)), key=len, reverse=True)

@@ -74,7 +74,8 @@ class Calibrated:
     apart_deg: Array
     """(V,) by how much the turns of halves of the recording differ, each found without the other."""
     apart_m: Array
-    """(V,) the same of the places."""
+    """(V,) distance between the places of each camera as halves of the recording give them, each without the
+    other, metres."""
     held_out_px: float
     """Median distance of a joint from where the other cameras put it, on halves that were not used."""
     counts: Index
@@ -82,7 +83,8 @@ class Calibrated:
     explained: Array
     """(V,) which part of the people that each saw another camera saw too."""
     missed_px: Array
-    """(N, V) the same distances one by one; NaN where unknown."""
+    """(N, V) distances of joints from where the other cameras put them, on halves that were not used, pixels;
+    NaN where unknown."""
     notes: tuple[str, ...] = field(default=())
     """What is weak, a sentence each."""
 
@@ -152,7 +154,7 @@ def calibrate(
             raise Undetermined(tuple(_apart(rig, connected)))
         edges = {pair: _edge(each, detections.skeleton, measured.stature_m) for pair, each in pairs.items()}
         few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
-        start = how.settled(few, _posed(rig, arranged(edges, views)), _ROUGH).rig
+        start = how.settled(few, rig.at_poses(arranged(edges, views)), _ROUGH).rig
     adjusted = how.settled(footage, start, _ROUNDS)
     halves, missed = list[Rig](), list[Array]()
     for used, left in (both := np.array_split(taken, 2)), both[::-1]:
@@ -230,13 +232,6 @@ def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
     return Edge.of(pair, metres if np.isfinite(metres) else 3.0)
 
 
-def _posed(rig: Rig, poses: Array) -> Rig:
-    """The rig with its cameras at `poses` (V, 4, 4)."""
-    return replace(
-        rig, cameras=tuple(replace(each, wTc=wTc) for each, wTc in zip(rig.cameras, poses, strict=True))
-    )
-
-
 @dataclass(frozen=True)
 class _How:
     """What rounds of adjusting have in common."""
@@ -257,7 +252,7 @@ class _How:
                 raise Undetermined(
                     (f"only {len(people)} people are seen by two cameras at once, 10 are the least; {_FILM}",)
                 )
-            given = _posed(self.given, np.stack([camera.wTc for camera in now.cameras]))
+            given = self.given.at_poses(now.wTc)
             spread = dilution(self.times.frame_s[np.unique(people.frame)])
             adjusted = adjust(given, now, people, self.freedom, spread, misfit(people, now), scaled=True)
             factor = scale_of(adjusted.people, self.skeleton, self.stature_m)

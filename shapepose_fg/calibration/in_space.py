@@ -31,13 +31,13 @@ class InSpace:
     """People in space, and their tracks: offsets are those at which each camera sees what the others place."""
 
     tracks: list[Tracks]
-    """Of each camera."""
+    """Tracks of each camera."""
     views: Views
     """The cameras."""
     shift: Array
     """(V,) frames: frame f of the first camera is frame f + shift of another."""
     time: Index
-    """(P,) of each person, frames of the first camera."""
+    """(P,) time of each person, frames of the first camera."""
     member: Index
     """(P, V) the track of each person in each camera; -1 for none."""
     step: int

@@ -1,11 +1,12 @@
 """A rig without a world gets one: metres from people's stature, up from who stands, the floor at 0."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
@@ -68,7 +69,7 @@ class World:
     """How a rig was laid on the floor."""
 
     sigma_scale: float
-    """Of the scale, as a part of it, one sigma."""
+    """Standard deviation of the scale, as a share of the scale."""
     stature_m: float
     """Median stature of the people, metres, at this scale."""
     persons: int
@@ -86,14 +87,11 @@ def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> flo
     return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
 
 
-def scaled(rig: Rig, factor: float) -> Rig:
-    """The rig with all distances `factor` times as large."""
-    cameras = []
-    for camera in rig.cameras:
-        wTc = camera.wTc.copy()
-        wTc[:3, 3] *= factor
-        cameras.append(replace(camera, wTc=wTc))
-    return replace(rig, cameras=tuple(cameras))
+def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
+    """The rig with all distances from the `fixed` point (3,), by default the origin, `factor` times as large."""
+    wTc = rig.wTc
+    wTc[:, :3, 3] = fixed + factor * (wTc[:, :3, 3] - fixed)
+    return rig.at_poses(wTc)
 
 
 def at_once(people: People) -> int:
@@ -135,11 +133,8 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -
     R = np.stack([x, np.cross(up, x), up])
     move = -R @ at
     move[2] = -bottom
-    cameras = []
-    for camera in rig.cameras:
-        wTc = camera.wTc.copy()
-        wTc[:3] = R @ wTc[:3]
-        wTc[:3, 3] += move
-        cameras.append(replace(camera, wTc=wTc))
+    wTc = rig.wTc
+    wTc[:, :3] = R @ wTc[:, :3]
+    wTc[:, :3, 3] += move
     world = World(sigma_scale, build.stature, at_once(people), floor, upright)
-    return Rig(tuple(cameras), "z"), world
+    return Rig(rig.at_poses(wTc).cameras, "z"), world

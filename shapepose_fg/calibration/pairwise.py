@@ -15,7 +15,7 @@ from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
 _GATE = 0.06
 """Tracks whose rays miss each other by more than this part of the person's size are not one person."""
 _MOST_SAMPLES = 3000
-"""Of each pair of cameras, frames of tracks."""
+"""Maximum number of frames of tracks that are compared for a pair of cameras."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Pairwise:
     """Tracks of all cameras, and what is thought of their clocks."""
 
     tracks: list[Tracks]
-    """Of each camera."""
+    """Tracks of each camera."""
     views: Views
     """The cameras."""
     shift: Array
@@ -81,7 +81,9 @@ class Pairwise:
         return miss, np.einsum("njk,njk->nj", normal, speed) / size[:, None]
 
     def nearest(self, reach: float, step: float) -> "Pairwise":
-        """The same with shifts that fit best among those within `reach` frames, camera after camera."""
+        """Return a copy with the shifts that fit best among those within `reach` frames, found camera after
+        camera.
+        """
         V, shift = len(self.tracks), self.shift.copy()
         pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
         tried = np.arange(-reach, reach + step / 2, step)

@@ -33,7 +33,8 @@ class People:
     xy: Array
     """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
     sigma_px: Array
-    """(P, J, V) of each detection on each axis, as the detector was measured; NaN where there is none."""
+    """(P, J, V) standard deviation of each detection per axis, pixels, as measured for the detector; NaN where
+    there is none."""
     points: Array
     """(P, J, 3) where the cameras put the joints, metres; NaN where fewer than two saw them."""
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.levelling import scaled
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig, Views
@@ -54,7 +55,8 @@ class Refinement:
     """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
     used; given cameras."""
     after_px: float
-    """The same with cameras that were refined by the other half of the recording."""
+    """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
+    used; cameras refined on the other half of the recording."""
     counts: Index
     """(V,) people, one per frame, by whom each camera was adjusted."""
     notes: tuple[str, ...] = field(default=())
@@ -79,14 +81,8 @@ class Refinement:
         return self.adjusted.rig if self.better else self.given
 
     def of_stature(self, stature_m: float) -> Rig:
-        """The same, farther apart or nearer, so that people have this stature in the median."""
-        factor, middle = stature_m / self.stature_m, self.rig.centres.mean(axis=0)
-        cameras = []
-        for camera in self.rig.cameras:
-            wTc = camera.wTc.copy()
-            wTc[:3, 3] = middle + factor * (wTc[:3, 3] - middle)
-            cameras.append(replace(camera, wTc=wTc))
-        return replace(self.rig, cameras=tuple(cameras))
+        """Return `rig` scaled so that people have the median stature `stature_m`."""
+        return scaled(self.rig, stature_m / self.stature_m, self.rig.centres.mean(axis=0))
 
     def change(self) -> dict[str, Array]:
         """(V,) how far each camera was adjusted: turn in degrees, move in mm, focal in %, centre in pixels."""
@@ -100,7 +96,7 @@ class Refinement:
         return {name: np.array(each) for name, each in zip(_UNITS, (turn, move, focal, centre), strict=True)}
 
     def sigma(self) -> dict[str, Array]:
-        """(V,) of the same, in the same units."""
+        """(V,) standard deviations of what `change` gives, in the same units."""
         each = {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
         return each
 

@@ -39,7 +39,8 @@ _FINALISTS = 6
 """Guesses that are refined."""
 _STEPS = 8
 _DILUTION = 25.0
-"""So many errors of joints are one: those of a person at one moment, and of moments that are near each other."""
+"""Number of correlated errors of joints that count as one independent error: those of a person in one frame,
+and in frames that are near each other."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +50,13 @@ class Relative:
     R: Array
     """(3, 3) rotation."""
     t: Array
-    """(3,) of length one."""
+    """(3,) direction of the translation, of length one."""
     score: float
     """How much of what both saw at a time is matched, and how well: 1 if all is without error, 0 if nothing."""
     seconds: float
     """Person-seconds that are matched."""
     covariance: Array
-    """(6, 6) of a small turn w before R, rad, and of a change of t, which has none along t."""
+    """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along t."""
     points: Array
     """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN where not seen by both."""
 
@@ -87,8 +88,11 @@ class _Together:
         """Which pairs of tracks (K,) are one person each, the best first, and what that is worth."""
         worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
         order = np.argsort(-worth, kind="stable")
-        kept = np.zeros(len(miss), dtype=np.bool_)
-        _choose(order[worth[order] > 0], self.tracks, *self.alike, kept)
+        kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
+        for n in order[worth[order] > 0].tolist():
+            # Nobody's track is that of two people at once.
+            rival = ((a == a[n]) & self.alike[1][b[n], b]) | ((b == b[n]) & self.alike[0][a[n], a])
+            kept[n] = not (kept & rival).any()
         return kept, float(worth[kept].sum() / max(self.possible, 1))
 
     def joints(self, kept: Mask) -> tuple[Array, Array, Array]:
@@ -167,7 +171,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
 
 
 def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Of the four poses that an essential matrix allows, that with most joints in front of both cameras."""
+    """Return that of the four poses of an essential matrix which has most joints in front of both cameras."""
     one, two, t = (np.asarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(E))
     ways = [(R, sign * t[:, 0]) for R, sign in product((one, two), (1.0, -1.0))]
     return max(ways, key=lambda way: int(_meeting(*way, a, b)[1].sum()))
@@ -274,19 +278,3 @@ def _misses(
             if seen >= MIN_JOINTS:
                 total[h, pair[n]] += miss / seen
                 count[h, pair[n]] += 1
-
-
-@kernel("i1 i2 b2 b2 b1")
-def _choose(order: Index, tracks: Index, same_a: Mask, same_b: Mask, kept: Mask) -> None:
-    """Marks in `kept` (K,) pairs of tracks in `order`, none that gives a track two people at once."""
-    for n in range(len(order)):
-        a, b = tracks[order[n], 0], tracks[order[n], 1]
-        free = True
-        for m in range(n):
-            other = order[m]
-            if kept[other]:
-                c, d = tracks[other, 0], tracks[other, 1]
-                if (a == c and same_b[b, d]) or (b == d and same_a[a, c]):
-                    free = False
-                    break
-        kept[order[n]] = free

@@ -8,14 +8,15 @@ repeat themselves: of the offsets that stand out those are taken at which one po
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from shapepose_fg.calibration.pairwise import fast_part
 from shapepose_fg.calibration.relative import relative
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.compiled import kernel
 
 _STEP_S = 0.04
 """Between frames that are compared."""
@@ -54,7 +55,7 @@ def offsets_without_poses(
     for a, b in product(range(len(tracks)), repeat=2):
         if a < b:
             curves[a, b] = np.zeros(2 * most + 1)
-            _alike(*parts[a], *parts[b], round(_LEAST_S * fps / step), _LEAST_ALIKE, curves[a, b])
+            _add_likeness(curves[a, b], parts[a], parts[b], round(_LEAST_S * fps / step))
             curves[b, a] = curves[a, b][::-1]
     fits = dict[tuple[int, int, int], float]()
 
@@ -109,60 +110,40 @@ def _peaks(
     return found
 
 
-def _rises(tracks: Tracks, step: int, fps: float) -> tuple[Array, Index, Index]:
-    """How joints rise (N, J), one sample every `step` frames, 0 where unknown; where tracks begin in it, and its
-    end (K + 1,); and the number of the sample at which each begins (K,).
-    """
+class _Rises(NamedTuple):
+    """How fast the joints of one camera's tracks rise."""
+
+    values: list[Array]
+    """Speeds (N, J) of each track, in parts of the person's size a frame; 0 where unknown."""
+    begins: Index
+    """(K,) the number of each track's first sample."""
+
+
+def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
+    """How joints rise, one sample every `step` frames."""
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
     known = np.abs(values) < _FASTEST / fps  # nor NaN
     (values,) = fast_part((np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps)
     kept = np.flatnonzero(tracks.frame % step == 0)
     _, first = np.unique(tracks.track[kept], return_index=True)
     begins = (tracks.frame[kept] // step)[first]
-    return np.ascontiguousarray(values[kept]), np.append(first, len(kept)).astype(np.intp), begins
+    return _Rises(np.split(values[kept], first)[1:], begins)
 
 
-@kernel("f2 i1 i1 f2 i1 i1 i0 f0 f1")
-def _alike(
-    a: Array,
-    first_a: Index,
-    begin_a: Index,
-    b: Array,
-    first_b: Index,
-    begin_b: Index,
-    least: int,
-    least_alike: float,
-    worth: Array,
-) -> None:
-    """Adds to `worth` (2 L + 1,), at offsets -L to L of b against a, how improbable by chance tracks are alike."""
-    middle, joints = len(worth) // 2, a.shape[1]
-    power_a, power_b = np.zeros(len(a) + 1), np.zeros(len(b) + 1)
-    for n in range(len(a)):
-        power_a[n + 1] = power_a[n]
-        for j in range(joints):
-            power_a[n + 1] += a[n, j] ** 2
-    for n in range(len(b)):
-        power_b[n + 1] = power_b[n]
-        for j in range(joints):
-            power_b[n + 1] += b[n, j] ** 2
-    for i in range(len(begin_a)):
-        for k in range(len(begin_b)):
-            many, other = first_a[i + 1] - first_a[i], first_b[k + 1] - first_b[k]
-            dots = np.zeros(many + other)
-            for t in range(many):
-                for u in range(other):
-                    dot = 0.0
-                    for j in range(joints):
-                        dot += a[first_a[i] + t, j] * b[first_b[k] + u, j]
-                    dots[u - t + many] += dot
-            for n in range(1, many + other):
-                apart = n - many
-                place = begin_b[k] - begin_a[i] + apart + middle
-                begin, end = max(0, -apart), min(many, other - apart)
-                if end - begin < least or place < 0 or place >= len(worth) or dots[n] <= 0:
-                    continue
-                energy = power_a[first_a[i] + end] - power_a[first_a[i] + begin]
-                energy *= power_b[first_b[k] + end + apart] - power_b[first_b[k] + begin + apart]
-                square = dots[n] ** 2 / max(energy, 1e-12)
-                if square > least_alike**2:
-                    worth[place] -= (end - begin) * np.log(max(1 - square, 1e-6))
+def _add_likeness(worth: Array, a: _Rises, b: _Rises, least: int) -> None:
+    """Add to `worth` (2 L + 1,), at offsets -L to L of b against a, how improbable by chance tracks are alike.
+
+    Tracks are compared where at least so many samples are common.
+    """
+    for one, begin_one in zip(a.values, a.begins, strict=True):
+        for other, begin_other in zip(b.values, b.begins, strict=True):
+            apart = np.arange(1 - len(one), len(other))
+            dots = fftconvolve(other, one[::-1], axes=0).sum(axis=1)
+            start, stop = np.maximum(0, -apart), np.minimum(len(one), len(other) - apart)
+            power, power_other = (np.append(0.0, np.cumsum((each**2).sum(axis=1))) for each in (one, other))
+            energy = (power[stop] - power[start]) * (power_other[stop + apart] - power_other[start + apart])
+            square = dots**2 / np.maximum(energy, 1e-12)
+            place = begin_other - begin_one + apart + len(worth) // 2
+            alike = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
+            alike &= (place >= 0) & (place < len(worth))
+            worth[place[alike]] -= (stop - start)[alike] * np.log(np.maximum(1 - square[alike], 1e-6))

@@ -24,21 +24,21 @@ class Scan:
     """One camera's people at some frames, and all of another's."""
 
     normal: Array
-    """(A, J, 3) of the plane through both cameras and a joint."""
+    """(A, J, 3) normals of the planes through both cameras and a joint."""
     frame: Index
-    """(A,)."""
+    """(A,) frame of each person of the first camera."""
     rays: Array
-    """(S, J, 3) of the other camera, in order of frames."""
+    """(S, J, 3) rays of the other camera, in the order of its frames."""
     size: Array
-    """(S,) rad."""
+    """(S,) size of each person of the other camera, rad."""
     first: Index
-    """(T + 1,) where each of the other's frames begins, from `begin` on."""
+    """(T + 1,) index of the first person of each of the other camera's frames, from frame `begin` on."""
     begin: int
-    """Its first frame."""
+    """First frame of the other camera."""
 
     @classmethod
     def of(cls, sightings: Sightings, views: Views, a: int, b: int) -> "Scan":
-        """Of the cameras `a` and `b`."""
+        """Scan of cameras `a` and `b`."""
         one, other = (sightings.rows(sightings.view == view) for view in (a, b))
         taken = np.unique(one.frame)
         wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]

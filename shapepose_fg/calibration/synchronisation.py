@@ -38,7 +38,8 @@ _WORST_S = 0.05
 _WIDER = 1.5
 """Sigmas are multiplied by this: as they come, 82 % of 95 % regions hold, Shelf among them; with it 92 %."""
 WHOLE_S, _END_S, _DRIFT_S = 180.0, 60.0, 2.0
-"""Of longer recordings the first seconds are looked at; and the last, for a drift of up to so many."""
+"""Duration that is used of a longer recording, s; duration at its end that is used to estimate drift, s; and
+the largest drift that is searched there, s."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, 
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast, get_type_hints
 
 import typer
 
@@ -38,7 +38,7 @@ def option(group: str, text: str, default: Any = None, *names: str, **more: Any)
 
 
 def argument(metavar: str, text: str) -> Any:
-    """The same, given by its place in the line."""
+    """Declare a positional argument of a command."""
     return field(metadata={"typer": typer.Argument(metavar=metavar, help=text)})
 
 
@@ -220,7 +220,7 @@ class Located(DetectionOptions):
         return replace(given, fps=self.source.fps)
 
     def given(self) -> dict[str, object]:
-        """The same for the next command, but for the calibration and what is said of it."""
+        """Options of the next command for the same detections and joints, the calibration left out."""
         if self.source is None:
             return {"--detections": self.detections, "--skeleton": self.skeleton}
         return {"--project": self.source.folder, "--skeleton": self.skeleton}
@@ -233,21 +233,23 @@ class ProjectOptions(DetectionOptions):
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
 
+    def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
+        """The options with the places that a project says, and the project; `tell` is given its notes."""
+        if self.project is None:
+            return self, None
+        from shapepose_fg.io.pose2sim_project import read_pose2sim_project
+
+        source = read_pose2sim_project(self.project)
+        tell(*source.notes)
+        calibration, detections = self.calibration or source.calibration, self.detections or source.detections
+        return replace(self, calibration=calibration, detections=detections), source
+
     def located(self) -> Located:
         """Where they are; InputError where that is not said."""
-        calibration, detections, source = self.calibration, self.detections, None
-        if self.project is not None:
-            from shapepose_fg.io.pose2sim_project import read_pose2sim_project
-
-            source = read_pose2sim_project(self.project)
-            note(*source.notes)
-            calibration, detections = calibration or source.calibration, detections or source.detections
-        if calibration is None or detections is None:
-            places = {"--calibration": calibration, "--detections": detections}
-            missing = " and ".join(name for name, place in places.items() if place is None)
-            raise InputError(f"{missing}: missing; give them, or --project with the folder of a Pose2Sim project")
-        given = {each.name: getattr(self, each.name) for each in fields(DetectionOptions)}
-        return Located(**given | {"calibration": calibration, "detections": detections, "source": source})
+        whole, source = self.completed()
+        refuse_missing({"--calibration": whole.calibration, "--detections": whole.detections})
+        given = {each.name: getattr(whole, each.name) for each in fields(DetectionOptions)}
+        return Located(**given, source=source)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,7 +303,7 @@ class RateOptions(TimeOptions):
         return recording, FrameTimes.assumed(count) if times is None else times, span
 
     def given(self) -> dict[str, object]:
-        """The same options for the next command."""
+        """Options of the next command for the same times and frames."""
         return {"--fps": self.fps, "--timestamps": self.timestamps, "--frames": self.frames}
 
 
@@ -338,6 +340,14 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
     """How to go on, as a line to copy: `reconstruct` with those options that are given."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def refuse_missing(places: Mapping[str, Path | None]) -> None:
+    """InputError where one of the options, by their names, is not given, and no project says it."""
+    missing = [name for name, place in places.items() if place is None]
+    if missing:
+        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
+        raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
 
 
 def names_of(text: str | None) -> list[str] | None:

@@ -15,7 +15,7 @@ class Stopped(BaseException):
     def __init__(self, number: int, message: str = "") -> None:
         super().__init__(message)
         self.number = number
-        """Of the signal."""
+        """Number of the signal."""
         self.message = message
         """Where the work stands, and how to go on."""
 

@@ -6,9 +6,9 @@ from typing import Annotated, Any, get_type_hints
 from annotated_types import Interval
 
 Metres = Annotated[float, Interval(gt=0, le=10)]
-"""A distance between joints, people or rays."""
+"""A distance between joints, people or rays, m; above 0."""
 MetresOrNone = Annotated[float, Interval(ge=0, le=10)]
-"""The same, which may be 0: the setting's docstring says what that means."""
+"""A distance, m, at least 0; the setting's docstring states what 0 means."""
 Seconds = Annotated[float, Interval(gt=0, le=60)]
 """A time in which people move."""
 Speed = Annotated[float, Interval(gt=0, le=100)]

@@ -199,6 +199,11 @@ class Rig:
             self, cameras=cameras, dark=dark, doubted=doubted, trajectories=trajectories, unwanted=unwanted
         )
 
+    def at_poses(self, wTc: Array) -> "Rig":
+        """The rig with its cameras at world-from-camera poses (V, 4, 4)."""
+        cameras = (replace(camera, wTc=each) for camera, each in zip(self.cameras, wTc, strict=True))
+        return replace(self, cameras=tuple(cameras))
+
     def without(self, names: Iterable[str]) -> "Rig":
         """A rig with all cameras but those of these names; ValueError where there is no such camera."""
         return self.only(choose(self.names, without=list(names)))
@@ -254,6 +259,11 @@ class Rig:
         """(V, 3, 4) camera-from-world matrices."""
         # The order in memory is that of a copy in another process, so that both round alike.
         return np.ascontiguousarray(np.stack([camera.cTw for camera in self.cameras]))
+
+    @property
+    def wTc(self) -> Array:
+        """(V, 4, 4) poses of the cameras, world from camera; a copy."""
+        return np.stack([camera.wTc for camera in self.cameras])
 
     @cached_property
     def centres(self) -> Array:
@@ -372,7 +382,7 @@ class Views:
 
     @cached_property
     def focal(self) -> Array:
-        """(1, V) or (N, V), as many rows as `projection` has, the same as `focal_px`."""
+        """(1, V) or (N, V) focal lengths as in `focal_px`, with as many rows as `projection` has."""
         return np.array(np.broadcast_to(self.focal_px, self.projection.shape[:2]), order="C")
 
     def rows(self, index: Index) -> "Views":
@@ -396,7 +406,7 @@ class Views:
         return self.project_apart(points[:, :, None])
 
     def project_apart(self, points: Array) -> tuple[Array, Array, Array]:
-        """The same of `points` (N, J, V, 3) that differ from view to view."""
+        """Project `points` (N, J, V, 3) that differ from view to view; returns what `project` returns."""
         K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
         return project_with_jacobian(points, K, cTw)
 

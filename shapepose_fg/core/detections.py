@@ -100,6 +100,15 @@ class Detections:
         )
 
     @classmethod
+    def joined(cls, parts: Sequence["Detections"]) -> "Detections":
+        """The candidates of several parts (one at least), one after the other, with the affinities of each."""
+        names = ("view", "joint", "xy", "confidence", "affinity", "place")
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        starts = np.cumsum([0, *(len(part) for part in parts)])
+        pairs = np.concatenate([part.pairs + start for part, start in zip(parts, starts, strict=False)])
+        return cls(pairs=pairs, **columns)
+
+    @classmethod
     def empty(cls) -> "Detections":
         """A frame in which no view saw anything."""
         none = np.zeros(0, dtype=np.intp)

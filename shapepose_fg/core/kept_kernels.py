@@ -123,7 +123,7 @@ def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
 
 @cache
 def _digest(module: str) -> str:
-    """Of the sources that a module's kernels are compiled from, of Numba, Python and the processor."""
+    """Digest of the sources of a module's kernels, of the versions of Numba and Python, and of the processor."""
     given = NUMBA.CPU_FEATURES
     features = get_host_cpu_features().flatten() if given is None else given
     options = sorted(f"{name}={sorted(each) if isinstance(each, set) else each}" for name, each in OPTIONS.items())

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from shapepose_fg.core.detections import Input
 
@@ -33,10 +33,9 @@ _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Frames = dict[str, list[_Count]]
 
 
-class _Kept(BaseModel):
+class _Kept(BaseModel, extra="forbid"):
     """Notes as plain values."""
 
-    model_config = ConfigDict(extra="forbid")
     frames: _Count
     seconds: dict[str, _Number]
     evidence: dict[_Count, tuple[_Number, Annotated[int, Field(gt=0)]]]
@@ -50,16 +49,16 @@ class _Kept(BaseModel):
 
 @dataclass
 class Notes:
-    """Of one window, or of all together."""
+    """Notes about one window, or about a whole run."""
 
     frames: int = 0
-    """How many frames it is of."""
+    """Number of frames that the notes are about."""
     seconds: Counter[str] = field(default_factory=Counter)
     """Time per stage, over all processes."""
     evidence: dict[int, Sequence[float]] = field(default_factory=dict)
-    """Of each track the sum of its rows' evidence (`Observations.evidence`), and how many rows that is."""
+    """Sum of the evidence (`Observations.evidence`) of each track's rows, and the number of these rows."""
     probable: Counter[str] = field(default_factory=Counter)
-    """Frame by frame how many rows are so probable, by tenths rounded down."""
+    """Number of rows of single frames by their probability, in tenths rounded down."""
     dropped: dict[str, list[int]] = field(default_factory=dict)
     """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
     thinned_frames: dict[str, list[int]] = field(default_factory=dict)
@@ -140,7 +139,7 @@ class Notebook:
         self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
-        """The same frames; while one is worked on, it is the present frame."""
+        """Yield the frames; notes that are taken before the next one are about the frame yielded last."""
         for each in given:
             self._frame = each.frame
             yield each

@@ -57,7 +57,7 @@ class Known(IntEnum):
 
     @classmethod
     def observed(cls, known: Whole) -> Mask:
-        """Of which joints (...) any view's detection was used."""
+        """Return for which joints (...) the detection of at least one view was used."""
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
 
@@ -176,11 +176,11 @@ class Reconstruction(Table):
         return self.rows(self.frame == frame)
 
     def with_run(self, **entries: Any) -> "Reconstruction":
-        """The same people, with more to say in run.json."""
+        """Return these people with further entries in run.json."""
         return replace(self, run=self.run | entries)
 
     def relabelled(self, person: Whole) -> "Reconstruction":
-        """The same rows with other identities (N,), in `observations` too."""
+        """Return these rows with other identities (N,), in `observations` too."""
         table = None if self.observations is None else replace(self.observations, person=person)
         return replace(self, person=person, observations=table)
 

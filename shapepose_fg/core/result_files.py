@@ -29,8 +29,8 @@ RUN_ID = "run_id"
 """What ties them: a digest of all columns of people.npz."""
 T = TypeVar("T", bound=Table)
 _DIGITS = 32
-"""Of the id. The same people have the same one, so that a run that was stopped and went on leaves the same bytes
-as one that was not."""
+"""Number of digits of the run's id. The id depends on the people alone, so that an interrupted run that was
+resumed writes the same bytes as one that was not interrupted."""
 
 
 def results_folder(results: Path) -> Path:
@@ -115,7 +115,7 @@ def check_id(people_id: object, other_id: object, file: Path) -> None:
 
 
 def _told(name: str, column: Pieces, tell: Any) -> Pieces:
-    """The same column; `tell` is given its name, type, shape and bytes when its pieces are asked for."""
+    """Return the column; its pieces, when read, pass its name, type, shape and bytes to `tell`."""
 
     def pieces() -> Iterator[NDArray[Any]]:
         tell(f"{name} {column.dtype} {column.shape}\n".encode())

@@ -62,7 +62,7 @@ class SubjectShapes(Table):
         return np.linalg.inv(self.information).astype(np.float64, copy=False)
 
     def named(self, names: Sequence[str]) -> "SubjectShapes":
-        """The same people with other names."""
+        """Return these people with other names."""
         return replace(self, names=np.array(list(names), dtype=str))
 
     def updated(self, other: "SubjectShapes") -> "SubjectShapes":

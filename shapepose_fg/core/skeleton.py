@@ -35,7 +35,8 @@ class Skeleton:
     parents: tuple[int, ...]
     """(J,) the joint that a joint is grown from; -1 for the root, which is the anchor of a person."""
     mirror: tuple[int, ...]
-    """(J,) the same joint on the other side of the body; a joint in the middle is its own mirror."""
+    """(J,) index of the corresponding joint on the other side of the body; a joint in the middle has its own
+    index."""
     core: tuple[int, ...]
     """The body parts by which a person is recognised: trunk, arms and legs, without face and toes."""
     middles: tuple[tuple[int, int, int], ...] = ()

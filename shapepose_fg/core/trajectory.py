@@ -8,7 +8,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 DRIFT = 0.01
-"""Of an odometry that says nothing of its errors: wheels and cameras drift by about 1 % of the way."""
+"""Drift of an odometry that states no errors, per metre: wheels and cameras drift by about 1 % of the distance."""
 LONGEST_GAP_S = 0.5
 """Between poses that are farther apart nothing is interpolated: at a walk that is 0.7 m, at a turn 45 degrees."""
 _MOST_DRIFT = 1.0
@@ -36,8 +36,8 @@ class Trajectory:
     wTb: Array
     """(F, 4, 4) world from carrier, metres."""
     covariance: Array | None = None
-    """(F, 6, 6) of each pose against the world, turn then way along the carrier's own axes, rad² and m² (GTSAM's
-    order); None of an odometry, which knows its start and drifts."""
+    """(F, 6, 6) covariance of each pose in the world, rotation before translation along the carrier's own axes,
+    rad² and m² (GTSAM's order); None for an odometry, whose start is known and which drifts."""
     drift: float = DRIFT
     """How far an odometry errs after a metre, as a part of it; errors add up like steps of a random walk."""
     refined: bool = False
@@ -117,7 +117,9 @@ class Trajectory:
         return way[:, None, None] * np.diag(sigmas**2)
 
     def _between(self, values: Array, time_s: Array) -> Array:
-        """(M, ...) of `values` (F, ...) at times (M,), on straight lines; ends stay."""
+        """(M, ...) values (F, ...) interpolated linearly at times (M,), and constant before the first and after
+        the last.
+        """
         before, part = self._place(time_s)
         part = part.reshape(-1, *[1] * (values.ndim - 1))
         return (1 - part) * values[before] + part * values[before + 1]

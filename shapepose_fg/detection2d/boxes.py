@@ -7,7 +7,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Real
 from shapepose_fg.core.errors import InputError
@@ -24,25 +24,24 @@ _STRIDES = (8, 16, 32)
 _PERSON = 0
 """The number of people among COCO's classes."""
 _MOST_PEOPLE = 200
-"""Of one picture; the surest."""
+"""Maximum number of people in a picture; the boxes with the highest scores are kept."""
 _FARTHEST = 1e6
 """Pixels of the input: no box lies beyond."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
 """Scores over which a box counts, as in rtmlib; the second where suppression is in the network."""
 
 
-class BoxForm(BaseModel):
+class BoxForm(BaseModel, extra="forbid"):
     """How a box network is to be read: the table `boxes` of a network's TOML file."""
 
-    model_config = ConfigDict(extra="forbid")
     network: str = ""
     """Its ONNX file."""
     size: tuple[Side, Side] = (640, 640)
-    """(width, height) of its input, where the ONNX file does not fix it."""
+    """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     min_score: _Share | None = None
-    """Less sure boxes are nobody's; None for rtmlib's own."""
+    """Minimum score of a box; None for rtmlib's own."""
     max_overlap: _Share = 0.45
-    """Of two boxes that share more of their union than this one goes."""
+    """Intersection over union of two boxes above which the one with the lower score is removed."""
 
 
 @dataclass(frozen=True)

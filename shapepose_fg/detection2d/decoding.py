@@ -43,7 +43,7 @@ class Candidates:
         return len(self.joint)
 
     def moved(self, xy: Array, inside: Mask) -> "Candidates":
-        """The same at other positions; those that are not `inside` (D,) are left out."""
+        """Return the candidates at other positions; those that are not `inside` (D,) are left out."""
         place = np.cumsum(inside) - 1
         both = inside[self.pairs].all(axis=1)
         joint, score, pairs = self.joint[inside], self.score[inside], place[self.pairs[both]]

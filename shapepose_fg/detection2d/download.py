@@ -38,9 +38,9 @@ class NamedNetwork:
     file: str
     """The archive that holds it, at each of `BASES`."""
     size: tuple[int, int]
-    """(width, height) of its input."""
+    """Width and height of the network's input, pixels."""
     boxes: str | None = None
-    """The name of the network that finds people for it; None of one that finds people."""
+    """The name of the network that finds people for it; None for a network that finds people."""
 
 
 @lru_cache(maxsize=1)

@@ -20,7 +20,7 @@ from shapepose_fg.io.write_detections import association_lines
 _STRIDE, _MULTIPLE = 8, 16
 """Pixels of the input per cell of the output, along each axis; what both sides of the input are multiples of."""
 _TRIAL = (64, 64)
-"""(width, height) of the empty picture that a new network is tried on."""
+"""Width and height of the empty picture that a new network is tried on, pixels."""
 _LONG_SIDE = 656
 
 

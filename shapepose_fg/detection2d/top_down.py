@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.errors import InputError
@@ -26,10 +26,9 @@ _AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
 """How many axes the outputs of each decoding have."""
 
 
-class KeypointForm(BaseModel):
+class KeypointForm(BaseModel, extra="forbid"):
     """How a network of keypoints is to be read: a TOML file, RTMPose's kind where it says nothing else."""
 
-    model_config = ConfigDict(extra="forbid")
     network: str = ""
     """Its ONNX file."""
     skeleton: str | None = None
@@ -43,7 +42,7 @@ class KeypointForm(BaseModel):
     outputs: list[str] | None = None
     """Names of its outputs that are read: x and y of SimCC, otherwise one; None for the first ones."""
     size: tuple[Side, Side] = (192, 256)
-    """(width, height) of its input, where the ONNX file does not fix it."""
+    """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     colours: Literal["bgr", "rgb"] = "bgr"
     """Their order. RTMPose was trained on the other; so is it run by rtmlib, and by everybody since."""
     mean: _Three = (123.675, 116.28, 103.53)
@@ -73,7 +72,7 @@ class People:
         return int((self.score > 0).sum())
 
     def moved(self, xy: Array, inside: Mask) -> "People":
-        """The same at other positions; those that are not `inside` (P, K) are left out."""
+        """Return the people at other positions; joints that are not `inside` (P, K) get the score 0."""
         return replace(self, xy=xy, score=np.where(inside, self.score, 0.0))
 
 

@@ -39,7 +39,7 @@ class UprightView:
     """How a region of a picture becomes the input of a network, turned upright."""
 
     size: tuple[int, int]
-    """(width, height) of the network's input, pixels."""
+    """Width and height of the network's input, pixels."""
     input_from_picture: Array
     """(2, 3) affine map of the picture's pixels to those of the input."""
     region: tuple[float, float, float, float]

@@ -57,7 +57,10 @@ def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None
 def told_by_parts(
     folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
 ) -> tuple[list[Path], list[str]] | None:
-    """Of `paths` in a folder, which are called `names`, that of each camera by `match_names`, and a note of it."""
+    """Return the path of each camera, found in `paths` (called `names`) with `match_names`, and a note about it.
+
+    None where the names do not tell cameras apart.
+    """
     chosen = match_names(cameras, names)
     if chosen is None:
         return None

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.provenance import checksums
@@ -27,16 +27,14 @@ _CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {COR
 Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
 
 
-class _Edit(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
+class _Edit(BaseModel, strict=True, extra="forbid"):
     action: Literal["merge", "split", "rename", "drop", "swap"]
     person: Number
     other: Number | None = None
     frame: Number | None = None
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
+class _File(BaseModel, strict=True, extra="forbid"):
     format: Literal["shapepose-fg corrections 1"]
     people: str
     edits: Annotated[list[_Edit], Field(min_length=1)]

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.errors import InputError, naming
@@ -21,8 +21,7 @@ _FACE_AND_TOES = {
 _HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
+class _File(BaseModel, strict=True, extra="forbid"):
     name: Annotated[str, Field(min_length=1)]
     keypoints: Annotated[list[str], Field(min_length=3)]
     limbs: list[_Pair]

@@ -1,6 +1,5 @@
 """When frames were taken, from a text file: a line per frame, in seconds; one column, or one for each camera."""
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,17 +12,14 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.moments import CameraClock, Moments, align
-from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.core.storage.files import write_content
+from shapepose_fg.io.number_table import MISSING, read_number_table
 from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
-_MOST_BYTES = 2**28
-"""A line a frame: a day of 30 cameras."""
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 1e-6, 10.0
 """Frames nearer or farther apart than this are no recording of motion: the file is in another unit."""
-_NO_PICTURE = "-"
-"""In place of a time: the camera has no such frame."""
 
 
 def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
@@ -79,7 +75,14 @@ def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]
 
 def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]:
     """The times (T, C) of frames, of all cameras or of each, NaN for those that a camera lacks; and the clocks."""
-    names, numbers, lines = _table(path, rig)
+
+    def heads(line: int, words: list[str]) -> tuple[list[str], bool]:
+        # Cameras may be called by numbers; without a header there is one column.
+        header = not is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
+        return (words if header else [_TIME]), header
+
+    in_seconds = "write seconds like 0.033"
+    names, numbers, lines = read_number_table(path, heads, in_seconds, lambda name: name not in (_FRAME, _TIME))
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{path}: column {twice} occurs twice; give each its own name")
@@ -113,7 +116,7 @@ def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
     columns = [_TIME] if times.ndim == 1 else names
     rows = [", ".join([_FRAME, *columns])]
     for frame, row in enumerate((times - np.nanmin(times)).reshape(len(times), -1).tolist()):
-        rows.append(", ".join([str(frame), *(f"{each:.6f}" if each == each else _NO_PICTURE for each in row)]))
+        rows.append(", ".join([str(frame), *(f"{each:.6f}" if each == each else MISSING for each in row)]))
     write_content(path, "\n".join(rows) + "\n")
 
 
@@ -131,33 +134,6 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
     if len(there) > 0 and len(time_s) == 0:
         raise InputError(f"{path}: camera {name} has no times; take it out of the calibration")
     return CameraClock(name, time_s, step)
-
-
-def _table(path: Path, rig: Rig) -> tuple[list[str], Array, Index]:
-    """Names of the columns, the numbers (T, C), and the line of the file that each row is from."""
-    names, rows, lines = list[str](), list[list[float]](), list[int]()
-    for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
-        words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
-        if len(words) == 0:
-            continue
-        if len(names) == 0:
-            # Cameras may be called by numbers; without a header there is one column.
-            header = not is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
-            names = words if header else [_TIME]
-            if header:
-                continue
-        if len(words) != len(names):
-            cure = "name the columns in a first line" if names == [_TIME] else "correct the line"
-            raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
-        lacks = [
-            word == _NO_PICTURE and name not in (_FRAME, _TIME) for word, name in zip(words, names, strict=True)
-        ]
-        wrong = [word[:20] for word, none in zip(words, lacks, strict=True) if not (none or is_number(word))]
-        if len(wrong) > 0:
-            raise InputError(f"{path}: line {line} must hold numbers, got {wrong[0]!r}; write seconds like 0.033")
-        rows.append([np.nan if none else float(word) for word, none in zip(words, lacks, strict=True)])
-        lines.append(line)
-    return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
 
 
 def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> Index:

@@ -1,18 +1,15 @@
 """Trajectories of what carries cameras: TUM's text and our own CSV, which may say how surely poses are known."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
-from shapepose_fg.core.storage.files import read_text
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.io.number_table import read_number_table
 from shapepose_fg.io.validation import is_number
 
-_MOST_BYTES = 2**28
 _MOST_METRES = 1e6
 _UNIT = 0.01
 """How far the length of a quaternion may be from 1."""
@@ -35,7 +32,14 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
 
         return read_frame(Path(f"{file}.mcap"), frame[1:], name or str(path))
     path = Path(path)
-    names, numbers, lines = _table(path)
+
+    def heads(line: int, words: list[str]) -> tuple[list[str], bool]:
+        header = not is_number(words[0])
+        names = words if header else [*map(str, POSE)]
+        _check_columns(path, line, names)
+        return names, header
+
+    names, numbers, lines = read_number_table(path, heads, "write seconds and metres")
     if len(numbers) < 2:
         raise InputError(f"{path}: a trajectory needs 2 poses or more, got {len(numbers)}; write a line for each")
     columns = {each: numbers[:, place] for place, each in enumerate(names)}
@@ -66,30 +70,6 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
             raise InputError(f"{path}: {what}; write variances, rad² and m², of the carrier's own axes")
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
-
-
-def _table(path: Path) -> tuple[list[str], Array, Index]:
-    """Names of the columns, the numbers (F, C), and the line of the file that each row is from."""
-    names, rows, lines = list[str](), list[list[float]](), list[int]()
-    for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
-        words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
-        if len(words) == 0:
-            continue
-        if len(names) == 0:
-            names = list(POSE) if is_number(words[0]) else words
-            _check_columns(path, line, names)
-            if names is words:
-                continue
-        if len(words) != len(names):
-            raise InputError(
-                f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; correct the line"
-            )
-        wrong = next((word[:20] for word in words if not is_number(word)), None)
-        if wrong is not None:
-            raise InputError(f"{path}: line {line} must hold numbers, got {wrong!r}; write seconds and metres")
-        rows.append([float(word) for word in words])
-        lines.append(line)
-    return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
 
 
 def _check_columns(path: Path, line: int, names: list[str]) -> None:

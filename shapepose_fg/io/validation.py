@@ -25,7 +25,7 @@ def validated(model: type[Model], value: object, place: object, cure: str | Mapp
 def validated_list(
     kind: TypeAdapter[list[Model]], value: object, place: object, cure: str, start: int = 0
 ) -> list[Model]:
-    """The same of a list, whose first item is number `start` in the file."""
+    """Validate a list as `validated` does; its first item is number `start` in the file."""
     try:
         return kind.validate_python(value)
     except ValidationError as error:

@@ -22,7 +22,7 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 from shapepose_fg.tracking.worlds import PLACED_M
 
 ON_TRIAL = -1
-"""The identity of who has too little evidence yet."""
+"""The identity of a track with insufficient evidence."""
 _SEARCH_S = 0.1
 """Interval between searches for new people, seconds."""
 _SURE = 0.3
@@ -30,7 +30,7 @@ _SURE = 0.3
 _WAITS_S = 1.0
 """Whoever may be somebody who left waits no longer for their bones to be known."""
 _MOST_GONE = 256
-"""So many who left are remembered at the most."""
+"""Maximum number of ended tracks that are remembered."""
 _LONGEST_S = 0.1
 """A frame stands for no more, however long nothing came before it: evidence is of what was seen."""
 
@@ -70,7 +70,7 @@ class Moment:
     length_m: Array
     """(A, B) sum of each bone's lengths, metres."""
     count: Array
-    """(A, B) of so many frames."""
+    """(A, B) number of frames in which each bone was measured."""
     gone: Gone
     """Who left."""
     sought_s: float = -np.inf
@@ -179,7 +179,7 @@ class Filter:
         return replace(now.rows(stays), gone=Gone(*columns)), candidate[stays]
 
     def _with_newcomers(self, now: Moment, candidate: Index, given: Input) -> tuple[Moment, Index]:
-        """And those who are found in what everybody leaves over."""
+        """Add the tracks of people found in detections that no track uses."""
         tracker, tracks = self.tracker, now.tracks
         tracker.search(given.frame)
         places, own = tracker.newcomers(tracks, candidate, given.detections, given.rig)
@@ -240,7 +240,9 @@ class Filter:
         return bool((near & (apart_m <= self.stitching.reach_m + 1.5 * gap_s)).any())
 
     def _returned(self, now: Moment, ready: Index) -> dict[int, int]:
-        """Of the rows `ready` those who left before, by `tracking.stitching`, and who they are."""
+        """Return the identities of those rows among `ready` that continue an ended track, by
+        `tracking.stitching`.
+        """
         gone, G, R = now.gone, len(now.gone.identity), len(ready)
         bones = np.where(
             now.count[ready] >= LEAST_ROWS, now.length_m[ready] / np.maximum(now.count[ready], 1), np.nan

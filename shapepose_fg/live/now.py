@@ -23,8 +23,9 @@ from shapepose_fg.tracking.tracker import Tracker
 from shapepose_fg.tracking.worlds import PLACED_M
 
 _OWN_S, _TOGETHER_S = 0.3, 0.7
-"""So long a joint goes on as it moves beside its person, and the person as it moves: 0.3 and 1 s ahead errors are
-11 and 39 % smaller than straight on (simulated, split tune and crossing)."""
+"""Time constants with which the velocity of a joint relative to its person, and that of the person, decay, s:
+0.3 and 1 s ahead errors are 11 and 39 % smaller than with constant velocity (simulated, split tune and
+crossing)."""
 _LATER, _FADES_S = 3.5, 0.25
 """What the density of accelerations (`MotionModel.acceleration`) is multiplied with; for so long they last."""
 _PACE, _PACE_UNSEEN = 0.1, 0.4
@@ -32,9 +33,9 @@ _PACE, _PACE_UNSEEN = 0.1, 0.4
 follows as if everybody were fast (`pipeline.setup.FAST_M_S`). With these 95 % regions hold 94 to 97 % of joints
 0.1 to 1 s ahead (four stretches of split `tune`, six cameras, on which they were chosen)."""
 _FORGOTTEN = 0.1
-"""So much of the filter's variance, which grows while no two views see a joint, is added to what the body knows
-of it: a hidden head may have turned. Regions of 95 % then hold 98 to 100 % of unseen joints in three stretches of
-split `tune`, and 92 and 86 % in crowds, where they held 91 to 95, 75 and 57 %."""
+"""Share of the filter's variance, which grows while no two views see a joint, that is added to the variance
+from the body: a hidden head may have turned. Regions of 95 % then hold 98 to 100 % of unseen joints in three
+stretches of split `tune`, and 92 and 86 % in crowds, where they held 91 to 95, 75 and 57 %."""
 
 
 def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:

@@ -29,7 +29,7 @@ from shapepose_fg.live.filtering import Filter
 from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
-from shapepose_fg.live.views import MOST_S, ViewsInStep, joined, with_pose
+from shapepose_fg.live.views import MOST_S, ViewsInStep, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.workers import workers as worker_processes
@@ -53,9 +53,10 @@ _MOST_SAID = 1000
 _OFF_CLOCK = 10
 """Views in a row whose time is elsewhere, after which a camera is named, and the frames of `push` are believed."""
 _STANDS = 30
-"""So many more views without a pose than with one say that a camera is where the rig has it after all."""
+"""Excess of views without a pose over views with one, after which a camera is taken to stand where the rig has
+it."""
 _BACK_S = 1.0
-"""Poses of cameras that move are kept for so much longer than a frame can wait to be solved."""
+"""Time for which poses of moving cameras are kept beyond the longest time that a frame waits to be solved, s."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class LiveReport:
     frames: int
     """Frames that were taken in."""
     late: int
-    """Of these, those that came after a later one."""
+    """Frames among `frames` that came after a later one."""
     dropped: int
     """Frames, or a camera's detections, that came too late, or twice: left out."""
     unrefined: int
@@ -452,7 +453,9 @@ class OnlineReconstructor:
             return
         at_s = slot.given.time_s.copy()
         at_s[view] = time_s
-        both = joined([slot.given.detections, thinned(detections, self.rig, self._config.candidates)[0]])
+        both = Detections.joined(
+            [slot.given.detections, thinned(detections, self.rig, self._config.candidates)[0]]
+        )
         dark = tuple(each for each in slot.given.rig.dark if each != view)
         rig = replace(self._state.rig.at(at_s), dark=dark, doubted=slot.given.rig.doubted)
         slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)

@@ -26,13 +26,13 @@ from shapepose_fg.io.solved_setup import body_of
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
 Publish = Callable[[str, Reconstruction], None]
-"""Of a kind, `now` or `settled`, and its rows."""
+"""Function that takes the kind of the rows, `now` or `settled`, and the rows."""
 _MOST_WAITING = 2**23
 """Bytes that a client may be behind with."""
 _LOOK_S = 0.2
-"""So long the end may have to wait for the thread that lets readers in, seconds."""
+"""Longest time that the end waits for the thread that accepts readers, s."""
 _LAST_S = 2.0
-"""So long all clients together are waited for at the end, seconds."""
+"""Longest time that the end waits for all clients together, s."""
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import CommonClock
 from shapepose_fg.live.filtering import OF_TRACKS, ON_TRIAL, Filter, Gone, Moment
 from shapepose_fg.live.refining import LiveState, Slot
-from shapepose_fg.live.views import MOST_S, SHORTEST_S, ViewsInStep, joined
+from shapepose_fg.live.views import MOST_S, SHORTEST_S, ViewsInStep
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
@@ -226,7 +226,7 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
         "clock": np.array([state.views.done_s, state.views.period_s]),
         "waiting_s": waiting_s,
     }
-    waiting = joined([each for each, _ in state.views.waiting.values()] or [Detections.empty()])
+    waiting = Detections.joined([each for each, _ in state.views.waiting.values()] or [Detections.empty()])
     for name, seen in (("waiting", waiting), ("before", state.before or Detections.empty())):
         arrays |= {f"{name}.{each}": getattr(seen, each) for each in _DETECTIONS}
     for each in sorted(state.rig.trajectories, key=lambda each: each.name):

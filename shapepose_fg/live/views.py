@@ -80,20 +80,9 @@ class ViewsInStep:
         times = np.full(self.views, mean)
         for view, (_, time_s) in self.waiting.items():
             times[view] = time_s
-        together = joined([self.waiting[view][0] for view in sorted(self.waiting)])
+        together = Detections.joined([self.waiting[view][0] for view in sorted(self.waiting)])
         self.waiting, self.done_s = {}, mean
         return [(together, times)]
-
-
-def joined(parts: list[Detections]) -> Detections:
-    """The detections of several views, one after the other."""
-    first = np.cumsum([0, *(len(part) for part in parts)])
-    columns = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("view", "joint", "xy", "confidence", "affinity", "place")
-    }
-    pairs = np.concatenate([part.pairs + n for part, n in zip(parts, first, strict=False)])
-    return replace(parts[0], pairs=pairs, **columns)
 
 
 def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array | None, since_s: float) -> Rig:

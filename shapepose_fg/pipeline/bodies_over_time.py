@@ -223,10 +223,10 @@ def with_bodies_over_time(
     floor: Floor | None = None,
     keyframe_s: float = 0.0,
 ) -> Reconstruction:
-    """The same rows with one body per person, fitted to the joints as they were solved, and everybody's shape.
+    """Return the rows with one body per person, fitted to the joints as they were solved, and each person's shape.
 
-    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Nothing of this returns into the joints or
-    their covariances. Rows without a body keep the body that they had. `shapes` of the result are everybody's.
+    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Joints and their covariances do not change.
+    Rows that get no body keep the body that they had. `shapes` of the result are those of all people.
     """
     if len(people) == 0:
         return people

@@ -1,4 +1,4 @@
-"""The same work for many items on the processes of a Dask cluster: this machine's, or that of many machines."""
+"""Run one function on many items in the processes of a Dask cluster, on this machine or on many machines."""
 
 import multiprocessing
 import socket
@@ -20,11 +20,11 @@ from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, pac
 Shared = TypeVar("Shared")
 
 RETRIES = 2
-"""So often an item whose process was lost, or that failed, is tried again."""
+"""Number of times that an item is tried again after it failed or its process was lost."""
 _LEAST = 2
-"""So many items are always under way, so that the next one does not wait for the last."""
+"""Minimum number of items under way, so that the next one does not wait for the last."""
 _SECONDS = 10
-"""A cluster that does not answer for so long is not there."""
+"""Time within which a cluster must answer, s."""
 _ITSELF = "shapepose-fg itself"
 
 

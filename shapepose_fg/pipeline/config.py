@@ -54,11 +54,12 @@ class WindowConfig(Settings):
     Errors of detectors last longer than a frame, so that little is lost. New people are sought in those that are
     0.3 s or more apart."""
     again_over_time: RepeatsOrNone = 8
-    """How often detections are reassociated around a draft of a window, at the most: it ends when hardly any
+    """Rounds of reassociation around the initial estimate of a window, at most; they end when hardly any detection
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
     again_alone: RepeatsOrNone = 5
-    """The same frame by frame; 0: never, as in the paper. From round to round more is asked of who stays
-    (`LEAST_PROBABILITY`): who goes leaves detections to others, so the least sure goes first. Fewer are faster."""
+    """Rounds of reassociation of a single frame, at most; 0 for none, as in the paper. Each round demands a higher
+    probability of people (`LEAST_PROBABILITY`): those that are removed leave their detections to others, so the
+    least probable is removed first. Fewer rounds are faster."""
 
     @property
     def shared_s(self) -> float:
@@ -74,8 +75,8 @@ class SolvingConfig(Settings):
     """N of Algorithm 1 frame by frame: how often the body is fitted and the joints are solved, at the most. Most
     frames are settled after one or two; the paper has 10."""
     window_alternations: Repeats = 1
-    """The same over time, where a window starts from drafts: a second round takes twice the time and changed the
-    mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
+    """N of Algorithm 1 over time, where a window starts from initial estimates: a second round takes twice the
+    time and changed the mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
     weight_shape: Factor = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model: less for people whom it does not fit,
     in wide clothes or with a load."""

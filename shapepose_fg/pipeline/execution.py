@@ -32,7 +32,7 @@ class Execution:
     """Told how far it is."""
 
     def worth(self, frames: int) -> "Execution":
-        """The same with the number of workers that pay for so many frames, where none is given."""
+        """Return a copy with the number of workers that pays for this many frames, where none is given."""
         count = suitable_workers(frames, _FRAMES_WORTH_A_WORKER) if self.workers is None else self.workers
         return replace(self, workers=count)
 

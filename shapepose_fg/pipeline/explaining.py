@@ -65,7 +65,7 @@ class _Said(BaseModel):
 
 
 class _Setup(BaseModel):
-    """Of run.json's `setup` what is read here."""
+    """The part of run.json's `setup` that is read here."""
 
     left_out: list[_Spell] = []
     doubted: list[_Spell] = []
@@ -73,13 +73,13 @@ class _Setup(BaseModel):
 
 
 class _People(BaseModel):
-    """Of run.json's `people` what is read here."""
+    """The part of run.json's `people` that is read here."""
 
     problems: list[_Problem] = []
 
 
 class _Run(BaseModel):
-    """Of run.json what is read here."""
+    """The part of run.json that is read here."""
 
     setup: _Setup = _Setup()
     people: _People = _People()

@@ -56,15 +56,17 @@ class ViewReason:
     probability: float
     """That the detection is this person's, by the assignment."""
     sigma_px: float | None
-    """How far off such a detection usually is, one sigma per axis."""
+    """Standard deviation of such a detection per axis, pixels."""
     residual_px: tuple[float, float] | None
-    """The joint as it is reported, projected, minus the detection."""
+    """The projection of the joint as reported minus the detection, pixels."""
     off_px: float | None
-    """How far the detection is from where all *else* has the joint, this detection not counted."""
+    """Distance from the detection to where everything *else* puts the joint, this detection not counted,
+    pixels."""
     off_sigma: float | None
-    """The same in standard deviations: of the detection, and of where all else has the joint."""
+    """The distance `off_px` in standard deviations of the detection and of where everything else puts the
+    joint."""
     share: float
-    """Of what the solver knows of the joint, 0 to 1."""
+    """Share of the information about the joint that this view gives, 0 to 1."""
     looks_like: str = ""
     """Whose joint the detection rather is, as `person 3's RWrist`; empty where it fits nobody better."""
 
@@ -78,7 +80,7 @@ class FactorReason:
     others: tuple[str, ...]
     """The joints that they tie it to, as `person 3's RWrist`; none where they are on this joint alone."""
     share: float
-    """Of what the solver knows of the joint, 0 to 1."""
+    """Share of the information about the joint that these factors give, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,13 @@ class Explanation:
     known: str
     """A name of `Known`."""
     status: str
-    """Of the row."""
+    """Status of the row."""
     views: tuple[ViewReason, ...]
     """Camera by camera."""
     body_share: float
-    """Of what the solver knows of the joint, what the body says of it without the joint's own views."""
+    """Share of the information about the joint that the body gives, the joint's own views not counted, 0 to 1."""
     motion_share: float
-    """And what comes from other frames."""
+    """Share of the information about the joint that comes from other frames, 0 to 1."""
     findings: tuple[Finding, ...]
     """What is the matter, the gravest first; none where nothing is."""
     factors: tuple[FactorReason, ...] = ()
@@ -118,7 +120,7 @@ class Explanation:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The same in sentences: where it is, what is the matter, and what says so."""
+        """The explanation in sentences: where the joint is, what is wrong, and what it is estimated from."""
         when = f"frame {self.frame}" + (f" ({self.time_s:.3f} s)" if self.time_s is not None else "")
         who = f"{self.joint} of person {self.person} in {when}"
         if self.position_m is None or self.sigma_m is None:

@@ -23,7 +23,7 @@ the errors of detectors."""
 
 
 def spaced(time_s: Array, apart_s: float) -> Mask:
-    """(T,) of rising times the first, the last, and as few between as are `apart_s` apart at the most."""
+    """(T,) mask of rising times: the first, the last, and as few between as leave no gap longer than `apart_s`."""
     chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
     reached = np.searchsorted(time_s, time_s + apart_s + _ROUNDING_S, side="right") - 1
     while at < last:
@@ -192,8 +192,8 @@ def bodies_between(
 
 
 def _quaternions(vectors: Array) -> Array:
-    """(B, K, 4) of rotation vectors (B, K, 3), radians; of the two that are one rotation the one nearer to that of
-    the row before.
+    """(B, K, 4) unit quaternions of rotation vectors (B, K, 3), radians; signs are those nearer to the row
+    before.
     """
     half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
     found = np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vectors], axis=-1)

@@ -30,7 +30,7 @@ class SolvedWindows:
     detections: ThinnedFrames
     """What the cameras saw."""
     pictures: WithoutRepeats
-    """The same before it was thinned."""
+    """The recording before it was thinned, without repeated pictures."""
     times: FrameTimes
     """When."""
     frames: range
@@ -153,9 +153,9 @@ class SolvedChunk:
     notes: Notes
     """What is to be said about following its people."""
     begins: Border
-    """Who is where at its beginning."""
+    """Tracks at the beginning of the chunk."""
     ends: Border
-    """And at its end."""
+    """Tracks at the end of the chunk."""
 
 
 def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk:

@@ -56,7 +56,9 @@ class Solver:
 
     @classmethod
     def read(cls, folder: Path, people: Reconstruction) -> "Solver":
-        """The same of a result that was loaded from `folder`; InputError too where its cameras are others."""
+        """Solver of a result that was loaded from `folder`; InputError as in `of`, and where the cameras are
+        others.
+        """
         rig, table = cameras_of(folder), people.observations
         if table is not None and tuple(table.view_names.tolist()) != rig.names:
             problem = "the cameras are not those of observations.npz"

@@ -30,8 +30,8 @@ Result = TypeVar("Result")
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
     "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"
 }
-"""Of worker processes: one thread each for linear algebra; loky is not to restart one whose memory grows, because
-recordings differ."""
+"""Environment of worker processes: one thread each for linear algebra; loky must not restart a worker whose memory
+grows, because recordings differ in size."""
 _LOOK_S = 0.5
 """Interval at which a worker looks whether the process that started it is alive, s."""
 
@@ -69,7 +69,7 @@ class Pool(Generic[Shared]):
 
 @contextmanager
 def workers(count: int, shared: Shared, ahead: int = 2) -> Iterator[Pool[Shared]]:
-    """So many processes, each of which has `shared`; a count of 1 is none but this one.
+    """Start `count` processes, each of which has `shared`; for a count of 1 the work is done in this process.
 
     They start when the block is entered and end when it is left, whatever happens in between. `ahead` items a
     worker are under way. ValueError for a count under 1, and for something shared that cannot be sent to another

@@ -42,9 +42,10 @@ _LARGEST_ERROR_M = 0.25
 """Errors were measured up to here; what is farther is a miss and a false candidate."""
 
 _HIDDEN, _SEEN = 0.3, 0.7
-"""Joints of which less, or more, is seen were measured as hidden, or visible; in between, in between."""
+"""Visible fraction below (above) which a joint counts as occluded (visible); linear in between."""
 _HALF_LOST, _WHOLLY_LOST = 1.96, 2.80
-"""Of joints of which one in 40 is missed, half and four fifths are when the probit is so much higher."""
+"""Increases of the probit at which half, and four fifths, of the joints are missed of which one in 40 is missed
+otherwise."""
 _NEAR_M = 0.5
 """False candidates nearer than this to somebody's joint were counted as that person's."""
 

@@ -22,7 +22,7 @@ JOINT_GROUP = np.unique(np.minimum(np.arange(25), _MIRROR), return_inverse=True)
 _LIMBS = np.array(BODY_25.limbs)
 _LIMB_NAMES = [min(tuple(limb), tuple(_MIRROR[limb].tolist())) for limb in _LIMBS.tolist()]
 LIMB_GROUP = np.array([sorted(set(_LIMB_NAMES)).index(name) for name in _LIMB_NAMES])
-"""(26,) the same for limbs, 14 rows."""
+"""(26,) the row of each limb in tables by limb: left and right share one, 14 rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,8 @@ class DetectorStatistics:
     error_memory: Array
     """(2, 2) share and time constant in seconds of a fast and a slow part of the errors; the rest is white."""
     confidence_memory: Array
-    """(2, 2) the same of confidences and misses."""
+    """(2, 2) share and time constant in seconds of a fast and a slow part of the variation of confidences and
+    misses."""
     error_correlation: Array
     """(25, 25) between the errors of a person's joints in one view."""
     confidence_correlation: Array
@@ -74,7 +75,7 @@ class DetectorStatistics:
     double_m: float
     """Sigma of each coordinate of the distance between the two."""
     double_confidence: Array
-    """(K,) of the one with the wrong name."""
+    """(K,) quantiles of the confidence of the one with the wrong name."""
     capture_gap_m: Array
     """(B,) distances from a hidden joint to the same joint of whoever hides it."""
     capture: Array
@@ -92,9 +93,9 @@ class DetectorStatistics:
     false_near_m: Array
     """(K,) quantiles of the distance of those near a person to the next joint."""
     false_joints: Array
-    """(G,) which joints they claim to be."""
+    """(K,) quantiles of the confidence of false candidates near a person."""
     false_near_confidence: Array
-    """(K,)"""
+    """(K,) quantiles of the confidence of false candidates elsewhere."""
     false_far_confidence: Array
     """(K,)"""
     false_memory: Array
@@ -104,17 +105,17 @@ class DetectorStatistics:
     affinity_right_confidence: Array
     """(14, K) quantiles of the lower of their confidences."""
     affinity_correlation: float
-    """Between the ranks of the two."""
+    """Correlation of the ranks of affinity and lower confidence of right pairs."""
     detours: Array
-    """(B,) lower edges of classes of wrong pairs: how far the wrong end is off, in limb lengths."""
+    """(B,) lower edges of classes of wrong pairs: distance of the wrong end, in limb lengths."""
     affinity_wrong_share: Array
     """(B,) share of the pairs of two people that get an affinity."""
     affinity_wrong: Array
-    """(B, K) and which."""
+    """(B, K) quantiles of the affinity of those pairs."""
     affinity_nobody_share: Array
-    """(B,) the same for pairs with a false candidate."""
+    """(B,) share of the pairs of a person and a false candidate that get an affinity."""
     affinity_nobody: Array
-    """(B, K)"""
+    """(B, K) quantiles of the affinity of those pairs."""
     provenance: str = "not known"
     """Where they come from."""
 

@@ -32,7 +32,8 @@ class Puppet:
     heading: Array
     """(T,) direction that the pelvis faces, from the x axis towards the y axis."""
     lean: Array
-    """(T, 3) of the trunk, over its three joints in all: forward, twist to the left, towards the right."""
+    """(T, 3) angles of the trunk, summed over its three joints: forward, twist to the left, towards the right,
+    rad."""
     ankles: Array
     """(T, 2, 3) ankle joints, left and right."""
     foot_heading: Array

@@ -76,7 +76,7 @@ class Clip:
         return replace(self, rotations=self.rotations[start:stop], pelvis=self.pelvis[start:stop])
 
     def resampled(self, fps: float) -> "Clip":
-        """The same motion at another rate: rotations by slerp, places linearly."""
+        """Return the motion at another rate: rotations by slerp, places linearly."""
         if fps == self.fps or len(self) < 2:
             return replace(self, fps=fps)
         time = np.arange(int(np.floor((len(self) - 1) * fps / self.fps + 1e-9)) + 1) * self.fps / fps

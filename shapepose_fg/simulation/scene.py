@@ -53,7 +53,7 @@ class Scene:
         return keypoints_of(self.body, self.motion)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "Scene":
-        """The same people, their true keypoints where a detector with these offsets puts them."""
+        """Return the scene with true keypoints where a detector with these offsets puts them."""
         return replace(self, body=self.body.with_keypoint_offsets(offsets))
 
     def part(self, span: range) -> "Scene":

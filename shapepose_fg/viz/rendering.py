@@ -63,7 +63,7 @@ def zoom(camera: Camera, box: tuple[float, float, float, float], width: int) -> 
 
 
 def scaled(camera: Camera, scale: float) -> Camera:
-    """The same camera with an image of `scale` times the size, without its distortion."""
+    """Return the camera with an image of `scale` times the size, without its distortion."""
     width, height = camera.image_size
     return zoom(camera, (0.0, 0.0, width, height), max(1, round(width * scale)))
 
@@ -93,7 +93,9 @@ def first_surface_at(
 
 
 def _as_opengl(points: Array, camera: Camera) -> NDArray[np.float32]:
-    """(N, 3) of points (3, N) in camera coordinates, where a camera of 1 radian, y up, z back, sees them alike."""
+    """(N, 3) where a camera of 1 radian, y up, z back, sees points as `camera` sees `points` (3, N) of its own
+    frame.
+    """
     (width, height), K = camera.image_size, camera.K
     focal = height / 2 / np.tan(0.5)
     # OpenCV's pixels have their centres at halves there; a shear moves the principal point to the middle.

@@ -153,7 +153,7 @@ def test_few_joints_are_left_out_one_by_one(fitter, people):
     """Four joints are the fewest that make a row; three still say, roughly, where the fourth is."""
     kept = [BODY_25.index(name) for name in ("Neck", "RHip", "LKnee", "LShoulder")]
     without = tuple(np.setdiff1d(np.arange(25), kept))
-    truth, noisy = (each[:40] for each in people)
+    truth, noisy = people
     fit = fitter.fit(make_targets(noisy, without=without))
     assert fit.ok.mean() > 0.9 and np.isfinite(fit.prior_xyz[fit.ok]).all()
     moved = noisy.copy()
@@ -162,8 +162,9 @@ def test_few_joints_are_left_out_one_by_one(fitter, people):
     both = fit.ok & again.ok
     assert np.abs(again.prior_xyz - fit.prior_xyz)[both, kept[0]].max() < 1e-6
     inside = mahalanobis((fit.prior_xyz - truth)[fit.ok][:, kept], fit.prior_covariance[fit.ok][:, kept]) < 7.81
-    # A row's four joints are right or wrong together: of 40 rows with 85 % three standard errors are 17 %.
-    assert inside.mean() > 0.68
+    # A row's four joints are right or wrong together: of 160 rows with 84 % three standard errors are 9 %. With
+    # half the covariance it is 57 to 64 %.
+    assert inside.mean() > 0.75
 
 
 def test_a_long_window_s_shape_is_agreed_upon_by_rows_spread_over_it(fitter):

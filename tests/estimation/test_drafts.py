@@ -12,7 +12,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.simulation import built_in_scene
+from shapepose_fg.simulation import Scene, built_in_scene
 
 LEG = [BODY_25.joints.index(name) for name in ("RKnee", "RAnkle", "RHeel", "RBigToe", "RSmallToe")]
 FRAMES = range(0, 40, 4)
@@ -24,21 +24,21 @@ def fitter():
     return make_fitter(BodyConfig())
 
 
-def with_a_neighbour_s_leg(alone: bool) -> tuple[Observations, np.ndarray]:
+def with_a_neighbour_s_leg(alone: bool, scene: Scene = SCENE) -> tuple[Observations, np.ndarray]:
     """A person in ten frames, 5 mm of noise, and where the joints are, (N, J, 3).
 
     Of six views three see the leg below the right hip where it is half a metre aside.
     """
-    truth = SCENE.keypoints[list(FRAMES), 0]
+    truth = scene.keypoints[list(FRAMES), 0]
     noisy = truth + np.random.default_rng(0).normal(0, 5e-3, truth.shape)
     aside = noisy.copy()
     aside[:, LEG] += [0.5, 0.0, 0.0]
-    xy, wrong = (np.moveaxis(SCENE.rig.project(joints)[0], 0, 2) for joints in (noisy, aside))
+    xy, wrong = (np.moveaxis(scene.rig.project(joints)[0], 0, 2) for joints in (noisy, aside))
     xy[:, LEG, 3:] = wrong[:, LEG, 3:]
     N = len(truth)
     rows = Observations(xy, np.full(xy.shape[:3], 0.8), np.full(truth.shape, np.nan), frame=np.array(FRAMES))
     rows = replace(rows, track=np.arange(N) if alone else np.zeros(N, dtype=int))
-    return replace(rows, time_s=np.broadcast_to(np.array(FRAMES)[:, None] / SCENE.fps, rows.time_s.shape)), truth
+    return replace(rows, time_s=np.broadcast_to(np.array(FRAMES)[:, None] / scene.fps, rows.time_s.shape)), truth
 
 
 def ankle_errors(fitter, alone: bool) -> np.ndarray:
@@ -77,21 +77,28 @@ class Counting(BodyFitter):
 
 
 def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, monkeypatch):
-    """Twenty rows, half of them with the neighbour's leg in three views: as when all are fitted every time."""
-    (disturbed, truth), count = with_a_neighbour_s_leg(True), len(FRAMES)
-    xy = np.moveaxis(SCENE.rig.project(truth + np.random.default_rng(1).normal(0, 5e-3, truth.shape))[0], 0, 2)
-    clean = replace(disturbed, xy=xy, track=disturbed.track + count)
-    rows, drafts, fitted = Observations.concatenate([disturbed, clean]), [], []
-    for moved_m in (draft.MOVED_M, -1.0):
-        monkeypatch.setattr(draft, "MOVED_M", moved_m)
-        counting = Counting(fitter)
-        drafts.append(draft.draft(rows, Views.of(SCENE.rig), counting, EstimatorConfig())[0])
-        fitted.append(counting.rows)
-    assert fitted[1] == [2 * count] * (1 + len(draft.NARROWING_M))
-    # Every disturbed row or most of them each time, a clean one hardly ever.
-    assert fitted[0][0] == 2 * count and all(count / 2 < again < 2 * count for again in fitted[0][1:])
-    # A row's detection near its gate may fall on either side of it.
-    assert (np.linalg.norm(drafts[0] - drafts[1], axis=-1).max(axis=1) > 1e-3).sum() <= 2
+    """Of three scenes twenty rows, half of them with the neighbour's leg in three views: about as when all are
+    fitted every time.
+    """
+    count, moved_m, apart_m = len(FRAMES), draft.MOVED_M, []
+    for scene in (SCENE, *(built_in_scene(seed, people=2, frames=40, cameras=6) for seed in (4, 5))):
+        disturbed, truth = with_a_neighbour_s_leg(True, scene)
+        noisy = truth + np.random.default_rng(1).normal(0, 5e-3, truth.shape)
+        clean = np.moveaxis(scene.rig.project(noisy)[0], 0, 2)
+        rows = Observations.concatenate([disturbed, replace(disturbed, xy=clean, track=disturbed.track + count)])
+        drafts, fitted = [], []
+        for again_m in (moved_m, -1.0):
+            monkeypatch.setattr(draft, "MOVED_M", again_m)
+            counting = Counting(fitter)
+            drafts.append(draft.draft(rows, Views.of(scene.rig), counting, EstimatorConfig())[0])
+            fitted.append(counting.rows)
+        assert fitted[1] == [2 * count] * (1 + len(draft.NARROWING_M))
+        # At first every disturbed row, a clean one hardly ever; later those that have not settled.
+        assert fitted[0][0] == 2 * count and count / 2 < fitted[0][1] and max(fitted[0][1:]) < 2 * count
+        apart_m.append(np.linalg.norm(drafts[0] - drafts[1], axis=-1).max(axis=1))
+        assert apart_m[-1][count:].max() < 1e-3
+    # A detection near its gate may fall on either side of it. With targets that count as unmoved: 2.8 to 24 mm.
+    assert np.mean(apart_m) < moved_m / 8
 
 
 def test_rows_whose_detections_stay_keep_their_drafts(fitter):

@@ -88,7 +88,7 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("0\nsoon\n1\n", "line 2 must hold numbers, got 'soon'; write seconds like 0.033"),
         ("0\nnan\n1\n", "line 2 must hold numbers, got 'nan'"),
         ("0\ninf\n1\n", "line 2 must hold numbers, got 'inf'"),
-        ("0 0\n1 1\n2 2\n", "line 1 must hold 1 numbers, got 2; name the columns in a first line"),
+        ("0 0\n1 1\n2 2\n", "line 1 must hold 1 numbers, got 2; correct the line, or name the columns"),
         ("cam0 cam1\n0 0\n1\n2 2\n", "line 3 must hold 2 numbers, got 1; correct the line"),
         ("cam0 cam2\n0 0\n1 1\n2 2\n", "no times of camera cam1, the columns are cam0 cam2; name a column time_s"),
         ("time_s time_s\n0 0\n", "column time_s occurs twice; give each its own name"),

@@ -53,7 +53,7 @@ def test_covariances_of_feet_hold(dance):
     apart = (people.joints - truth[np.arange(len(people)), who])[:, FEET]
     squared = np.einsum("nji,njik,njk->nj", apart, np.linalg.inv(people.covariance[:, FEET]), apart)
     # Of a Gaussian 95 % are within 7.81. Eight feet of four people stand twice or so: of 16 that are independent
-    # 12 or more are, but once in 1,000; with sigmas half as large it would be 51 %.
+    # 12 or more are, but once in 1,000; with half the covariance it is 55 to 73 %.
     assert 0.75 < (squared < 7.81).mean() <= 1.0
 
 

@@ -19,7 +19,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -154,10 +154,21 @@ def test_extending(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_to_files(page):
-    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
-    missing = [target for target in targets if "://" not in target and not (page.parent / target).exists()]
+def test_links_lead_to_files_and_headings(page):
+    links = re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", page.read_text(encoding="utf-8"))
+    missing = []
+    for target, heading in links:
+        there = page.parent / target if target != "" else page
+        if "://" not in target and (not there.exists() or (heading != "" and heading not in headings(there))):
+            missing.append(f"{target}#{heading}")
     assert missing == []
+
+
+def headings(page: Path) -> list[str]:
+    """The headings of a page, as GitHub's links name them."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

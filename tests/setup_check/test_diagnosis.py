@@ -293,7 +293,7 @@ def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
     assert diagnose(recording, rig).findings == ()
     for frames in (range(110), range(120)):  # somebody comes back to where they were a second ago
         assert diagnose(recording, rig, frames).findings == ()
-    # Some here; all of them take minutes (docs/setup_checks.md).
+    # Some here; all of them take minutes (docs/evaluation.md).
     recording = Recording(BODY_25, [recording[frame] for frame in range(120)])
     wanted = {"turned 5": 2, "late 6 to 10 frames": 1, "exchanged": 3}
     for each in spoiled(recording, rig, seed=5):

@@ -42,7 +42,7 @@ from shapepose_fg.pipeline.workers import Processes
 ATTEMPTS = 2
 """A recording that has failed so often is left, and the others go on."""
 _PATIENCE_S = 20.0
-"""So long a leader may take to let go of its work."""
+"""Time that a leader may take to end its work, s."""
 _LEAST, _USUAL = 0.1, 2.0
 """Bytes of results for each byte of detections: many cameras whose files hold hands and faces, and others."""
 
@@ -56,7 +56,7 @@ class Assignment:
     request: Request
     """What is wanted."""
     folder: Path
-    """Of its results."""
+    """Folder of the recording's results."""
     cluster: str
     """Address of the scheduler."""
     sharing: int = 1
@@ -80,7 +80,7 @@ class Campaign:
     cluster: str
     """Address of the scheduler."""
     at_once: int
-    """So many recordings are led at a time."""
+    """Number of recordings that are led at a time."""
 
     def run(self, standings: Standings, watcher: Bars) -> None:
         """Do what is not done; `standings` has how each ended.
@@ -265,7 +265,7 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Bytes of a recording's detections."""
-    known = prepare(entry.request, folder, tell=lambda _: None)
+    known = prepare(entry.request, folder, tell=lambda *_: None)
     asked = known.request
     _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)

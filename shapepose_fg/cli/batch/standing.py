@@ -40,7 +40,7 @@ class Standing:
     seconds: float = 0.0
     """What it took by the clock, beside others, all attempts together."""
     frames: int | None = None
-    """Of a recording that is done, like the next."""
+    """Number of frames of a recording that is done; None before, as are `rows` and `people`."""
     rows: int | None = None
     people: int | None = None
     warnings: tuple[str, ...] = ()
@@ -59,7 +59,7 @@ class Standing:
 
 @dataclass
 class Standings:
-    """Of all recordings by name, as they are in the file."""
+    """States of all recordings by name, as they are in the file."""
 
     file: Path
     """batch.json."""
@@ -130,7 +130,7 @@ class Bars:
         self._tasks[name] = self._bars.add_task(name, total=None)
 
     def frames(self, name: str, done: int, count: int) -> None:
-        """So many of its frames are done."""
+        """Show how many frames of a recording are done."""
         self._bars.update(self._tasks[name], completed=done, total=count)
 
     def ended(self, name: str, *, failed: str | None, again: bool) -> None:

@@ -84,7 +84,7 @@ def _check_names(names: list[str], path: Path) -> None:
 
 
 def _located(request: Request, path: Path, place: str) -> Request:
-    """The same with its paths found from the table's folder."""
+    """Return the request with its paths relative to the table's folder resolved."""
     given = {name: getattr(request, name) for name in _PATHS}
     if request.skeleton is not None and not layouts_called(request.skeleton):
         given["skeleton"] = Path(request.skeleton)
@@ -107,7 +107,9 @@ def _inside(given: Path, path: Path, place: str) -> Path:
 
 
 def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
-    """The same; those that share a file of shapes wait for each other, so that their order is the table's."""
+    """Return the entries such that those that share a file of shapes wait for each other, in the order of the
+    table.
+    """
     last: dict[Path, str] = {}
     projects: dict[tuple[Path, str | None], str] = {}
     found = []

@@ -3,15 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from shapepose_fg.cli.options import (
     INPUT,
     RESULT,
     RUN,
     TIME,
-    DetectionOptions,
     Preset,
+    ProjectOptions,
     TimeOptions,
     check_fps,
     ends,
@@ -19,6 +19,7 @@ from shapepose_fg.cli.options import (
     frames_option,
     option,
     preset_option,
+    refuse_missing,
 )
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
@@ -36,10 +37,9 @@ OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMEN
 
 
 @dataclass(frozen=True, kw_only=True)
-class Request(DetectionOptions, TimeOptions):
+class Request(ProjectOptions, TimeOptions):
     """One recording, and what is wanted of it: the options of `shapepose-fg reconstruct`, by their names."""
 
-    detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections, settings; adds TRC, C3D.")
     preset: Preset | None = preset_option(None)
     config: Path | None = option(RESULT, "Settings as TOML, all that `shapepose-fg config` prints or some.")
@@ -139,31 +139,21 @@ class Prepared:
             ) from None
 
 
-def prepare(request: Request, output: Path | None, tell: Callable[[str], None] = note) -> Prepared:
+def prepare(request: Request, output: Path | None, tell: Callable[..., None] = note) -> Prepared:
     """Find a request's places, and look at its options, before any large file is read.
 
     `tell` is given what a project's files were taken to be. InputError where something is missing or wrong.
     """
     from shapepose_fg.io.recording import times_beside
 
-    project = None
-    if request.project is not None:
-        from shapepose_fg.io.pose2sim_project import read_pose2sim_project
-
-        project = read_pose2sim_project(request.project)
-        for each in project.notes:
-            tell(each)
+    request, project = request.completed(tell)
+    if project is not None:
         output = output or project.output
-        calibration, detections = request.calibration or project.calibration, request.detections
-        request = replace(request, calibration=calibration, detections=detections or project.detections)
         if request.fps is None and request.timestamps is None:
             request = replace(request, fps=project.fps)
-    calibration, detections = request.calibration, request.detections
-    if calibration is None or detections is None or output is None:
-        options = {"--calibration": calibration, "--detections": detections, "--output": output}
-        missing = [name for name, value in options.items() if value is None]
-        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
-        raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
+    places = {"--calibration": request.calibration, "--detections": request.detections, "--output": output}
+    refuse_missing(places)
+    calibration, detections, output = (cast(Path, place) for place in places.values())
     check_fps(request.fps)
     if request.synchronise and request.timestamps is not None:
         raise InputError("--synchronise and --timestamps: when frames were taken is sought, or known; give one")

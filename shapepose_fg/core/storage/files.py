@@ -130,7 +130,7 @@ def read_json(path: Path, *, most: int = LARGE) -> Any:
 
 
 def parse_json(text: str, path: Path | str) -> Any:
-    """The same of text that is from the file at `path`."""
+    """Parse the JSON `text` of the file at `path`, with the checks that `read_json` makes."""
     try:
         value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
     except json.JSONDecodeError as error:

@@ -94,10 +94,12 @@ def _mapped(arrays: Arrays) -> Arrays:
 
 
 class InFolder(KeptArrays):
-    """The same as a file per set: safetensors, which holds no code and gives single arrays and rows of them.
+    """Arrays kept in a folder, one safetensors file per set: the format holds no code and gives single arrays and
+    rows.
 
-    A file is on the disk when `keep` returns. It has a digest of each array, and one of these, its name and its
-    run: what is read is checked once, and again when the file has changed. InputError names a damaged file.
+    A file is on the disk when `keep` returns. It has a digest of each array, and one of these digests, its name
+    and its run: what is read is checked once, and again when the file has changed. InputError names a damaged
+    file.
     """
 
     lasting = True
@@ -174,7 +176,7 @@ class InFolder(KeptArrays):
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:
-    """Of an array by its name, type, shape and bytes."""
+    """Digest of an array: of its name, type, shape and bytes."""
     digest = hashlib.sha256(json.dumps([key, array.dtype.str, array.shape]).encode())
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()

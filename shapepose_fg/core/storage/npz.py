@@ -18,15 +18,15 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular
 
 _WRITTEN_BYTES = 1 << 20
-"""What the compressor is given at a time, whatever pieces an array comes in."""
+"""Bytes that the compressor receives at a time, whatever the size of an array's pieces."""
 _LEVEL = 1
-"""Of packing: half the time of zlib's usual 6 for files that are 3 % larger."""
+"""Level of compression: half the time of zlib's usual 6 for files that are 3 % larger."""
 _SMALL_BYTES = 2**28
 """Arrays of a small file may be so large together, however well they are packed: columns of NaN pack 1000 to 1."""
 _MOST_PACKED = 50
 """Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
 _BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
-"""Of rows that are unpacked, and that are passed over, at a time."""
+"""Bytes of the rows that are unpacked at a time, and of those that are skipped at a time."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 

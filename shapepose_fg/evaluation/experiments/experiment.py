@@ -80,7 +80,7 @@ class Experiment:
         return every
 
     def only(self, wanted: Callable[[str], bool]) -> "Experiment":
-        """The same with the cases whose names are wanted."""
+        """Return the experiment with only the cases whose names are wanted."""
         rows = {label: [case for case in row if wanted(case.name)] for label, row in self.rows.items()}
         return replace(self, rows={label: row for label, row in rows.items() if len(row) > 0})
 

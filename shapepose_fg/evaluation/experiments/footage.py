@@ -9,13 +9,11 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
-from shapepose_fg.evaluation.experiments.methods import initial_proposals
-from shapepose_fg.evaluation.experiments.scenes import FRAME_BY_FRAME, MODES, OVER_TIME, Scale
+from shapepose_fg.evaluation.experiments.scenes import MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
 from shapepose_fg.evaluation.metrics import People
 from shapepose_fg.evaluation.shelf import ACTORS, ShelfScore, evaluate_shelf
 from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
-from shapepose_fg.evaluation.smplify import smpl_only
 from shapepose_fg.evaluation.tracking import body_joints
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detection_table import DetectionTable
@@ -78,17 +76,6 @@ def _ours(folder: Path, mode: str) -> Reconstruction:
     return _reconstructed(folder, MODES[mode])
 
 
-def _smpl_only(folder: Path) -> People:
-    """SMPL-only of the people and detections of ours frame by frame."""
-    people = _ours(folder, "frame by frame")
-    return smpl_only(people, shelf_footage(folder)[0], FRAME_BY_FRAME.observations).people
-
-
-def _stage_one(folder: Path) -> People:
-    rig, detections = shelf_footage(folder)
-    return initial_proposals(detections, rig, FRAME_BY_FRAME)
-
-
 def _bodies(folder: Path) -> People:
     """The joints of the bodies in place of those of the graphs."""
     people = _ours(folder, "frame by frame")
@@ -98,9 +85,7 @@ def _bodies(folder: Path) -> People:
 _SHELF: dict[str, Callable[[Path], People]] = {
     "**shapepose-fg, with time**": partial(_ours, mode="over time"),
     "**shapepose-fg, without time**": partial(_ours, mode="frame by frame"),
-    "(ours) stage I alone": _stage_one,
     "(ours) bodies' joints": _bodies,
-    "SMPL-only, of the same people and detections": _smpl_only,
 }
 """What is measured on Shelf."""
 

@@ -44,9 +44,9 @@ class Segment:
     cameras: int = 6
     """Views."""
     seed: int = 0
-    """Of the detector's errors; of the built-in scene, too."""
+    """Seed of the detector's errors, and of the built-in scene."""
     people: int = 4
-    """Of the built-in scene; a sequence has its own."""
+    """Number of people in the built-in scene; a sequence has its own."""
     made: SequenceConfig | None = None
     """What a sequence is made of, in place of the named one's."""
     fps: float | None = None
@@ -76,10 +76,6 @@ class Segment:
         part = np.searchsorted(self.scene.cuts, truth.frame, side="right")
         return replace(truth, person=truth.person + part * (int(truth.person.max(initial=0)) + 1))
 
-    def shorter(self, frames: int) -> "Segment":
-        """Its first so many frames, or all that it has."""
-        return replace(self, span=self.span[:frames])
-
     def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
         """Reconstructed at the scene's rate."""
         scene = self.scene
@@ -98,7 +94,7 @@ class Scale:
     split: Split = "report"
     """Choose on `tune`, report on `report`."""
     seeds: tuple[int, ...] = tuple(range(6101, 6106))
-    """Of the sequences that are drawn anew (`who is there`)."""
+    """Seeds of the sequences that are drawn anew (`who is there`)."""
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -171,7 +167,7 @@ THERE_COLUMNS = columns(
 HELD_BACK_SEED, HELD_BACK = 1001, {"salsa": 0, "crossing": 108, "crowd": 0}
 """Where the first 300 frames of each without a cut begin."""
 SECONDS, RATES, CAMERAS = 4.0, (10, 15, 20, 30, 60), (2, 3, 4, 6)
-"""Of the recordings of `who is there`."""
+"""Duration, s, frame rates, Hz, and numbers of cameras of the recordings of `who is there`."""
 
 
 def measure(segment: Segment, config: PipelineConfig) -> Figures:

@@ -33,7 +33,7 @@ _MOST_CHARACTERS = 2**23
 _MOST_DEPTH = 64
 """Nodes in nodes: libyaml's loader calls itself and crashes the interpreter on very deep ones."""
 _MOST_DIGITS = 100
-"""Of a number: YAML's base 60 takes the square of them."""
+"""Maximum number of digits of a number: the time that YAML's base 60 takes grows with their square."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
@@ -40,10 +40,9 @@ _CURES = {
 """What to do about a value, by its name in any of the formats."""
 
 
-class _Camera(BaseModel):
+class _Camera(BaseModel, strict=True, extra="forbid"):
     """A camera of a rig file; its numbers are checked as those of all formats."""
 
-    model_config = ConfigDict(strict=True, extra="forbid")
     name: Annotated[str, Field(min_length=1)]
     image_size: Any
     K: Any
@@ -56,15 +55,13 @@ class _Camera(BaseModel):
     readout_s: float = 0.0
 
 
-class _Trajectory(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
+class _Trajectory(BaseModel, strict=True, extra="forbid"):
     drift: Annotated[float, Field(gt=0, le=1)] = DRIFT
     refined: bool = False
     wTo: Any = None
 
 
-class _Rig(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
+class _Rig(BaseModel, strict=True, extra="forbid"):
     format: Literal["shapepose-fg rig 1"]
     unit: Unit | None = None
     up: Axis | None = None

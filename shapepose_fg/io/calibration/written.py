@@ -69,7 +69,7 @@ class WrittenRig:
     cameras: Sequence[WrittenCamera]
     """In the order of the file."""
     unit: Unit | None
-    """Of the translations; None where the file and its format do not say."""
+    """Unit of the translations; None where the file and its format do not say."""
     up: Axis | None
     """Which axis points up; None where the file and its format do not say."""
     cures: Mapping[str, str] = field(default_factory=dict)
@@ -134,7 +134,7 @@ class Node:
         return found
 
     def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array:
-        """The same of numbers that must be there."""
+        """Return `numbers` that must be there; InputError where they are missing."""
         found = self.numbers(names, *counts, most=most)
         if found is None:
             raise self.refuse(names.split()[0] if isinstance(names, str) else names[0], "is missing")
@@ -164,12 +164,12 @@ class Node:
         return pose(turn, shift, self.named(R) or R, self.place, centre=centre)
 
     def pose_of_rows(self, name: str) -> Array:
-        """The same of camera from world, 3 x 4 numbers."""
+        """World from camera, of camera from world as 3 x 4 numbers."""
         cTw = self.needed(name, 12).reshape(3, 4)
         return pose(cTw[:, :3], cTw[:, 3], name, self.place)
 
     def pose_of_matrix(self, name: str) -> Array:
-        """The same as it is written, 4 x 4 numbers."""
+        """World from camera as written, 4 x 4 numbers."""
         wTc = self.needed(name, 16).reshape(4, 4)
         if np.any(wTc[3] != (0, 0, 0, 1)):
             raise self.refuse(name, "must have the last row 0 0 0 1")

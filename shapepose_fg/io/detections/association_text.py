@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
 from shapepose_fg.core.storage.files import text_pieces
@@ -25,8 +23,6 @@ from shapepose_fg.proposal.assignment import match_best_first
 
 _LONGEST_WORD = 2**20
 """No number is as long."""
-_POWERS: Array = np.array([10.0**power for power in range(16)])
-"""Of ten."""
 _SPACE = " \n\t"
 """Pieces end behind one of these, so that no number, letter or end of line is cut."""
 SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
@@ -125,10 +121,6 @@ class NumberStream:
 
     def _numbers(self, text: str, first: int) -> Array:
         """The numbers of a piece, finite; `first` are before it."""
-        plain = np.empty(len(text) // 2 + 1)
-        count = _plain_numbers(np.frombuffer(bytearray(text, "utf-8"), dtype=np.uint8), _POWERS, plain)
-        if count >= 0:
-            return plain[:count].copy()
         tokens = text.split()
         try:
             values = np.array(tokens, dtype=np.float64)
@@ -153,35 +145,6 @@ class NumberStream:
             # A line that goes on in the next piece is not over.
             lines += len((text + "|").splitlines()) - 1
         return last
-
-
-@kernel("u1 f1 f1")
-def _plain_numbers(text: NDArray[np.uint8], powers: Array, values: Array) -> int:
-    """Fill in the numbers of a `text`, each a sign, up to 15 digits and a point, as the nearest doubles: a whole
-    number and a power of ten, both exact, are divided. Returns how many; -1 where one is written otherwise.
-    """
-    at, count = 0, 0
-    while at < len(text):
-        if text[at] == 32 or 9 <= text[at] <= 13:
-            at += 1
-            continue
-        sign, whole, digits, places, point = 1.0, 0.0, 0, 0, False
-        if text[at] == 45:
-            sign, at = -1.0, at + 1
-        while at < len(text) and text[at] > 32:
-            if 48 <= text[at] <= 57:
-                whole, digits = 10.0 * whole + (text[at] - 48.0), digits + 1
-                places += point
-            elif text[at] == 46 and not point:
-                point = True
-            else:
-                return -1
-            at += 1
-        if not 0 < digits < len(powers):
-            return -1
-        values[count] = sign * whole / powers[places]
-        count += 1
-    return count
 
 
 def read_association_text(path: Path, camera: Camera) -> ViewStream:

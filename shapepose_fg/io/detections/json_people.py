@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
+from pydantic import BaseModel, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
@@ -57,22 +57,19 @@ _AT_ONCE = 1024
 """Items that are checked together: as Python's numbers they take several times the memory of an array."""
 
 
-class _Person(BaseModel):
+class _Person(BaseModel, strict=True, extra="allow"):
     """A person of a frame of OpenPose; hands and face are passed over."""
 
-    model_config = ConfigDict(strict=True, extra="allow")
     pose_keypoints_2d: list[float] | None = None
 
 
-class _Frame(BaseModel):
-    model_config = ConfigDict(strict=True)
+class _Frame(BaseModel, strict=True):
     people: list[_Person]
 
 
-class _Instance(BaseModel):
+class _Instance(BaseModel, strict=True):
     """A person of MMPose."""
 
-    model_config = ConfigDict(strict=True)
     keypoints: list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
     keypoint_scores: list[FiniteFloat]
 
@@ -85,43 +82,38 @@ class _Instance(BaseModel):
         return [number for (x, y), score in pairs for number in (x, y, score)]
 
 
-class _VideoFrame(BaseModel):
+class _VideoFrame(BaseModel, strict=True):
     """A frame of MMPose."""
 
-    model_config = ConfigDict(strict=True)
     frame_id: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
     instances: list[_Instance]
 
 
-class _Result(BaseModel):
+class _Result(BaseModel, strict=True):
     """A person of COCO's results."""
 
-    model_config = ConfigDict(strict=True)
     image_id: int | str
     keypoints: Annotated[list[float], Field(min_length=1)]
     category_id: int | str | None = None
 
 
-class _Flat(BaseModel):
+class _Flat(BaseModel, strict=True):
     """A person of OpenPifPaf."""
 
-    model_config = ConfigDict(strict=True)
     keypoints: Annotated[list[float], Field(min_length=1)]
 
 
-class _Columns(BaseModel):
+class _Columns(BaseModel, strict=True):
     """The keypoints of a person of Ultralytics."""
 
-    model_config = ConfigDict(strict=True)
     x: list[FiniteFloat]
     y: list[FiniteFloat]
     visible: list[FiniteFloat] | None = None
 
 
-class _Object(BaseModel):
+class _Object(BaseModel, strict=True):
     """A person, or another thing, of Ultralytics."""
 
-    model_config = ConfigDict(strict=True)
     keypoints: _Columns | None = None
 
     def flat(self, place: str) -> list[float]:
@@ -136,22 +128,19 @@ class _Object(BaseModel):
         return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
 
 
-class _Body(BaseModel):
+class _Body(BaseModel, strict=True):
     """A person of AlphaPose's --format cmu."""
 
-    model_config = ConfigDict(strict=True)
     joints: Annotated[list[float], Field(min_length=1)]
 
 
-class _Bodies(BaseModel):
-    model_config = ConfigDict(strict=True)
+class _Bodies(BaseModel, strict=True):
     bodies: list[_Body]
 
 
-class _PifPafFrame(BaseModel):
+class _PifPafFrame(BaseModel, strict=True):
     """A frame of OpenPifPaf's video."""
 
-    model_config = ConfigDict(strict=True)
     frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
     predictions: list[_Flat]
 

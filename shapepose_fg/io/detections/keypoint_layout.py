@@ -63,10 +63,10 @@ def skeleton_of_people(
 
 
 def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tuple[Skeleton, str]:
-    """Of layouts with as many keypoints the one that people fit surely better than the most usual, which is the
-    first, and why; the most usual where none does.
+    """Return the layout that people fit best among those with as many keypoints, and why.
 
-    InputError where cameras surely fit different ones.
+    It is the most usual one, which is the first, where no other fits surely better. InputError where cameras
+    surely fit different ones.
     """
     from shapepose_fg.body.joint_order import LIKE_A_BODY
 

@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Len
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
@@ -24,13 +24,11 @@ _Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
 _Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
 
 
-class _Person(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+class _Person(BaseModel, strict=True, extra="allow"):
     pose_keypoints_2d: list[float]
 
 
-class _Line(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+class _Line(BaseModel, strict=True, extra="allow"):
     camera: str
     time_s: Annotated[FiniteFloat, Field(ge=-1e12, le=1e12)]
     people: list[_Person]
@@ -60,7 +58,9 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
 def view_of(
     camera: str, time_s: float, flat: list[list[float]], place: str, rig: Rig, skeleton: Skeleton
 ) -> tuple[str, Detections, float]:
-    """The same of people whose keypoints are x, y, score one after the other, in pixels of the picture."""
+    """Return a camera's name, its detections and their time, from keypoints in a flat list of x, y, score, pixels
+    of the picture.
+    """
     if camera not in rig.names:
         raise InputError(f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}")
     K = skeleton.keypoint_count

@@ -17,7 +17,7 @@ OVERSHOOT = 1.1
 _RARE = 0.01
 """Scores are divided by what this share of them exceeds: the highest alone would be decided by one outlier."""
 _MOST_LOOKED_AT = 4_000_000
-"""Of more scores than this every second, third ... is looked at for that."""
+"""Number of scores above which only every second, third ... of them is used to find how they are scaled."""
 _BLOCKS_LOOKED_AT = 10
 """Blocks of a camera's people that are read to see what they look like."""
 _OCCLUDED = 0.5
@@ -35,14 +35,14 @@ class PeopleBlock:
 
     @classmethod
     def of(cls, frames: list[int], people: list[list[float]]) -> "PeopleBlock":
-        """Of flat keypoints, as many of each person."""
+        """Block of flat keypoints, equally many for each person."""
         count = len(people[0]) // 3 if len(people) > 0 else 0
         keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
         return cls(np.array(frames, dtype=np.intp), keypoints)
 
     @property
     def scores(self) -> Array:
-        """(S,) of keypoints that were seen."""
+        """(S,) scores of the keypoints that were seen."""
         every = self.keypoints[..., 2].ravel()
         return every[np.isfinite(every) & (every > 0)]
 

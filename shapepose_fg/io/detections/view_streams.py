@@ -40,7 +40,7 @@ class ViewCandidates:
     def of(
         cls, frame: Index, joint: Index, xy: Array, confidence: Array, pairs: Index, affinity: Array
     ) -> "ViewCandidates":
-        """Of columns as in `Detections`."""
+        """Candidates from columns as in `Detections`."""
         return cls(frame, Detections(np.zeros_like(joint), joint, xy, confidence, pairs, affinity))
 
     def only(self, keep: Mask) -> "ViewCandidates":
@@ -160,29 +160,14 @@ def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
 
 def _joined(parts: Sequence[ViewCandidates]) -> ViewCandidates:
     """Candidates of one view after each other."""
-    start = np.cumsum([0, *(len(part.frame) for part in parts)])
-    columns = ("joint", "xy", "confidence", "affinity")
-    joint, xy, confidence, affinity = (
-        np.concatenate([getattr(part.seen, name) for part in parts]) for name in columns
-    )
-    pairs = np.concatenate([part.seen.pairs + at for part, at in zip(parts, start[:-1], strict=True)])
     frame = np.concatenate([part.frame for part in parts])
-    return ViewCandidates.of(frame, joint, xy, confidence, pairs, affinity)
+    return ViewCandidates(frame, Detections.joined([part.seen for part in parts]))
 
 
 def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detections, Index, Index]:
     """The candidates of all views in some frames, and (T + 1,) where candidates and pairs of each frame begin."""
-    counts = [len(view.frame) for view in views]
-    offsets = np.cumsum([0, *counts[:-1]])
-    every = Detections(
-        np.repeat(np.arange(len(views)), counts),
-        np.concatenate([view.seen.joint for view in views]),
-        np.concatenate([view.seen.xy for view in views]),
-        np.concatenate([view.seen.confidence for view in views]),
-        np.concatenate([view.seen.pairs + offset for view, offset in zip(views, offsets, strict=True)]),
-        np.concatenate([view.seen.affinity for view in views]),
-    )
-    frame = np.concatenate([view.frame for view in views])
+    parts = [replace(view.seen, view=np.full(len(view.frame), n)) for n, view in enumerate(views)]
+    every, frame = Detections.joined(parts), np.concatenate([view.frame for view in views])
     # Views come in order and each is sorted by frame: a stable sort leaves (frame, view, joint).
     order = np.argsort(frame, kind="stable")
     frame, every = frame[order], every.rows(order)

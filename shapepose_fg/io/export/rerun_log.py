@@ -43,7 +43,7 @@ _GATES = {
 _USED_DOT, _UNUSED_DOT = -2.0, -3.0
 """Radii of dots on the screen, whatever the zoom: that is what rerun takes negative radii for."""
 _QUALITY = 75
-"""Of the JPEGs, of 100: a second of four cameras in full HD is about 30 MB."""
+"""Quality of the JPEGs, out of 100: a second of four cameras in full HD is about 30 MB."""
 
 
 def person_path(who: int) -> str:

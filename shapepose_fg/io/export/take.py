@@ -115,10 +115,11 @@ class Take:
         return column
 
     def near_origin(self) -> tuple["Take", Array]:
-        """The same people and cameras from a local origin, and (3,) where that is, whole metres of the world.
+        """Return these people and cameras in the frame of a local origin, and (3,) that origin, whole metres of
+        the world.
 
-        For formats of seven digits: 400 km from the world's origin these are centimetres. It is the
-        world's own origin where nobody is farther than a kilometre from that.
+        It is for formats of seven digits, whose steps are centimetres 400 km from the world's origin. The local
+        origin is the world's where no joint is farther than a kilometre from that.
         """
         every = self.people.joints.reshape(-1, 3)
         every = np.concatenate([every[np.isfinite(every).all(axis=1)], self.people.transl])
@@ -130,11 +131,11 @@ class Take:
         return replace(self, people=people, rig=None if self.rig is None else _moved(self.rig, origin)), origin
 
     def at_one_rate(self) -> tuple["Take", int]:
-        """The same people at exactly `fps` frames a second, for formats that know no other; and what was lost.
+        """Return these people at exactly `fps` frames a second, for formats that know no other rate, and a count.
 
-        A frame goes to the nearest step, numbered on from the first; steps that no frame is near to are holes.
-        The number says how many frames were left out because another is nearer to their step. InputError where
-        that would be more than a million frames.
+        A frame goes to the nearest step, numbered on from the first; steps that no frame is near to are holes. The
+        count is the number of frames left out because another is nearer to their step. InputError where that would
+        be more than a million frames.
         """
         step = (self.times_s - self.times_s[0]) * self.fps
         if step[-1] >= _LONGEST:
@@ -162,9 +163,8 @@ def _moved(rig: Rig, origin: Array) -> Rig:
         shifted[..., :3, 3] -= origin
         return shifted
 
-    cameras = tuple(replace(camera, wTc=local(camera.wTc)) for camera in rig.cameras)
     trajectories = tuple(replace(each, wTb=local(each.wTb)) for each in rig.trajectories)
-    return replace(rig, cameras=cameras, trajectories=trajectories)
+    return replace(rig.at_poses(local(rig.wTc)), trajectories=trajectories)
 
 
 def _check_memory(persons: int, frames: int) -> None:

@@ -62,7 +62,7 @@ class Video:
 
     path: Path
     size: tuple[int, int]
-    """(width, height) of the pictures."""
+    """Width and height of the pictures, pixels."""
     time_s: Array
     """(N,) the frames' own times in the file, seconds after the first."""
     notes: tuple[str, ...] = ()
@@ -123,7 +123,7 @@ class PictureFiles:
 
     path: Path
     size: tuple[int, int]
-    """(width, height) of the pictures."""
+    """Width and height of the pictures, pixels."""
     files: tuple[Path, ...]
     """(N,) the files in the order of their numbers."""
     number: Index
@@ -211,7 +211,7 @@ def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
 
 
 def _size(file: Path) -> tuple[int, int]:
-    """(width, height) of a picture."""
+    """Return the width and height of a picture, pixels."""
     picture = _decoded(file)
     if picture is None:
         raise InputError(f"{file}: not a picture that can be read; give an undamaged one")

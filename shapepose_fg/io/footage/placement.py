@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
@@ -33,7 +33,7 @@ class PlacementKind(StrEnum):
     CROP = "crop"
     """Columns on the right and rows at the bottom were cut off, or added."""
     CROP_CENTRE = "crop-centre"
-    """The same, equally on both sides."""
+    """Columns on both sides, and rows above and below, were cut off, or added, equally many."""
     SCALE = "scale"
     """They were resized, each axis on its own."""
     LETTERBOX = "letterbox"
@@ -47,7 +47,7 @@ class Placement:
     kind: PlacementKind
     """Where it comes from."""
     picture_size: tuple[int, int]
-    """(width, height) of the pictures."""
+    """Width and height of the pictures, pixels."""
     calibrated_size: tuple[int, int]
     """(width, height) that the calibration is for."""
 
@@ -155,8 +155,7 @@ class CameraFootage:
 _Size = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
 
 
-class _Camera(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class _Camera(BaseModel, extra="forbid"):
     name: str
     path: str
     placement: PlacementKind

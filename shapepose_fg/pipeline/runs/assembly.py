@@ -147,7 +147,7 @@ class Assembly:
         write_result(folder, self.columns(), self.observation_columns(), self.run, check_files)
 
     def with_run(self, **entries: Any) -> "Assembly":
-        """The same with more to say in run.json."""
+        """Return a copy with further entries in run.json."""
         return replace(self, run=self.run | entries)
 
     def _piece(self, n: int, name: str, before: Mapping[int, int]) -> NDArray[Any]:

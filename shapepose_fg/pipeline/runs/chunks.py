@@ -17,24 +17,24 @@ from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.tracking.following import BLOCK_S
 
 WARM_S = 6.0
-"""Before a chunk people are followed for so long: who is there is known after a second or two, and people who hide
-for longer than that are rare. Following takes a tenth of the time."""
+"""Time over which people are tracked before a chunk, s: who is present is known after a second or two, and people
+who are hidden for longer are rare. Tracking takes a tenth of the time."""
 _SAME = 0.5
-"""Of two tracks the lesser one's detections that the other has too, from which on they are one person."""
+"""Minimum share of the smaller track's detections that both tracks use, from which on they are one person."""
 _NEAR_M = 0.3
-"""Or both are out of sight, and their joints so near to each other in the mean."""
+"""Mean distance between the joints of two tracks without detections, m, below which they are one person."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Frames that are reconstructed apart from all others."""
+    """Frames that are reconstructed independently of all others."""
 
     own: range
-    """The frames whose rows are its own."""
+    """The frames whose rows belong to the chunk."""
     first: int
-    """People are followed from this frame on."""
+    """The first frame in which people are tracked."""
     until: int
-    """And up to the one before this: the last own window is known then."""
+    """The frame before which tracking ends; the last of the chunk's own windows is decided by then."""
     ended: bool
     """Whether the recording ends, or is cut, at `until`."""
 

@@ -73,7 +73,7 @@ def frames_done(output: Path) -> int:
 
 
 def _digest(begun: Any) -> str:
-    """Of what a run was begun from."""
+    """Digest of what a run was begun from."""
     return hashlib.sha256(json.dumps(begun, sort_keys=True).encode()).hexdigest()
 
 
@@ -153,7 +153,7 @@ def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShap
 
 
 def checksum_at_start(kept: KeptArrays) -> str:
-    """Of the file that `people_at_start` read, sha256."""
+    """SHA-256 of the file that `people_at_start` read."""
     return kept.about(_KNOWN)["sha256"]
 
 

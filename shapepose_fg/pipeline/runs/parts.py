@@ -183,7 +183,7 @@ _ROWS = {
     "initial": Column("N J 3", most=1e6),
     "evidence": Column("N", most=1e6),
 }
-"""Of a row that waits to be solved; the rest is what the cameras gave."""
+"""Columns of a row that waits to be solved; the rest comes from the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
 _FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6)}
 _FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12)}

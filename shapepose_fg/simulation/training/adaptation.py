@@ -34,7 +34,7 @@ TRAINED, PLAIN = "trained", "plain optimiser"
 _RIDGE_M = 0.005
 """What of a shape moves points by less than this says nothing of which shape it is in the other body."""
 _SLOWER = 0.2
-"""Of the learning rate for a network from nothing: this one knows nearly everything."""
+"""Learning rate relative to that of training from scratch: this network needs small changes only."""
 _CALIBRATION_PEOPLE = 4096
 _SEEN = tuple(range(len(BODY_25)))
 

@@ -62,9 +62,9 @@ class CorruptionConfig:
     """How often what happens; shares of people unless it says otherwise."""
 
     triangulated: float = 0.5
-    """Seen by virtual cameras; the rest have isotropic noise."""
+    """Share of people whose targets come from virtual cameras; the others' have isotropic noise."""
     clean: float = 0.3
-    """Of the rest, those without noise."""
+    """Share without noise among the people with isotropic noise."""
     limb: float = 0.45
     """One limb is missing; two with this squared."""
     region: float = 0.08
@@ -74,7 +74,8 @@ class CorruptionConfig:
     complete: float = 0.25
     """Nothing at all is taken away."""
     outlier: float = 0.012
-    """Of the joints: off by 25 cm (one sigma and axis), with the claim of a good one."""
+    """Share of joints that are off by 25 cm (one sigma per axis) though their stated information is that of a
+    good joint."""
     swap: float = 0.04
     """Left and right of a limb change places."""
 
@@ -129,7 +130,7 @@ def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
 
 
 def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
-    """The same noise along every axis, 2 to 40 mm before they are made unlike from joint to joint."""
+    """Targets with isotropic noise, 2 to 40 mm before it is varied from joint to joint, and their information."""
     B, K = xyz.shape[:2]
     base = torch.exp(torch.log(torch.tensor(0.002)) + draw.uniform(B, 1) * torch.log(torch.tensor(20.0)))
     base = base * (draw.uniform(B, 1) >= clean)

@@ -45,7 +45,7 @@ class TrainedNetwork(nn.Module):
         return found
 
     def finished(self) -> UpdateNetwork:
-        """The same for the fitter."""
+        """Return this network as the fitter uses it."""
         return UpdateNetwork(self.config, {name: value.cpu().numpy() for name, value in self.state_dict().items()})
 
     def forward(self, inputs: Tensor, step: int) -> Tensor:

@@ -53,11 +53,11 @@ class TrainingConfig:
     weight_decay: float = 0.02
     """AdamW's."""
     averaging: float = 0.999
-    """Of the weights over iterations (exponential); the averaged ones are shipped."""
+    """Decay of the exponential moving average of the weights over iterations; the averaged weights are shipped."""
     model_sigma_m: float = 0.02
     """Added to every target, as the fitter's evidence does."""
     kernel_scale: float = 6.0
-    """Of the energy whose gradient the network sees."""
+    """Width of the robust kernel of the energy whose gradient the network receives, in standard deviations."""
     shake_rad: float = 0.05
     """Sigma added to recorded angles: bodies and recordings have play."""
     exchange: float = 0.15
@@ -73,7 +73,7 @@ class TrainingConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Size of the network."""
     seed: int = 0
-    """Of everything that is drawn."""
+    """Seed of everything that is drawn."""
 
 
 @dataclass(frozen=True)
@@ -234,11 +234,11 @@ def _judge(
 
 
 def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) -> FitterWeights:
-    """The same weights with `spread` measured on `count` people of `source` for each skeleton.
+    """Return the weights with `spread` measured on `count` people of `source` for each skeleton.
 
-    What is claimed of joints without their own target (`BodyFit.prior_covariance`, less the error of the model;
-    whether or not they have one) is widened or narrowed so that `INSIDE` of them are there. Left and right are
-    taken together.
+    The claimed covariance of joints without their own target (`BodyFit.prior_covariance`, less the error of the
+    model; whether or not they have one) is scaled so that regions of probability `INSIDE` contain this share of
+    them. Left and right are taken together.
     """
     plain = replace(weights, spread=np.ones(len(BODY_POINTS)))
     spread = np.ones(len(BODY_POINTS))

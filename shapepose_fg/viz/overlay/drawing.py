@@ -29,7 +29,7 @@ _DARK: Colour = (30, 30, 30)
 _BEND = 8
 """Pieces in which a bone is drawn, because a lens bends it."""
 _OPACITY = 0.45
-"""Of bodies: what is under them stays visible."""
+"""Opacity of bodies: what is under them stays visible."""
 _FINE = 8
 """Bits of a pixel's fraction in OpenCV's drawing."""
 _REACH = 0.5
@@ -46,7 +46,7 @@ class PictureView:
     placement: Placement
     """Where calibrated pixels lie in its pictures."""
     size: tuple[int, int]
-    """(width, height) of what is drawn on: the picture, enlarged or made smaller."""
+    """Width and height of what is drawn on, pixels: the picture, enlarged or made smaller."""
 
     @property
     def scale(self) -> Array:
@@ -127,7 +127,7 @@ class Skeletons:
 
     @classmethod
     def of(cls, people: Reconstruction) -> "Skeletons":
-        """Of the rows of one frame."""
+        """Skeletons of the rows of one frame."""
         numbers = people.person.tolist()
         return cls(
             joints=people.joints,

@@ -29,7 +29,7 @@ class CameraPage:
     rig: Rig
     """The cameras."""
     before: Rig | None = None
-    """The same as they were given, to be drawn beside."""
+    """The cameras as they were given, drawn beside the refined ones; None: there are none to compare with."""
     points: Array
     """(P, J, 3) people's joints, metres."""
     frame: Index

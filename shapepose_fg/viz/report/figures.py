@@ -30,7 +30,7 @@ class Residual:
 
     @classmethod
     def of(cls, px: Real) -> "Residual":
-        """Of all finite distances in `px`."""
+        """Median and 90th percentile of the finite distances `px`."""
         px = px[np.isfinite(px)]
         return cls(*np.quantile(px, [0.5, 0.9]).tolist()) if len(px) > 0 else cls(None, None)
 
@@ -46,9 +46,9 @@ class CameraFigures:
     gates: dict[Gate, int]
     """How many of them were used, and how many were not for which reason."""
     all: Residual
-    """Of all that were given to people."""
+    """Residuals of all detections that were assigned to people."""
     used: Residual
-    """Of those that were used."""
+    """Residuals of the detections that were used."""
     trend_px: list[float | None]
     """Median over time of all that were given to people: equal segments of the recording."""
     offered: float | None = None
@@ -56,7 +56,7 @@ class CameraFigures:
     left_out_px: float | None = None
     """Median distance to where the other cameras alone put the joint; None where run.json does not say."""
     left_out_mm: float | None = None
-    """The same as a length at the joint's depth."""
+    """Median of the same distances as lengths at the depth of the joint, mm; None where run.json does not say."""
 
 
 def camera_figures(people: Reconstruction) -> list[CameraFigures]:

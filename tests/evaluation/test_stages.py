@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.evaluation.experiments.methods import initial_proposals
-from shapepose_fg.evaluation.metrics import match_people
-from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.linearisation import triangulate
+from shapepose_fg.evaluation.metrics import PlainPeople, match_people
+from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
 
@@ -17,14 +19,17 @@ def test_stage_two_helps_whom_the_views_see_badly():
     scene = built_in_scene(1000, frames=10)
     detections = simulate(scene, DetectorConfig(misses=3.0), seed=1000)
     config = replace(PipelineConfig(), temporal=False)
-    before, after = initial_proposals(detections, scene.rig, config), reconstruct(detections, scene.rig, config)
+    found = [find_people(seen, scene.rig, detections.skeleton, config) for seen in detections]
+    frame = np.repeat(np.arange(len(found)), [len(people) for people in found])
+    placed = triangulate(Observations.concatenate(found), Views.of(scene.rig), config.observations)
+    before, after = PlainPeople(frame, placed), reconstruct(detections, scene.rig, config)
     error = np.full((2, *scene.keypoints.shape[:3]), np.nan)
     confidence = np.zeros(error.shape[1:])
     for table, people in zip(error, (before, after), strict=True):
-        found = match_people(people.frame, people.joints, scene.keypoints)
-        at = (found.frame, found.person)
-        table[at] = np.linalg.norm(people.joints[found.row] - scene.keypoints[at], axis=-1)
-    confidence[at] = after.confidence[found.row]  # the mean over views
+        match = match_people(people.frame, people.joints, scene.keypoints)
+        at = (match.frame, match.person)
+        table[at] = np.linalg.norm(people.joints[match.row] - scene.keypoints[at], axis=-1)
+    confidence[at] = after.confidence[match.row]  # the mean over views
     both = np.isfinite(error).all(axis=0)
     well, badly = error[:, both & (confidence >= 0.25)], error[:, both & (confidence < 0.25)]
     assert badly.shape[1] >= 20

@@ -1,0 +1,52 @@
+"""Tables of numbers as text: a line for each row, columns that a header may name."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.io.validation import is_number
+
+_MOST_BYTES = 2**28
+"""Largest file, bytes: a line per frame, a day of 30 cameras."""
+MISSING = "-"
+"""Stands for a number that is missing, in the columns that may lack some."""
+
+
+def read_number_table(
+    path: Path,
+    heads: Callable[[int, list[str]], tuple[list[str], bool]],
+    units: str,
+    may_lack: Callable[[str], bool] = lambda name: False,
+) -> tuple[list[str], Array, Index]:
+    """The names of the columns, the numbers (R, C), NaN for missing ones, and the line (R,) of each row.
+
+    Words are apart by commas or spaces, and `#` begins a comment. `heads` is given the number and the words of the
+    first line, and returns the names of the columns and whether that line is the header. `may_lack` says which
+    columns may have `MISSING`. InputError that names file and line; `units` is the cure for what is no number.
+    """
+    names, rows, lines = list[str](), list[list[float]](), list[int]()
+    for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
+        words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
+        if len(words) == 0:
+            continue
+        if len(names) == 0:
+            names, is_header = heads(line, words)
+            if is_header:
+                continue
+        if len(words) != len(names):
+            cure = "correct the line, or name the columns in the first line"
+            raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
+        row = list[float]()
+        for name, word in zip(names, words, strict=True):
+            lacks = word == MISSING and may_lack(name)
+            if not (lacks or is_number(word)):
+                raise InputError(f"{path}: line {line} must hold numbers, got {word[:20]!r}; {units}")
+            row.append(np.nan if lacks else float(word))
+        rows.append(row)
+        lines.append(line)
+    return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
