@@ -46,9 +46,11 @@ class Sightings(Rows):
     def of(cls, detections: DetectionSequence, frames: Iterable[int]) -> "Sightings":
         """The 2D people of some `frames`, grouped by affinities of their own picture; the core joints only."""
         joints = len(detections.skeleton.core)
-        none = cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints)))
+        none = Sightings(
+            np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints))
+        )
         found = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
-        return cls.concatenate([none, *found])
+        return Sightings.concatenate([none, *found])
 
 
 @dataclass(frozen=True)
