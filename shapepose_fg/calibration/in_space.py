@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
-from shapepose_fg.calibration.pairwise import Pairwise
+from shapepose_fg.calibration.pairwise import Pairwise, without_means
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
@@ -169,7 +168,10 @@ class InSpace:
             fastest = _FASTEST / self.fps
             fine = (length[1] < GATE / 2) & (length[2] < fastest) & (length[3] < fastest)
             grid[:, ~fine] = np.nan
-            miss, calm, fast = (_brisk(each, FAST_S * self.fps / self.step)[at] / whose for each in grid[1:])
+            miss, calm, fast = (
+                without_means(each, np.isfinite(each[..., :1]), FAST_S * self.fps / self.step)[at] / whose
+                for each in grid[1:]
+            )
             length = np.linalg.norm(miss, axis=-1)
             usual = np.array(
                 [np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0 for each in length.T]
@@ -210,14 +212,6 @@ def _across(points: Array, moving: Array, centre: Array) -> Array:
     away = points - centre
     far = np.linalg.norm(away, axis=-1, keepdims=True)
     return (moving - (moving * away).sum(axis=-1, keepdims=True) * away / far**2) / far
-
-
-def _brisk(values: Array, width: float) -> Array:
-    """Values (T, J, 3) less their means over the time around."""
-    there = np.isfinite(values[..., :1])
-    weight = gaussian_filter1d(there.astype(np.float64), width, axis=0, mode="constant")
-    mean = gaussian_filter1d(np.where(there, values, 0.0), width, axis=0, mode="constant")
-    return values - mean / np.maximum(weight, 1e-9)
 
 
 def _pixels(rays: Array, views: Views, view: int) -> Array:

@@ -156,9 +156,14 @@ def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, 
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
     for start, stop in zip([0, *edges], [*edges, len(one)], strict=True):
-        there = known[start:stop].astype(np.float64)
-        weight = np.maximum(gaussian_filter1d(there, width, axis=0, mode="constant"), 1e-9)
+        there = known[start:stop]
         for each in result:
-            mean = gaussian_filter1d(each[start:stop], width, axis=0, mode="constant") / weight
-            each[start:stop] = np.where(known[start:stop], each[start:stop] - mean, 0.0)
+            each[start:stop] = np.where(there, without_means(each[start:stop], there, width), 0.0)
     return result
+
+
+def without_means(values: Array, known: Mask, width: float) -> Array:
+    """Values (T, ...) less the means of those that are `known` over the time around: `width` steps, one sigma."""
+    weight = gaussian_filter1d(known.astype(np.float64), width, axis=0, mode="constant")
+    mean = gaussian_filter1d(np.where(known, values, 0.0), width, axis=0, mode="constant")
+    return values - mean / np.maximum(weight, 1e-9)

@@ -1,86 +1,76 @@
-"""What a run notes down for run.json, window by window: times, who is how probable, dropped, or not solved."""
+"""Notes of a run for run.json, window by window: times, evidence, dropped people, joints that were not solved."""
 
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from shapepose_fg.core.detections import Input
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What went wrong with one joint of one person in one frame."""
+    """A problem with one joint of one person in one frame."""
 
     row: int
     """Row of the solution."""
     track: int
-    """Who."""
+    """The track."""
     frame: int
-    """When."""
+    """The frame."""
     joint: int
-    """Which joint, an index into the skeleton."""
+    """Index of the joint in the skeleton."""
     reason: str
     """What happened, in words."""
 
 
 _Count = Annotated[int, Field(ge=0, lt=2**53)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
+_Rows = Annotated[int, Field(gt=0)]
 _Frames = dict[str, list[_Count]]
-
-
-class _Kept(BaseModel, extra="forbid"):
-    """Notes as plain values."""
-
-    frames: _Count
-    seconds: dict[str, _Number]
-    evidence: dict[_Count, tuple[_Number, Annotated[int, Field(gt=0)]]]
-    probable: dict[str, _Count]
-    dropped: _Frames
-    thinned_frames: _Frames
-    repeated_pictures: _Frames
-    problems: list[Problem]
-    factors: dict[str, tuple[_Count, _Count]] = {}
 
 
 @dataclass
 class Notes:
     """Notes about one window, or about a whole run."""
 
-    frames: int = 0
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    frames: _Count = 0
     """Number of frames that the notes are about."""
-    seconds: Counter[str] = field(default_factory=Counter)
-    """Time per stage, over all processes."""
-    evidence: dict[int, Sequence[float]] = field(default_factory=dict)
+    seconds: dict[str, _Number] = field(default_factory=dict)
+    """Time per stage, s, summed over all processes."""
+    evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
     """Sum of the evidence (`Observations.evidence`) of each track's rows, and the number of these rows."""
-    probable: Counter[str] = field(default_factory=Counter)
+    probable: dict[str, _Count] = field(default_factory=dict)
     """Number of rows of single frames by their probability, in tenths rounded down."""
-    dropped: dict[str, list[int]] = field(default_factory=dict)
-    """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
-    thinned_frames: dict[str, list[int]] = field(default_factory=dict)
-    """The frames of which something was left out, because it was too much."""
-    repeated_pictures: dict[str, list[int]] = field(default_factory=dict)
-    """The frames in which a camera, by its name, showed the picture before once more."""
+    dropped: _Frames = field(default_factory=dict)
+    """Frames in which people were dropped, by reason; one entry per person and frame."""
+    thinned_frames: _Frames = field(default_factory=dict)
+    """Frames in which detections, points or candidates were left out because there were too many, by what was
+    left out."""
+    repeated_pictures: _Frames = field(default_factory=dict)
+    """Frames in which a camera, by its name, repeated the previous picture."""
     problems: list[Problem] = field(default_factory=list)
-    """What could not be solved."""
-    factors: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """How many factors each function of the user's made, and how many of them were inactive."""
+    """Problems that were met."""
+    factors: dict[str, tuple[_Count, _Count]] = field(default_factory=dict)
+    """Number of factors that each of the user's functions made, and number of them that were inactive."""
 
     def add(self, other: "Notes") -> None:
-        """Take in the notes of what comes next."""
+        """Add the notes of the frames that follow."""
         self.frames += other.frames
-        for mine, more in ((self.seconds, other.seconds), (self.probable, other.probable)):
-            mine.update(more)
+        both: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
+        for mine, more in both:
+            for name, amount in more.items():
+                mine[name] = mine.get(name, 0) + amount
         for kind in ("dropped", "thinned_frames", "repeated_pictures"):
             for name, frames in getattr(other, kind).items():
                 getattr(self, kind).setdefault(name, []).extend(frames)
         for track, (evidence, rows) in other.evidence.items():
-            before = self.evidence.get(track, [0.0, 0])
-            self.evidence[track] = [before[0] + evidence, before[1] + rows]
+            before = self.evidence.get(track, (0.0, 0))
+            self.evidence[track] = before[0] + evidence, before[1] + rows
         self.problems += other.problems
         for name, counts in other.factors.items():
             before = self.factors.get(name, (0, 0))
@@ -94,15 +84,14 @@ class Notes:
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
         """What `as_dict` gave; ValueError where `values` are something else."""
         try:
-            made: dict[str, Any] = vars(_Kept.model_validate(values))
+            return TypeAdapter(cls).validate_python(values)
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
             raise ValueError(f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}") from None
-        return cls(**{**made, "seconds": Counter(made["seconds"]), "probable": Counter(made["probable"])})
 
 
 class Notebook:
-    """Notes that are being taken."""
+    """Collects notes while the pipeline runs."""
 
     def __init__(self) -> None:
         self._notes = Notes()
@@ -111,7 +100,7 @@ class Notebook:
         self._searched: int | None = None
 
     def search(self, frame: int) -> None:
-        """New people are sought in a frame, one of many that are looked at: what is thinned now is of this one."""
+        """Set the frame to which notes on thinning belong: the one in which new people are searched for."""
         self._searched = frame
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
@@ -122,20 +111,20 @@ class Notebook:
             noted += [frame] if frame not in noted[-1:] else []
 
     def repeat(self, cameras: Sequence[str], frame: int) -> None:
-        """Note down the cameras whose picture of a frame is the one before."""
+        """Note the cameras whose picture of a frame repeats the previous one."""
         for camera in cameras:
             self._notes.repeated_pictures.setdefault(camera, []).append(frame)
 
     def drop(self, reason: str, count: int) -> None:
-        """Note down people of the present frame who were none, or too little is seen of.
+        """Note people of the present frame who were dropped: false positives, or seen by too little.
 
-        Over time there is no present frame: blocks of frames are looked at, each many times.
+        Over time there is no present frame: blocks of frames are read, each many times.
         """
         if self._frame is not None:
             self.drop_in(reason, [self._frame] * count)
 
     def drop_in(self, reason: str, frames: Sequence[int]) -> None:
-        """Note down somebody who was not kept, in all of these frames."""
+        """Note that a person was dropped in all of these frames."""
         self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
@@ -146,14 +135,14 @@ class Notebook:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a block to a stage, but for that of stages inside it."""
+        """Add the time of a block to a stage, without that of stages inside it."""
         start, outside, self._inner = time.perf_counter(), self._inner, 0.0
         yield
         whole = time.perf_counter() - start
-        self._notes.seconds[name] += whole - self._inner  # type: ignore[assignment]
+        self._notes.seconds[name] = self._notes.seconds.get(name, 0.0) + whole - self._inner
         self._inner = outside + whole
 
-    def torn_off(self) -> Notes:
-        """What was noted since the last time, which is forgotten here."""
+    def flush(self) -> Notes:
+        """Return the notes since the last call, and start new ones."""
         notes, self._notes = self._notes, Notes()
         return notes

@@ -1,4 +1,4 @@
-"""The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
+"""The pipeline: triangulate, propose and associate people; track them, solve windows, fit bodies; return rows."""
 
 import warnings
 from collections.abc import Sequence
@@ -171,7 +171,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     done = parts.notes().frames
     windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, task.keyframes(), book)
     with execution.pool(setup, len(frames)) as pool:
-        beginning = book.torn_off()
+        beginning = book.flush()
         nobody = setup.engine(book).tracker.nobody()
         for part in windows.after(parts.checkpoint(windows.read, frames, nobody), pool, chunk):
             parts.append(part)
@@ -202,7 +202,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
                 )
                 result = replace(result, bodies=bodies)
     notes = beginning
-    for each in (parts.notes(), book.torn_off()):
+    for each in (parts.notes(), book.flush()):
         notes.add(each)
     more = {"time": times.as_dict(), "cuts": cuts}
     more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}

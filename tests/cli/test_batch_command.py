@@ -119,10 +119,10 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     assert "a batch was begun here; go on with --resume, or begin anew with --restart" in capsys.readouterr().err
     assert finished(*words, "--resume") == 1, "one of them failed"
     said = capsys.readouterr()
-    standings = json.loads((tmp_path / "batch.json").read_text())
-    assert (standings["done"], standings["failed"]) == (2, 1)
-    assert standings["recordings"]["long"]["frames"] == 30 and standings["recordings"]["long"]["people"] >= 2
-    broken = standings["recordings"]["broken"]
+    batch_status = json.loads((tmp_path / "batch.json").read_text())
+    assert (batch_status["done"], batch_status["failed"]) == (2, 1)
+    assert batch_status["recordings"]["long"]["frames"] == 30 and batch_status["recordings"]["long"]["people"] >= 2
+    broken = batch_status["recordings"]["broken"]
     assert broken["attempts"] == 2 and broken["reasons"][0] == broken["reasons"][1]
     assert "the file ends too early" in broken["reasons"][0]
     assert f"broken: {broken['reasons'][0]}"[:60] in " ".join(said.err.split()) and "2 done, 1 failed" in said.out

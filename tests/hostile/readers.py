@@ -13,7 +13,7 @@ import scipy.sparse
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, read_smpl_file
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
+from shapepose_fg.cli.batch.status import BatchStatus, RecordingStatus, read_status
 from shapepose_fg.cli.batch.table import read_table
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.observation_table import ObservationTable
@@ -178,9 +178,11 @@ def _recordings(folder: Path, seed: int) -> Read:
 
 
 def _batch(folder: Path, seed: int) -> Read:
-    standings = Standings(folder / "batch.json", "recordings.toml", {"walk": Standing({"fps": 25.0, "cuts": [3]})})
-    standings.set("dance", Standing({}).failed("no", 1.5, 1))
-    return lambda: read_standings(folder / "batch.json")
+    status = BatchStatus(
+        folder / "batch.json", "recordings.toml", {"walk": RecordingStatus({"fps": 25.0, "cuts": [3]})}
+    )
+    status.set("dance", RecordingStatus({}).failed("no", 1.5, 1))
+    return lambda: read_status(folder / "batch.json")
 
 
 def _network(folder: Path, seed: int) -> Read:

@@ -82,7 +82,7 @@ def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_peop
     fitter = make_fitter(config.body, BodyModel.default().with_keypoints(BODY_25.joints))
     tracker = Setup(five_cameras, BODY_25, config, fitter).engine(book).tracker
     finish(tracker, FollowState(tracker.nobody(), pending=(Input(7, np.zeros(5), seen, five_cameras),)))
-    assert book.torn_off().thinned_frames == {"points": [7], "candidates": [7]}
+    assert book.flush().thinned_frames == {"points": [7], "candidates": [7]}
 
 
 def test_the_surest_of_many_people_are_taken_and_that_is_said(five_cameras, two_people, seen_exactly):
@@ -97,4 +97,4 @@ def test_the_surest_of_many_people_are_taken_and_that_is_said(five_cameras, two_
     assert len(every(seen, five_cameras)) == 2
     one = replace(every, proposals=replace(config.proposals, most_people=1))(seen, five_cameras)
     np.testing.assert_allclose(one.initial, two_people[:1], atol=1e-6)
-    assert book.torn_off().thinned_frames == {"people": [7]}
+    assert book.flush().thinned_frames == {"people": [7]}

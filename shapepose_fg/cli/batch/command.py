@@ -16,7 +16,7 @@ from shapepose_fg.core.result_files import RUN as RUN_FILE
 from shapepose_fg.core.storage.output_folder import only_run_in
 
 if TYPE_CHECKING:
-    from shapepose_fg.cli.batch.standing import Standing
+    from shapepose_fg.cli.batch.status import RecordingStatus
     from shapepose_fg.cli.batch.table import Entry
     from shapepose_fg.pipeline.cluster import Scheduler
 
@@ -46,15 +46,15 @@ def batch(
 
 def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
     """The batch, in a folder that no other process writes to."""
-    from shapepose_fg.cli.batch.campaign import Campaign, look_at_all
-    from shapepose_fg.cli.batch.standing import Bars, Standings
+    from shapepose_fg.cli.batch.runner import BatchRunner, look_at_all
+    from shapepose_fg.cli.batch.status import Bars, BatchStatus
     from shapepose_fg.pipeline.cluster import local_cluster, look_at
     from shapepose_fg.pipeline.workers import cores
 
     begin = time.monotonic()
-    of = standings_of(entries, output, resume=running.resume, restart=running.restart)
-    standings = Standings(output / BATCH, str(table), of)
-    todo = [entry for entry in entries if standings.of[entry.name].status == "waiting"]
+    of = status_of(entries, output, resume=running.resume, restart=running.restart)
+    batch_status = BatchStatus(output / BATCH, str(table), of)
+    todo = [entry for entry in entries if batch_status.of[entry.name].status == "waiting"]
     sizes = look_at_all(table, todo, output, begun=running.resume or running.restart)
     if len(todo) > 0:
         with ExitStack() as opened:
@@ -69,26 +69,28 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
             count = min(at_once or most, len(todo))
             done = "" if len(todo) == len(entries) else f", {len(entries) - len(todo)} of them done before"
             _say(scheduler, f"{len(entries)} recordings{done}", count, here=here)
-            standings.write()
-            campaign = Campaign(entries, sizes, output, scheduler.address, count)
+            batch_status.write()
+            runner = BatchRunner(entries, sizes, output, scheduler.address, count)
             try:
                 with bars() as shown:
-                    campaign.run(standings, Bars(shown, standings))
+                    runner.run(batch_status, Bars(shown, batch_status))
             except Stopped as stop:
-                done = len(standings.names("done"))
+                done = len(batch_status.names("done"))
                 where = f"{done} of {len(entries)} recordings are done in {output}; go on with --resume"
                 raise Stopped(stop.number, where) from None
-    show(standings.summary(time.monotonic() - begin))
+    show(batch_status.summary(time.monotonic() - begin))
     print(f"written  {output / BATCH}")
-    for name in (failed := standings.names("failed")):
-        warn(f"{name}: {standings.of[name].reasons[-1]}")
+    for name in (failed := batch_status.names("failed")):
+        warn(f"{name}: {batch_status.of[name].reasons[-1]}")
     if len(failed) > 0:
         raise typer.Exit(1)
 
 
-def standings_of(entries: "list[Entry]", output: Path, *, resume: bool, restart: bool) -> "dict[str, Standing]":
-    """How far every recording is, and which begin anew: by `restart`, or with something else wanted."""
-    from shapepose_fg.cli.batch.standing import Standing, read_standings
+def status_of(
+    entries: "list[Entry]", output: Path, *, resume: bool, restart: bool
+) -> "dict[str, RecordingStatus]":
+    """The status of every recording; with `restart`, or if its options have changed, it begins anew."""
+    from shapepose_fg.cli.batch.status import RecordingStatus, read_status
     from shapepose_fg.cli.batch.table import asked
 
     file = output / BATCH
@@ -96,17 +98,17 @@ def standings_of(entries: "list[Entry]", output: Path, *, resume: bool, restart:
         raise InputError(f"{file}: a batch was begun here; go on with --resume, or begin anew with --restart")
     if resume and not file.exists():
         note(f"{output}: no batch was begun here; this one is")
-    before = read_standings(file) if resume and file.exists() else {}
-    found: dict[str, Standing] = {}
+    before = read_status(file) if resume and file.exists() else {}
+    found: dict[str, RecordingStatus] = {}
     for entry in entries:
         wanted = asked(entry.request)
-        old = before.get(entry.name, Standing(wanted, anew=restart))
+        old = before.get(entry.name, RecordingStatus(wanted, anew=restart))
         there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN_FILE))
         changed = old.asked != wanted
         if changed:
             note(f"{entry.name}: something else is wanted of it than before; it begins anew")
         is_done = not changed and old.status == "done" and there
-        found[entry.name] = old if is_done else Standing(wanted, anew=changed or old.anew)
+        found[entry.name] = old if is_done else RecordingStatus(wanted, anew=changed or old.anew)
     return found
 
 

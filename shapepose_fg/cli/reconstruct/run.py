@@ -16,8 +16,8 @@ from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.found_cameras import MOST_S, found_clocks, show_clocks
-from shapepose_fg.cli.reconstruct.ending import check_setup, show_check, summary_table
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
+from shapepose_fg.cli.reconstruct.summary import check_setup, show_check, summary_table
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show
 from shapepose_fg.core.camera import Rig

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
@@ -13,13 +12,12 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.export.take import Take, z_up
+from shapepose_fg.setup_check.matching import followed
 from shapepose_fg.viz.report.figures import Residual
 from shapepose_fg.viz.report.page import filled
 from shapepose_fg.viz.report.scene import Scene, camera_of, scene_of
 
 _SCENE_BYTES = 4_000_000
-_NEAR_M = 1.5
-"""Who is farther away a look later is somebody else."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +73,7 @@ class CameraPage:
         P, J = self.points.shape[:2]
         people = Reconstruction(
             frame=self.frame.astype(np.int64),
-            person=_followed(self.points, self.frame),
+            person=followed(self.frame, self.points).astype(np.int64),
             joint_names=np.array([self.skeleton.joints[joint] for joint in self.skeleton.core]),
             joints=self.points,
             covariance=np.full((P, J, 3, 3), np.nan),
@@ -94,23 +92,3 @@ class CameraPage:
             return scene
         before = [camera_of(each, z_up(up)) for each in self.before.cameras]
         return replace(scene, data=scene.data | {"before": before})
-
-
-def _followed(points: Array, frame: Index) -> Index:
-    """(P,) a number for each person, kept from look to look where somebody is near."""
-    person, at, free = np.zeros(len(points), dtype=np.int64), dict[int, Array](), 0
-    known = np.isfinite(points[..., :1])
-    middle = np.where(known, points, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    for now in np.unique(frame):
-        rows, numbers = np.flatnonzero(frame == now), list(at)
-        new = {int(row): -1 for row in rows}
-        if numbers:
-            away = np.linalg.norm(middle[rows][:, None] - np.stack([at[each] for each in numbers]), axis=-1)
-            for one, other in zip(*linear_sum_assignment(np.minimum(away, 2 * _NEAR_M)), strict=True):
-                if away[one, other] < _NEAR_M:
-                    new[int(rows[one])] = numbers[other]
-        for row, number in new.items():
-            person[row] = free if number < 0 else number
-            free += number < 0
-        at |= {int(person[row]): middle[row] for row in rows.tolist()}
-    return person

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.cli.batch import campaign as module
-from shapepose_fg.cli.batch.campaign import Assignment, Campaign, Leader
-from shapepose_fg.cli.batch.command import standings_of
-from shapepose_fg.cli.batch.standing import Standing, Standings, read_standings
+from shapepose_fg.cli.batch import runner as module
+from shapepose_fg.cli.batch.command import status_of
+from shapepose_fg.cli.batch.runner import Assignment, BatchRunner, Leader
+from shapepose_fg.cli.batch.status import BatchStatus, RecordingStatus, read_status
 from shapepose_fg.cli.batch.table import Entry
 from shapepose_fg.cli.reconstruct.request import Request
 from shapepose_fg.cli.reconstruct.run import Ended
@@ -84,12 +84,12 @@ def stage(monkeypatch) -> Stage:
     return found
 
 
-def run(stage: Stage, folder: Path, entries: list[Entry], at_once: int = 1, anew=()) -> Standings:
-    of = {entry.name: Standing({}, anew=entry.name in anew) for entry in entries}
-    standings = Standings(folder / "batch.json", "t", of)
+def run(stage: Stage, folder: Path, entries: list[Entry], at_once: int = 1, anew=()) -> BatchStatus:
+    of = {entry.name: RecordingStatus({}, anew=entry.name in anew) for entry in entries}
+    batch_status = BatchStatus(folder / "batch.json", "t", of)
     sizes = {entry.name: len(entry.name) for entry in entries}
-    Campaign(entries, sizes, folder, "tcp://x", at_once).run(standings, stage)
-    return standings
+    BatchRunner(entries, sizes, folder, "tcp://x", at_once).run(batch_status, stage)
+    return batch_status
 
 
 def entries(*names: str) -> list[Entry]:
@@ -99,23 +99,23 @@ def entries(*names: str) -> list[Entry]:
 def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage, tmp_path):
     stage.ends = {"bbb": ["disk full", DONE], "cc": ["no", "no again"], "a": [DONE]}
     (tmp_path / "bbb" / "parts").mkdir(parents=True)
-    standings = run(stage, tmp_path, entries("a", "bbb", "cc"), anew=("bbb", "cc"))
+    batch_status = run(stage, tmp_path, entries("a", "bbb", "cc"), anew=("bbb", "cc"))
     assert [each.name for each in stage.begun] == ["bbb", "cc", "a", "bbb", "cc"]
     # What was there goes once; what the first attempt left is kept.
     assert [(each.restart, each.resume) for each in stage.begun if each.name == "bbb"] == [
         (True, False),
         (False, True),
     ]
-    assert {name: each.status for name, each in standings.of.items()} == {
+    assert {name: each.status for name, each in batch_status.of.items()} == {
         "a": "done",
         "bbb": "done",
         "cc": "failed",
     }
-    assert standings.of["cc"].reasons == ("no", "no again") and standings.of["cc"].attempts == 2
-    assert standings.of["bbb"].frames == 10 and standings.of["bbb"].warnings == ("cam1 is late",)
+    assert batch_status.of["cc"].reasons == ("no", "no again") and batch_status.of["cc"].attempts == 2
+    assert batch_status.of["bbb"].frames == 10 and batch_status.of["bbb"].warnings == ("cam1 is late",)
     assert ("ended", "cc", "no", True) in stage.heard and ("ended", "cc", "no again", False) in stage.heard
     assert ("frames", "a", 5, 10) in stage.heard
-    assert read_standings(tmp_path / "batch.json") == standings.of
+    assert read_status(tmp_path / "batch.json") == batch_status.of
     content = json.loads((tmp_path / "batch.json").read_text())
     assert (content["done"], content["failed"], content["waiting"]) == (2, 1, 0)
 
@@ -124,21 +124,21 @@ def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, mon
     """A first attempt that ends before its run is begun leaves what was there before: nothing to go on with."""
     stage.ends, stage.frameless = {"a": ["no memory", DONE]}, ["a"]
     (tmp_path / "a" / "parts").mkdir(parents=True)
-    standings = run(stage, tmp_path, entries("a"), anew=("a",))
+    batch_status = run(stage, tmp_path, entries("a"), anew=("a",))
     assert [(each.restart, each.resume) for each in stage.begun] == [(True, False), (True, False)]
-    assert standings.of["a"].status == "done" and not standings.of["a"].anew
+    assert batch_status.of["a"].status == "done" and not batch_status.of["a"].anew
 
     def stop(*_: object) -> None:
         raise Stopped(15)
 
     for heard, anew in (("began", True), ("frames", False)):
         monkeypatch.setattr(stage, heard, stop)
-        standings = Standings(tmp_path / "batch.json", "t", {"a": Standing({}, anew=True)})
-        standings.write()
+        batch_status = BatchStatus(tmp_path / "batch.json", "t", {"a": RecordingStatus({}, anew=True)})
+        batch_status.write()
         with pytest.raises(Stopped):
             stage.ends = {"a": ["stopped"]}
-            Campaign(entries("a"), {"a": 1}, tmp_path, "tcp://x", 1).run(standings, stage)
-        assert read_standings(tmp_path / "batch.json")["a"].anew == anew
+            BatchRunner(entries("a"), {"a": 1}, tmp_path, "tcp://x", 1).run(batch_status, stage)
+        assert read_status(tmp_path / "batch.json")["a"].anew == anew
         monkeypatch.undo()
         monkeypatch.setattr(module, "Leader", stage.leader)
 
@@ -149,8 +149,8 @@ def test_a_batch_that_goes_on_knows_who_was_to_begin_anew(tmp_path):
 
     def anew(entries: list[Entry], **how: bool) -> list[str]:
         options = {"resume": False, "restart": False} | how
-        found = standings_of(entries, tmp_path, **options)
-        Standings(tmp_path / "batch.json", "t", found).write()
+        found = status_of(entries, tmp_path, **options)
+        BatchStatus(tmp_path / "batch.json", "t", found).write()
         return [name for name, each in found.items() if each.anew]
 
     assert anew(both) == []
@@ -163,18 +163,18 @@ def test_a_batch_that_goes_on_knows_who_was_to_begin_anew(tmp_path):
 
 
 def test_no_more_are_led_at_a_time_than_asked(stage, tmp_path):
-    standings = run(stage, tmp_path, entries(*"abcdefg"), at_once=3)
-    assert stage.together == 3 and len(standings.names("done")) == 7
+    batch_status = run(stage, tmp_path, entries(*"abcdefg"), at_once=3)
+    assert stage.together == 3 and len(batch_status.names("done")) == 7
 
 
 def test_recordings_with_shared_shapes_are_led_in_turn_and_not_without_those_before(stage, tmp_path):
     stage.ends = {"bb": ["no", "no"]}
     chain = [Entry("a", Request()), Entry("bb", Request(), "a"), Entry("ccc", Request(), "bb")]
     chain += [Entry("dddd", Request(), "ccc")]
-    standings = run(stage, tmp_path, chain, at_once=4)
+    batch_status = run(stage, tmp_path, chain, at_once=4)
     assert [each.name for each in stage.begun] == ["a", "bb", "bb"] and stage.together == 1
-    assert standings.names("failed") == ["bb", "ccc", "dddd"]
-    assert "begins with the shapes that bb leaves, which failed" in standings.of["ccc"].reasons[0]
+    assert batch_status.names("failed") == ["bb", "ccc", "dddd"]
+    assert "begins with the shapes that bb leaves, which failed" in batch_status.of["ccc"].reasons[0]
 
 
 def test_who_was_done_when_all_are_stopped_is_done(stage, tmp_path, monkeypatch):
@@ -184,7 +184,7 @@ def test_who_was_done_when_all_are_stopped_is_done(stage, tmp_path, monkeypatch)
     monkeypatch.setattr(stage, "frames", stop)
     with pytest.raises(Stopped):
         run(stage, tmp_path, entries("a", "b"), at_once=2)
-    assert read_standings(tmp_path / "batch.json")["a"].status == "done" and stage.alive == 0
+    assert read_status(tmp_path / "batch.json")["a"].status == "done" and stage.alive == 0
 
 
 def test_a_damaged_list_is_named(tmp_path):
@@ -196,7 +196,7 @@ def test_a_damaged_list_is_named(tmp_path):
     ):
         file.write_text(text)
         with pytest.raises(InputError, match=words):
-            read_standings(file)
+            read_status(file)
 
 
 @pytest.mark.slow

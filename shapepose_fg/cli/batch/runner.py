@@ -1,7 +1,7 @@
-"""Recordings, some at a time, each led by a process of its own: it reads, hands out work, and writes the results.
+"""Reconstruct the recordings of a batch, several at a time, each in a leader process of its own.
 
-A process and not a thread, so that one recording's error, memory or crash is no other's, and none waits for
-Python's lock.
+The leader reads the recording, submits windows to the cluster, and writes the results. It is a process and not a
+thread, so that an error, a crash or the memory of one recording does not affect the others.
 """
 
 import os
@@ -22,7 +22,7 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from shapepose_fg.cli.batch.standing import Bars, Standings
+from shapepose_fg.cli.batch.status import Bars, BatchStatus
 from shapepose_fg.cli.batch.table import LOG, Entry
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Request, prepare
 from shapepose_fg.cli.reconstruct.run import Ended, carry_out
@@ -40,67 +40,66 @@ from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.pipeline.workers import Processes
 
 ATTEMPTS = 2
-"""A recording that has failed so often is left, and the others go on."""
+"""Attempts after which a recording is given up; the others go on."""
 _PATIENCE_S = 20.0
-"""Time that a leader may take to end its work, s."""
+"""Time that a leader may take to stop, s."""
 _LEAST, _USUAL = 0.1, 2.0
-"""Bytes of results for each byte of detections: many cameras whose files hold hands and faces, and others."""
+"""Bytes of results per byte of detections: with many cameras and hands and faces in the files; usually."""
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """What a leader is to do; plain data."""
+    """The work of one leader; plain data."""
 
     name: str
-    """The recording's."""
+    """The name of the recording."""
     request: Request
-    """What is wanted."""
+    """The options of the recording."""
     folder: Path
-    """Folder of the recording's results."""
+    """The folder of its results."""
     cluster: str
     """Address of the scheduler."""
     sharing: int = 1
-    """How many recordings are led at a time."""
+    """Number of recordings that share the cluster."""
     resume: bool = False
-    """Go on with what a run that was stopped left."""
+    """Whether to continue an interrupted run."""
     restart: bool = False
-    """Remove it."""
+    """Whether to remove an interrupted run first."""
 
 
 @dataclass(frozen=True)
-class Campaign:
-    """What is to be done, and with what."""
+class BatchRunner:
+    """The recordings of a batch, and what reconstructs them."""
 
     entries: Sequence[Entry]
     """All recordings."""
     sizes: Mapping[str, int]
-    """Bytes of each one's detections."""
+    """Size of the detections of each recording, bytes."""
     output: Path
     """The folder of all results."""
     cluster: str
     """Address of the scheduler."""
     at_once: int
-    """Number of recordings that are led at a time."""
+    """Number of recordings that run at a time."""
 
-    def run(self, standings: Standings, watcher: Bars) -> None:
-        """Do what is not done; `standings` has how each ended.
+    def run(self, batch_status: BatchStatus, watcher: Bars) -> None:
+        """Reconstruct the recordings that are not done, and keep `batch_status` up to date.
 
-        The largest come first, so that none is left over at the end; those that failed come again after all
-        others.
+        The largest recordings start first; those that failed are tried again after all others.
         """
         leaders: list[Leader] = []
         try:
             while True:
-                while len(leaders) < self.at_once and (entry := self._next(standings, leaders)) is not None:
+                while len(leaders) < self.at_once and (entry := self._next(batch_status, leaders)) is not None:
                     watcher.began(entry.name)
-                    folder, restart = self.output / entry.name, standings.of[entry.name].anew
+                    folder, restart = self.output / entry.name, batch_status.of[entry.name].anew
                     how = self.cluster, self.at_once, not restart and (folder / PARTS).exists(), restart
                     leaders.append(Leader(Assignment(entry.name, entry.request, folder, *how)))
                 if len(leaders) == 0:
                     break
                 for ready in wait([leader.told for leader in leaders]):
                     leader = next(each for each in leaders if each.told is ready)
-                    if self._heard(leader, standings, watcher):
+                    if self._heard(leader, batch_status, watcher):
                         leaders.remove(leader)
         finally:
             for leader in leaders:
@@ -108,73 +107,73 @@ class Campaign:
             for leader in leaders:
                 found = leader.end()
                 if found is not None:  # it was done when it was asked to stop
-                    self._done(leader, found, standings)
+                    self._done(leader, found, batch_status)
 
-    def _next(self, standings: Standings, leaders: "Sequence[Leader]") -> Entry | None:
-        """The recording that is begun next; those whose turn cannot come are given up."""
+    def _next(self, batch_status: BatchStatus, leaders: "Sequence[Leader]") -> Entry | None:
+        """The recording to start next; recordings whose predecessor failed are given up."""
         led = {leader.assignment.name for leader in leaders}
         found: list[Entry] = []
         for entry in self.entries:
-            own = standings.of[entry.name]
+            own = batch_status.of[entry.name]
             if own.status != "waiting" or entry.name in led:
                 continue
-            before = None if entry.after is None else standings.of[entry.after].status
+            before = None if entry.after is None else batch_status.of[entry.after].status
             if before == "failed":
                 reason = f"it begins with the shapes that {entry.after} leaves, which failed; see there"
-                standings.set(entry.name, own.failed(reason, 0.0, 0))
+                batch_status.set(entry.name, own.failed(reason, 0.0, 0))
             elif before in (None, "done"):
                 found.append(entry)
-        turn = {each.name: (standings.of[each.name].attempts, -self.sizes[each.name]) for each in found}
+        turn = {each.name: (batch_status.of[each.name].attempts, -self.sizes[each.name]) for each in found}
         return min(found, key=lambda each: turn[each.name], default=None)
 
-    def _heard(self, leader: "Leader", standings: Standings, watcher: Bars) -> bool:
-        """Take in what a leader tells; whether it has ended."""
+    def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
+        """Process the next message of a leader; returns whether it has ended."""
         name, told = leader.assignment.name, leader.next()
         if isinstance(told, tuple):
-            if standings.of[name].anew:  # what is kept now is this run's own
-                standings.set(name, replace(standings.of[name], anew=False))
+            if batch_status.of[name].anew:  # what is kept now is this run's own
+                batch_status.set(name, replace(batch_status.of[name], anew=False))
             watcher.frames(name, *told)
             return False
         leader.end()
         if isinstance(told, Ended):
-            self._done(leader, told, standings)
+            self._done(leader, told, batch_status)
             watcher.ended(name, failed=None, again=False)
         else:
-            now = standings.of[name].failed(told, time.monotonic() - leader.began, ATTEMPTS)
-            standings.set(name, now)
+            now = batch_status.of[name].failed(told, time.monotonic() - leader.began, ATTEMPTS)
+            batch_status.set(name, now)
             watcher.ended(name, failed=told, again=now.status == "waiting")
         return True
 
-    def _done(self, leader: "Leader", found: Ended, standings: Standings) -> None:
-        """Note down that a recording is done."""
+    def _done(self, leader: "Leader", found: Ended, batch_status: BatchStatus) -> None:
+        """Record that a recording is done."""
         name = leader.assignment.name
-        standings.set(name, standings.of[name].done(found, time.monotonic() - leader.began))
+        batch_status.set(name, batch_status.of[name].done(found, time.monotonic() - leader.began))
 
 
 class Leader:
-    """The process that leads a recording, seen from the one that started it."""
+    """A leader process, as seen from the process that started it."""
 
     def __init__(self, assignment: Assignment) -> None:
-        """Start it."""
+        """Start the process."""
         self.assignment = assignment
         self.began = time.monotonic()
-        """When it was started, by the clock of `time.monotonic`."""
+        """Start time, by `time.monotonic`."""
         self.told, tell = Pipe(duplex=False)
-        """What it tells: (frames done, all frames), in the end `Ended`, or why it failed."""
+        """Messages: (frames done, all frames); at the end `Ended`, or the reason of the failure."""
         self._process = Processes(1, _tell_by, tell)
         tell.close()
         self._pid = self._process.submit(os.getpid)
         self._end = self._process.submit(_lead, assignment)
 
     def next(self) -> tuple[int, int] | Ended | str:
-        """What it tells next; where it has died, that."""
+        """The next message; a reason where the process has died."""
         try:
             return self.told.recv()
         except (EOFError, OSError):
             return "its process was ended from outside; there may be too little memory"
 
     def end(self) -> Ended | None:
-        """Wait for its end, or bring it about where it does not come; what it `Ended` with after all."""
+        """Wait for the process to end, or end it; returns the last `Ended` message, if there is one."""
         wait_for([self._end], _PATIENCE_S)
         self._process.shutdown()
         found = None
@@ -188,14 +187,14 @@ class Leader:
         return found
 
     def ask_to_stop(self) -> None:
-        """Have it keep what is done and end; `end` waits for it."""
+        """Ask the process to keep what is done and to stop; `end` waits for it."""
         with suppress(BrokenProcessPool, ProcessLookupError):
             if not self._end.done():
                 os.kill(self._pid.result(), signal.SIGTERM)
 
 
 _tell: Connection
-"""In a leader: the way to the one that started it."""
+"""In a leader: the connection to the process that started it."""
 
 
 def _tell_by(tell: Connection) -> None:
@@ -204,7 +203,7 @@ def _tell_by(tell: Connection) -> None:
 
 
 def _lead(assignment: Assignment) -> None:
-    """All that the process does; what is said, by libraries too, is added to a log."""
+    """The work of a leader process; all output is appended to the log of the recording."""
     use_any_streams()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
@@ -234,11 +233,11 @@ def _lead(assignment: Assignment) -> None:
 
 
 def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:
-    """Bytes of each recording's detections, whose cameras, settings and places are all there.
+    """Check the inputs and output folders of all recordings; returns the size of each one's detections, bytes.
 
-    `begun` says that runs which were stopped in their folders are meant to go on, or begin anew.
-    InputError where something is missing, wrong or in the way, for the first such recording, and how many others
-    there are; or where the disk of `output` has no room for what all of them will leave.
+    `begun` says whether interrupted runs in the folders will be continued or removed. InputError if something is
+    missing, wrong or in the way: it describes the first such recording and names others; or if the disk of
+    `output` has too little room.
     """
     sizes, problems = {}, []
     for entry in entries:
@@ -264,7 +263,7 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
 
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
-    """Bytes of a recording's detections."""
+    """Check one recording; returns the size of its detections, bytes."""
     known = prepare(entry.request, folder, tell=lambda *_: None)
     asked = known.request
     _, places, _ = find_places(known.detections, asked.rig())

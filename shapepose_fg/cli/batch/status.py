@@ -1,4 +1,4 @@
-"""How far the recordings of an archive are: batch.json, and what `shapepose-fg batch` says of them."""
+"""The status of every recording of a batch: batch.json, and what `shapepose-fg batch` prints."""
 
 import json
 from dataclasses import asdict, dataclass, field, replace
@@ -24,53 +24,53 @@ _STYLES = {"done": "green", "failed": "bold red", "waiting": "yellow"}
 
 
 @dataclass(frozen=True)
-class Standing:
-    """How far one recording is."""
+class RecordingStatus:
+    """The status of one recording."""
 
     asked: dict[str, Any]
-    """What is wanted of it (`table.asked`)."""
+    """The options that differ from the defaults (`table.asked`)."""
     status: Literal["waiting", "done", "failed"] = "waiting"
-    """`failed`: it failed twice, or one that it had to wait for did."""
+    """`failed`: it failed twice, or a recording that it depends on did."""
     attempts: int = 0
-    """How often it was begun."""
+    """Number of attempts so far."""
     anew: bool = False
-    """Whether what an earlier run of it left is to be removed first; so until the first frames are done."""
+    """Whether the next attempt removes what an earlier run left; false once the first frames are kept."""
     reasons: tuple[str, ...] = ()
-    """Why it failed, each time."""
+    """The reason of each failure."""
     seconds: float = 0.0
-    """What it took by the clock, beside others, all attempts together."""
+    """Wall time of all attempts together, seconds; other recordings run at the same time."""
     frames: int | None = None
-    """Number of frames of a recording that is done; None before, as are `rows` and `people`."""
+    """Frames that were reconstructed; None before the recording is done, as in the fields below."""
     rows: int | None = None
     people: int | None = None
     warnings: tuple[str, ...] = ()
 
-    def done(self, found: "Ended", seconds: float) -> "Standing":
-        """After it was done, in so many seconds."""
+    def done(self, found: "Ended", seconds: float) -> "RecordingStatus":
+        """The status after an attempt that succeeded and took so many seconds."""
         attempts, seconds = self.attempts + 1, self.seconds + seconds
         return replace(self, status="done", attempts=attempts, anew=False, seconds=seconds, **asdict(found))
 
-    def failed(self, reason: str, seconds: float, most: int) -> "Standing":
-        """After another attempt failed; the last of `most`?"""
+    def failed(self, reason: str, seconds: float, most: int) -> "RecordingStatus":
+        """The status after an attempt that failed; final after `most` attempts."""
         attempts, seconds = self.attempts + 1, self.seconds + seconds
         status = "failed" if attempts >= most else "waiting"
         return replace(self, status=status, attempts=attempts, seconds=seconds, reasons=(*self.reasons, reason))
 
 
 @dataclass
-class Standings:
-    """States of all recordings by name, as they are in the file."""
+class BatchStatus:
+    """The status of all recordings by name, kept in batch.json."""
 
     file: Path
     """batch.json."""
     table: str
-    """The table that they are of."""
-    of: dict[str, Standing] = field(default_factory=dict)
-    """In the table's order."""
+    """Path of the table of recordings."""
+    of: dict[str, RecordingStatus] = field(default_factory=dict)
+    """Status by name, in the order of the table."""
 
-    def set(self, name: str, standing: Standing) -> None:
-        """Change one, and the file."""
-        self.of[name] = standing
+    def set(self, name: str, status: RecordingStatus) -> None:
+        """Change the status of one recording, and write the file."""
+        self.of[name] = status
         self.write()
 
     def write(self) -> None:
@@ -85,11 +85,11 @@ class Standings:
         write_content(self.file, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
     def names(self, status: str) -> list[str]:
-        """The recordings that are that far."""
+        """The names of the recordings with this status."""
         return [name for name, each in self.of.items() if each.status == status]
 
     def summary(self, seconds: float) -> RenderableType:
-        """How each recording ended, frames, people and time; under it what all of them took."""
+        """A table of the results of all recordings, with totals below it."""
         rows = []
         for name, each in self.of.items():
             row = ["" if number is None else str(number) for number in (each.frames, each.people, each.rows)]
@@ -102,14 +102,14 @@ class Standings:
         return table(heads, rows, left=2, caption=caption)
 
 
-def read_standings(file: Path) -> dict[str, Standing]:
-    """What batch.json says of each recording; InputError where it is damaged."""
+def read_status(file: Path) -> dict[str, RecordingStatus]:
+    """Read the status of each recording from batch.json; InputError if it is damaged."""
     content = read_json(file)
     cure = "begin anew with --restart"
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise InputError(f"{file}: not of a batch of this program; {cure}, or give another --output")
     try:
-        kind = TypeAdapter(dict[str, Standing], config=ConfigDict(strict=True, allow_inf_nan=False))
+        kind = TypeAdapter(dict[str, RecordingStatus], config=ConfigDict(strict=True, allow_inf_nan=False))
         return kind.validate_json(json.dumps(content.get("recordings")))
     except ValidationError as error:
         place, problem = first_problem(error)
@@ -117,27 +117,27 @@ def read_standings(file: Path) -> dict[str, Standing]:
 
 
 class Bars:
-    """A line for all recordings, and one for each that is under way; nothing where stderr is no terminal."""
+    """Progress bars on stderr: one for the batch, one for each running recording; none without a terminal."""
 
-    def __init__(self, bars: Progress, standings: Standings) -> None:
-        self._bars, self._standings = bars, standings
-        self._whole = bars.add_task("recordings", total=len(standings.of))
+    def __init__(self, bars: Progress, batch_status: BatchStatus) -> None:
+        self._bars, self._status = bars, batch_status
+        self._whole = bars.add_task("recordings", total=len(batch_status.of))
         self._tasks: dict[str, TaskID] = {}
         self._count()
 
     def began(self, name: str) -> None:
-        """A recording is being read."""
+        """Show a bar for a recording that has started."""
         self._tasks[name] = self._bars.add_task(name, total=None)
 
     def frames(self, name: str, done: int, count: int) -> None:
-        """Show how many frames of a recording are done."""
+        """Update the number of frames that are done."""
         self._bars.update(self._tasks[name], completed=done, total=count)
 
     def ended(self, name: str, *, failed: str | None, again: bool) -> None:
-        """It is done, or has `failed` for a reason; `again` if it will be tried again."""
+        """Print that a recording is done, or why it `failed`, and whether it is tried `again`."""
         self._bars.remove_task(self._tasks.pop(name))
         self._count()
-        each = self._standings.of[name]
+        each = self._status.of[name]
         if failed is None:
             people = "" if each.people is None else f"{each.people} people, "
             words = ("done: ", "green"), f"{name}, {each.frames} frames, {people}{clock(each.seconds)}"
@@ -147,12 +147,12 @@ class Bars:
         self._bars.console.print(Text.assemble(*words), soft_wrap=True)
 
     def _count(self) -> None:
-        ended = len(self._standings.of) - len(self._standings.names("waiting"))
+        ended = len(self._status.of) - len(self._status.names("waiting"))
         self._bars.update(self._whole, completed=ended)
 
 
 def clock(seconds: float) -> str:
-    """A time in words: 12 s, 3 min 20 s, 5 h 10 min."""
+    """A duration in words: 12 s, 3 min 20 s, 5 h 10 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
