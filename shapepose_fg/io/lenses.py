@@ -9,9 +9,9 @@ import numpy as np
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.storage.files import open_regular
-from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.reading import camera_names
 from shapepose_fg.io.footage.placement import read_used_footage
+from shapepose_fg.io.footage.places import per_camera
 
 _NARROWEST, _WIDEST = 5.0, 150.0
 """Degrees from left to right that a lens without distortion can see."""
@@ -34,7 +34,7 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     pixels; without it footage.json, which `detect` writes, says them. InputError names what is missing.
     """
     names = camera_names(detections)
-    given = _given(fields, names)
+    given = dict(zip(names, per_camera("--field-of-view", fields, names, one_for_all=True), strict=True))
     footage = detections / "footage.json"
     sizes = (
         {}
@@ -42,14 +42,16 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
         else {each.name: each.placement.calibrated_size for each in read_used_footage(footage)}
     )
     cameras = []
-    for name in names:
+    for name, field in given.items():
         picture = size or sizes.get(name)
+        if field is None:
+            raise InputError(f"--field-of-view: camera {name} has none; give {name}=DEGREES")
         if picture is None:
             raise InputError(
                 f"camera {name}: nothing says how large its pictures are; pass --image-size WIDTHxHEIGHT"
             )
         with naming(detections):
-            cameras.append(_camera(name, picture, _degrees(given[name], picture)))
+            cameras.append(_camera(name, picture, _degrees(field, picture)))
     with naming(detections):
         return Rig(tuple(cameras), "z")
 
@@ -65,19 +67,6 @@ def _camera(name: str, size: tuple[int, int], degrees: float) -> Camera:
     f = width / 2 / np.tan(np.radians(degrees) / 2)
     K = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
     return Camera(name, K, np.eye(4), size)
-
-
-def _given(fields: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """What is given for each camera: what is for all of them, or its own."""
-    found = dict[str, str]()
-    for text in fields:
-        name, given, value = text.partition("=")
-        if given and name not in names:
-            raise InputError(f"--field-of-view {text}: no such camera; give one of {listing(names)}")
-        found |= {name: value} if given else {each: text for each in names if each not in found}
-    if missing := [name for name in names if name not in found]:
-        raise InputError(f"--field-of-view: camera {missing[0]} has none; give {missing[0]}=DEGREES")
-    return found
 
 
 def _degrees(given: str, size: tuple[int, int]) -> float:

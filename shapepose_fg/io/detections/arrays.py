@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.lib import format as npy
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.npz import read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.csv_people import body_parts, people_in
@@ -30,7 +30,6 @@ _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
 """How HDF5 keeps a text of any length: how long it is, and where."""
 _BLAZEPOSE = 33
 """MediaPipe's points of the body come first; hands and face follow."""
-_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _HDF5 = "an HDF5 file, and only SLEAP's analysis files and DeepLabCut's tables are known here; give the CSV"
 _FREEMOCAP_3D = (
     "FreeMoCap's table of points in 3D, and its 2D points are needed; give the recording's folder, or"
@@ -109,8 +108,7 @@ def cameras_of_freemocap(path: Path) -> list[str]:
 def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:
     """Shape, type and order of the array in an .npy file, and where its numbers begin."""
     try:
-        version = npy.read_magic(stream)
-        shape, fortran, dtype = _HEADERS[version](stream)
+        shape, fortran, dtype = read_npy_header(stream)
     except Exception:  # NumPy parses the header as Python's own text, with all errors of that
         raise InputError(f"{path}: this is no NumPy array; {what_it_is(path)}") from None
     if dtype.hasobject:
