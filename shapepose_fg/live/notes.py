@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from types import TracebackType
 
 _BETWEEN_S = 1.0
@@ -10,7 +11,7 @@ _AT_ONCE = 10
 """Notes that are passed on at once before."""
 
 
-class SparingNotes:
+class SparingNotes(AbstractContextManager["SparingNotes"]):
     """Passes notes on: the first ten, then one a second, with how many were left out. A context, which ends with
     that number.
     """
@@ -28,9 +29,6 @@ class SparingNotes:
         self._left -= 1
         self._count()
         self._note(text)
-
-    def __enter__(self) -> "SparingNotes":
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

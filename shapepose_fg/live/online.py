@@ -3,7 +3,7 @@
 import threading
 from bisect import bisect_left
 from collections import deque
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -92,7 +92,7 @@ class LiveReport:
     """How each camera is."""
 
 
-class OnlineReconstructor:
+class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     """Follows people from frame to frame as they come, and refines them within a fixed lag.
 
     A context: processes that refine end with it. `push`, `push_view`, `settled`, `save` and `close` wait for each
@@ -166,9 +166,6 @@ class OnlineReconstructor:
             found.close()
             raise
         return found
-
-    def __enter__(self) -> "OnlineReconstructor":
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 
@@ -241,27 +242,19 @@ class _Undistorted:
         camera, (width, height), xy = self.camera, self.camera.image_size, view.seen.xy
         size = np.array([width, height], dtype=np.float64)
         outside = np.any((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size), axis=1)
-
-        def where(row: int) -> str:
-            return (
-                f"{self.source}: frame {view.frame[row]} has a joint at pixel ({xy[row, 0]:.0f},"
-                f" {xy[row, 1]:.0f}), far outside the {width} x {height} picture of the calibration"
-            )
-
-        self.reasons[0].add(outside, where)
+        why = f"far outside the {width} x {height} picture of the calibration"
+        self.reasons[0].add(outside, partial(self._words, view, why))
         certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
         straight = camera.undistort(certain.seen.xy)
         undone = np.asarray(~np.isfinite(straight).all(axis=1))
-        xy = certain.seen.xy
-
-        def bent(row: int) -> str:
-            return (
-                f"{self.source}: frame {certain.frame[row]} has a joint at pixel ({xy[row, 0]:.0f},"
-                f" {xy[row, 1]:.0f}), where the distortion of camera {camera.name} cannot be undone"
-            )
-
-        self.reasons[1].add(undone, bent)
+        why = f"where the distortion of camera {camera.name} cannot be undone"
+        self.reasons[1].add(undone, partial(self._words, certain, why))
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
+
+    def _words(self, view: ViewCandidates, why: str, row: int) -> str:
+        """Which candidate of a block is left out, and why."""
+        x, y = view.seen.xy[row]
+        return f"{self.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), {why}"
 
 
 def undistorted(view: ViewCandidates, source: Path | str, camera: Camera) -> ViewCandidates:
