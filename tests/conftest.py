@@ -3,8 +3,10 @@
 import os
 import pickle
 import sys
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +35,24 @@ def pytest_configure() -> None:
     """Let `SHAPEPOSE_TEST_SEED` change all that is drawn."""
     if SEED != 0:
         np.random.default_rng = _other_generator
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, pytest.CollectReport, Any]:
+    """Let every other process of pytest-xdist read the test files from the last one back.
+
+    What pytest makes of a file is kept: each file is done by one process, and the others find it.
+    """
+    report = yield
+    if isinstance(collector, pytest.Directory) and os.environ.get("PYTEST_XDIST_WORKER", "gw0")[-1] in "13579":
+        report.result.reverse()
+    return report
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Have tests in the same order in all processes."""
+    items.sort(key=lambda item: item.path)
 
 
 _seeded = np.random.default_rng

@@ -17,17 +17,18 @@ def compile_kernels() -> None:
     from shapepose_fg.core.compiling import compile_beside
     from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
-    start, package = time.perf_counter(), Path(__file__).parents[1]
+    package = Path(__file__).parents[1]
     if kept_folder() != wanted_folder():
         raise InputError(f"{wanted_folder()}: cannot be written; set NUMBA_CACHE_DIR to a folder that can be")
     for path in sorted(package.rglob("*.py")):
         if "\nfrom shapepose_fg.core.compiled import" in path.read_text(encoding="utf-8"):
             import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
-    missing = [each for each in KERNELS.values() if not each.is_kept]
+    start, missing = time.perf_counter(), [each for each in KERNELS.values() if not each.is_kept]
     compile_beside(missing)
     for each in missing:  # what no other process could compile
-        each.load()
+        if not each.is_kept:
+            each.load()
     if lost := sum(not each.is_kept for each in KERNELS.values()):
         raise InputError(f"{wanted_folder()}: {lost} functions could not be kept; check the space left there")
-    took = f"{len(missing)} functions compiled in {time.perf_counter() - start:.0f} s"
-    show(f"{took}, {len(KERNELS)} kept in {wanted_folder()}")
+    took = f"compiled in {time.perf_counter() - start:.0f} s" if missing else "were compiled before"
+    show(f"{len(missing or KERNELS)} functions {took}; {len(KERNELS)} are kept in {wanted_folder()}")

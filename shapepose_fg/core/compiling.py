@@ -1,4 +1,4 @@
-"""Kernels compiled side by side by several processes, and what is said meanwhile."""
+"""Compiles kernels in several processes, and logs that it does."""
 
 import gc
 import logging
@@ -14,21 +14,21 @@ from typing import Any
 
 from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
-_BYTES_S = 3000
-"""Bytes of Python's code that are compiled in a second, on a machine that is neither fast nor slow."""
+_BYTES_S = 1300
+"""Bytes of Python code that an average machine compiles in a second."""
 _WORTH_S = 3.0
-"""Less than this is compiled here, one after the other: a process takes a second to start."""
+"""Compile time below which kernels are compiled in this process, s: starting a process takes a second."""
 _MOST = 8
-"""Number of processes: the longest kernel takes an eighth of all."""
+"""Maximum number of processes: the longest kernel takes an eighth of the whole time."""
 
 _tried = False
-"""Whether this process has compiled what was missing; what is missing then is compiled where it is called."""
+"""Whether this process has compiled the missing kernels; any that are missing later are compiled when called."""
 
 
 def compile_beside(kernels: Sequence[Any]) -> None:
-    """Compile these kernels, those that are not kept, by as many processes as there are cores; once a process.
+    """Compile those of the kernels that are not cached, in as many processes as there are cores; once per process.
 
-    Another process that does so is waited for.
+    Waits for another process that compiles.
     """
     global _tried
     if _tried:
@@ -52,42 +52,49 @@ def compile_beside(kernels: Sequence[Any]) -> None:
 
 
 def _share_out(kernels: Sequence[Any], count: int) -> None:
-    """Compile by `count` processes: a module's kernels, which have parts in common, in one, unless it is large."""
+    """Compile by `count` processes, each of which takes the largest group that is left: a module's kernels, which
+    have parts in common, or one of them where a module is large.
+    """
     modules: dict[str, list[Any]] = {}
     for each in kernels:
         modules.setdefault(each.py_func.__module__, []).append(each)
-    bound = _work(kernels) / count
-    shares: list[list[Any]] = [[] for _ in range(count)]
+    bound = _work(kernels) / (2 * count)
     groups = [p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])]
-    for group in sorted(groups, key=_work, reverse=True):
-        min(shares, key=_work).extend(group)
+    groups.sort(key=_work, reverse=True)
+    words = [",".join(each.name for each in group) for group in groups]
     # The same packages as here, whatever lies in the working folder.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)}
-    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()"]
+    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", *words]
     started = list[subprocess.Popen[Any]]()
+    numbers, to = os.pipe()  # of groups, two bytes each, which all processes read
     try:
-        for share in shares:
-            words = command + [each.name for each in share]
-            quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-            started.append(subprocess.Popen(words, env=environment, **quiet))
+        os.write(to, b"".join(n.to_bytes(2) for n in range(len(groups))))
+        os.close(to)
+        for _ in range(count):
+            quiet: Any = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+            started.append(subprocess.Popen(command, env=environment, stdin=numbers, **quiet))
         for each in started:
             each.wait()
     except OSError as error:  # without processes kernels are compiled where they are called
         logging.getLogger(__name__).debug("%r", error)
     finally:
+        os.close(numbers)
         for each in started:
             each.kill()
             each.wait()
 
 
 def main() -> None:
-    """Compile the kernels that the command line names, as a process of `compile_beside`."""
+    """Compile groups of kernels that the command line names, as a process of `compile_beside`: those whose numbers
+    it reads from standard input.
+    """
     global _tried
     _tried = True
     gc.disable()
-    for name in sys.argv[1:]:
-        module, _, function = name.partition(":")
-        getattr(import_module(module), function).load()
+    while number := os.read(0, 2):
+        for name in sys.argv[1 + int.from_bytes(number)].split(","):
+            module, _, function = name.partition(":")
+            getattr(import_module(module), function).load()
 
 
 @contextmanager
@@ -122,7 +129,7 @@ def _alone() -> Iterator[None]:
 
 
 def _work(kernels: Sequence[Any]) -> int:
-    """Bytes of Python's code that are compiled for kernels: how long that takes."""
+    """Bytes of Python code to compile for kernels: a measure of the time that it takes."""
     return sum(len(each.__code__.co_code) for kernel in kernels for each in _pieces(kernel.py_func))
 
 

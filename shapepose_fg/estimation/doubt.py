@@ -7,6 +7,7 @@ import numpy as np
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.joint_names import mirrored as mirror_of
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
@@ -16,6 +17,8 @@ CERTAIN = 0.99
 FREE_M = 0.3
 """A joint that nothing but a doubtful observation places is known to this, metres, without it: half an arm."""
 
+DOUBTED = 0.05
+"""Rows most of whose joints are more probably of the other side are not `Status.OK`: 95 % regions cannot hold."""
 REACH_M = 0.6
 """Limbs of two people whose ends are nearer than this may be exchanged."""
 FITS_M = 0.05
@@ -55,6 +58,19 @@ def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) ->
         fits = np.where(np.linalg.norm(away, axis=-1) < REACH_M, np.nan_to_num(fits), 0.0)
         spread[rows[:, None], far] = np.einsum("pql,pqli,pqlk->plik", fits, *(np.nan_to_num(away),) * 2)
     return spread
+
+
+def mirrored_spread(joints: Array, mirrored: Array, names: Sequence[str]) -> Array:
+    """(N, J, 3, 3) outer products of the ways from joints (N, J, 3) to the same ones of the other side, m².
+
+    They count by how probably the sides are exchanged: what the row's observations of them say, `mirrored`
+    (N, J, V).
+    """
+    other = [names.index(mirror_of(name)) if mirror_of(name) in names else n for n, name in enumerate(names)]
+    doubt = mirrored.max(axis=2, initial=0.0)
+    doubt = np.maximum(doubt, doubt[:, other])
+    away = np.nan_to_num(joints[:, other] - joints) * np.sqrt(doubt)[..., None]
+    return away[..., None] * away[..., None, :]
 
 
 def association_spread(

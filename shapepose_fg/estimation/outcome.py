@@ -12,7 +12,13 @@ from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
 from shapepose_fg.estimation.carried_error import carried_covariance
-from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
+from shapepose_fg.estimation.doubt import (
+    DOUBTED,
+    association_spread,
+    exchange_spread,
+    limbs_to_exchange,
+    mirrored_spread,
+)
 from shapepose_fg.estimation.in_time import carried, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
@@ -69,8 +75,11 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         waited = waited_s(np.asarray(reported[person.rows].any(axis=-1)), person.times_s)
         moved = np.minimum(elsewhere[person.rows], (SPEED_M_S * waited) ** 2)
         covariance[person.rows] += moved[..., None, None] * np.eye(3)
+    covariance += mirrored_spread(X, rows.mirrored, state.config.joints)
     wrong = problems(state, covariance)
-    status = np.where(fit.ok, Status.OK, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
+    doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
+    sided = np.where(doubted, Status.CONTRADICTED, Status.OK)
+    status = np.where(fit.ok, sided, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
     status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
     return WindowSolution(
         observations=rows,

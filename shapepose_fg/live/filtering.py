@@ -17,6 +17,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.following import observed
 from shapepose_fg.tracking.presence import APPEARS_S, LEAST_S, own_evidence, weighed
+from shapepose_fg.tracking.sides import hold_now
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 from shapepose_fg.tracking.worlds import PLACED_M
@@ -114,22 +115,22 @@ class Filter:
         own = np.zeros((0, J), np.int64), whole, real, real, real, np.zeros((0, 3)), *per_bone
         return Moment(self.tracker.nobody(), *own, gone)
 
-    def step(self, before: Moment, given: Input) -> tuple[Moment, Index]:
-        """The next frame, and the detections (A, J, V) of each of its tracks, -1 for none.
+    def step(self, before: Moment, given: Input) -> tuple[Moment, Index, Input]:
+        """The next frame, the detections (A, J, V) of each of its tracks, -1 for none, and the frame that they
+        are of, with people's sides held.
 
         People are predicted, given their detections and measured; ten times a second others are sought in what is
         left over.
         """
-        tracker, detections, rig = self.tracker, given.detections, given.rig
-        time_s = float(given.time_s.mean())
-        last_s = before.tracks.time_s
-        tracks, candidate = tracker.step(before.tracks, detections, rig, time_s)
+        time_s, last_s, tracker = float(given.time_s.mean()), before.tracks.time_s, self.tracker
+        tracks, given = hold_now(tracker, before.tracks, given)
+        tracks, candidate = tracker.step(tracks, given.detections, given.rig, time_s)
         now = replace(before, tracks=replace(tracks, time_s=time_s))
         now, candidate = self._weighed(now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S))
         now, candidate = self._without_ended(now, candidate)
         if not abs(time_s - now.sought_s) < _SEARCH_S:
             now, candidate = self._with_newcomers(now, candidate, given)
-        return self._with_names(now), candidate
+        return self._with_names(now), candidate, given
 
     def placed(self, now: Moment) -> Array:
         """(A, J, 3) where joints are, metres; NaN where that is not known well."""

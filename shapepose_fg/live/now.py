@@ -72,8 +72,8 @@ class Newest:
     """Fits their bodies."""
     doubted: bool = False
     """Whether cameras contradict each other and nothing says which are wrong."""
-    of_poses: Array | None = None
-    """(A, J, 3, 3) see `of_poses`; None where no camera moves."""
+    doubt: Array | None = None
+    """(A, J, 3, 3) added to covariances, m²: of cameras that move (`of_poses`) and of sides; None for nothing."""
 
     @cached_property
     def people(self) -> tuple[Moment, Array, Array, BodyFit]:
@@ -99,8 +99,8 @@ class Newest:
         mean = joints.mean.copy()
         mean[surer, :3], covariance[surer] = fit.joints[surer], of_body[surer]
         covariance[~(known | surer)] = np.nan
-        if self.of_poses is not None:
-            covariance += self.of_poses[order]
+        if self.doubt is not None:
+            covariance += self.doubt[order]
         unseen = np.where(surer, Known.BODY, Known.MOTION)
         code = np.where(now.views >= 2, Known.SEEN, np.where(now.views == 1, Known.WEAK, unseen))
         code = np.where(known | surer, code, Known.UNKNOWN)

@@ -22,6 +22,7 @@ from shapepose_fg.core.frame_times import LEAST_STEP_S
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
+from shapepose_fg.estimation.doubt import mirrored_spread
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import JUMP_S, CommonClock
@@ -409,8 +410,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         watch, rig = before.seen(detections, self._state.before, stands, time_s)
         last = slots[-1].moment if len(slots) > 0 else self._state.begin
         given = Input(self._state.frames, times, _without(detections, rig), rig)
-        given = self._filter.tracker.with_sides_held(last.tracks, given)
-        moment, candidate = self._filter.step(last, given)
+        moment, candidate, given = self._filter.step(last, given)
         self._state.frames += 1
         self._state.before = detections
         seen = (moment.views >= 2) & moment.named[:, None]
@@ -464,8 +464,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         for at in range(first, len(self._state.slots)):
             slot = self._state.slots[at]
             last = self._state.slots[at - 1].moment
-            slot.given = self._filter.tracker.with_sides_held(last.tracks, slot.given)
-            slot.moment, slot.candidate = self._filter.step(last, slot.given)
+            slot.moment, slot.candidate, slot.given = self._filter.step(last, slot.given)
             if slot.refined is not None:
                 slot.moment = fed_back(self._filter.tracker, slot.moment, slot.refined)
         self._show()
@@ -524,12 +523,14 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     def _show(self) -> None:
         """From now on `people` is asked of the newest moment as it is."""
         if len(self._state.slots) > 0:
-            newest, rig, carried = self._state.slots[-1], self._state.rig, None
-            if rig.moves:
+            newest, rig, setup, added = self._state.slots[-1], self._state.rig, self._setup, None
+            if rig.moves or newest.given.detections.mirrored.any():
                 rows = self._filter.observations(newest.moment, newest.candidate, newest.given)
-                carried = of_poses(rows, newest.moment.tracks.joints, rig, self._setup.estimator)
+                joints = newest.moment.tracks.joints
+                added = mirrored_spread(joints.position, rows.mirrored, setup.skeleton.joints)
+                added += of_poses(rows, joints, rig, setup.estimator) if rig.moves else 0.0
             doubted = len(newest.given.rig.doubted) > 0
-            self._now = Newest(newest.given.frame, newest.moment, self._setup.fitter, doubted, carried)
+            self._now = Newest(newest.given.frame, newest.moment, self._setup.fitter, doubted, added)
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:

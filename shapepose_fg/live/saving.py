@@ -29,9 +29,9 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
-FORMAT = "shapepose-fg live state 2"
+FORMAT = "shapepose-fg live state 3"
 _CURE = "begin without it"
-_WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place")
+_WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place", "mirrored")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """The columns of detections."""
 _POSES = ("time_s", "wTb", "covariance")
@@ -70,6 +70,7 @@ _COLUMNS = {
     "seen.xy": Column("D 2", most=1e9),
     "seen.confidence": Column("D", most=1e3),
     "seen.place": Column("D", _WHOLE),
+    "seen.mirrored": Column("D", most=1),
     "seen.pairs": Column("E 2", _WHOLE),
     "seen.affinity": Column("E", most=1e9),
 }
@@ -196,9 +197,11 @@ def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
     """ValueError where detections are of no camera or joint, or nowhere, or people have others than these."""
     if not (np.abs(seen.xy) <= _MOST_PIXELS).all():
         raise ValueError("its detections must be finite")
-    for each, most in ((seen.confidence, 1), (seen.affinity, _MOST_AFFINITY)):
+    for each, most in ((seen.confidence, 1), (seen.mirrored, 1), (seen.affinity, _MOST_AFFINITY)):
         if not ((each >= 0) & (each <= most)).all():
-            raise ValueError(f"confidences and affinities of its detections must be 0 to 1 and {_MOST_AFFINITY}")
+            raise ValueError(
+                f"of its detections, confidences and probabilities must be 0 to 1, affinities to {_MOST_AFFINITY}"
+            )
     within = all(
         len(values) == 0 or (values.min() >= 0 and values.max() < most)
         for values, most in ((seen.view, views), (seen.joint, joints), (seen.pairs, len(seen)))

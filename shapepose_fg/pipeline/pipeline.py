@@ -1,4 +1,4 @@
-"""The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
+"""The pipeline: triangulate, propose and associate people; track them, solve windows, fit bodies; return rows."""
 
 import warnings
 from collections.abc import Sequence

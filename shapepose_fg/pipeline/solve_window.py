@@ -1,4 +1,4 @@
-"""Stage II on one page: a window of frames, from whose detections are whose to joints, bodies and graphs."""
+"""Stage II on one page: from a window of frames with assigned detections to joints, bodies and graphs."""
 
 import time
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
 _SETTLED = 0.002
-"""Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
-three or four rounds, before three after eight or more."""
+"""Share of changed detections below which reassociation ends: in crowds before six cameras after three or four
+rounds, before three after eight or more."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Assigning:
     rounds: int
     """How often."""
     over_time: bool
-    """Whether people are the same from frame to frame. If not, each round asks more of who stays
-    (`LEAST_PROBABILITY`)."""
+    """Whether people are the same from frame to frame. If not, each round demands a higher probability of
+    people (`LEAST_PROBABILITY`)."""
 
 
 def solve_window(

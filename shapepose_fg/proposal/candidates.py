@@ -222,7 +222,7 @@ def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m,
             if _off_m(cameras[one], rays.xy[i], x) < gate_m and _off_m(cameras[other], rays.xy[j], x) < gate_m:
                 if count < len(pair):
                     pair[count, 0], pair[count, 1] = i, j
-                    xyz[count] = x
+                    xyz[count, 0], xyz[count, 1], xyz[count, 2] = x[0], x[1], x[2]  # a slice compiles for seconds
                 count += 1
     return count
 

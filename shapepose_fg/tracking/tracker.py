@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import CONSTANT_VELOCITY, Motion
+from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
-from shapepose_fg.tracking.sides import with_sides_held
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 FindPeople = Callable[[Detections, Rig], Observations]
@@ -118,6 +118,8 @@ class Tracker:
     """How people are followed."""
     observation: ObservationConfig
     """How far detections are trusted."""
+    fitter: BodyFitter | None = None
+    """Fits bodies: tells whether people have left and right exchanged (`sides.py`)."""
     drop: NoteDropped = lambda reason, frames: None
     """Is told why somebody was not kept, and in which frames."""
     search: Callable[[int], None] = lambda frame: None
@@ -143,14 +145,12 @@ class Tracker:
         evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 
-    def with_sides_held(self, tracks: Tracks, given: Input) -> Input:
-        """The frame with the detections of people on the sides of the body on which the `tracks` have them."""
+    def ahead(self, tracks: Tracks, time_s: float) -> JointStates:
+        """Where the joints of the tracks are predicted at `time_s`."""
         if len(tracks) == 0:
-            return given
-        step_s = float(given.time_s.mean()) - tracks.time_s
-        joints, _ = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)
-        held = with_sides_held(given.detections, joints.position, joints.sigma_m, given.rig, self.skeleton)
-        return given if held is given.detections else replace(given, detections=held)
+            return tracks.joints
+        step_s = time_s - tracks.time_s
+        return predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)[0]
 
     @cached_property
     def _bones(self) -> Bones:

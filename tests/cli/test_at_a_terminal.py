@@ -182,12 +182,34 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMANDS = sorted({" ".join(each) for page in PAGES for each in commands(page) if each[0] != "simulate"})
 
 
+ALL = """
+import sys
+from shapepose_fg.cli.main import main
+for line in sys.argv[1:]:
+    try:
+        main(line.split())
+    except SystemExit as end:
+        print("code", end.code, "of", line)
+"""
+"""Runs commands one after the other, in one process: to import all takes each seconds."""
+
+
 @pytest.mark.skipif(not PAGES[0].exists(), reason="installed without the documents")
-@pytest.mark.parametrize("command", [COMMANDS[0], *slow(*COMMANDS[1:])])
-def test_commands_of_the_documents_in_an_empty_folder_say_what_is_missing(tmp_path, command):
-    seen = at_terminal(sys.executable, "-m", "shapepose_fg", *command.split(), cwd=tmp_path)
+def test_a_command_in_an_empty_folder_says_what_is_missing(tmp_path):
+    seen = at_terminal(sys.executable, "-m", "shapepose_fg", *COMMANDS[0].split(), cwd=tmp_path)
     assert seen.code == 2 and seen.rubbish() == []
     assert any(line.startswith("error: ") for line in seen.lines) and "Traceback" not in seen.raw
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PAGES[0].exists(), reason="installed without the documents")
+def test_commands_of_the_documents_in_an_empty_folder_say_what_is_missing(tmp_path):
+    seen = at_terminal(sys.executable, "-c", ALL, *COMMANDS, columns=1000, cwd=tmp_path)
+    assert seen.code == 0 and seen.rubbish() == [] and "Traceback" not in seen.raw
+    said = re.split(r"code (\S+) of (.*?)\r*\n", seen.raw)
+    assert said[2::3] == COMMANDS
+    for words, code, command in zip(said[::3], said[1::3], said[2::3], strict=False):
+        assert code == "2" and "error: " in words, (command, words)
 
 
 @pytest.mark.slow

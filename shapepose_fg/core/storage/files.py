@@ -1,4 +1,4 @@
-"""Files, read within bounds and with one clear error, and written whole or not at all."""
+"""Reads files within bounds and with one clear error, and writes them whole or not at all."""
 
 import codecs
 import glob
@@ -17,13 +17,14 @@ from typing import Any, BinaryIO
 from shapepose_fg.core.errors import InputError
 
 SMALL, MIDDLE, LARGE = 2**20, 2**26, 2**32
-"""Bytes that a file may have: settings and tables of a few lines; cameras, or one frame; a recording."""
+"""Maximum size of a file, bytes: settings and tables of a few lines; cameras, or one frame; a recording."""
 PIECE = 2**20
-"""Bytes that are read at a time where a file may be larger than memory."""
+"""Number of bytes that are read at a time where a file may be larger than memory."""
 _MOST_DEPTH = 64
-"""Lists in lists and objects in objects: no format goes a fifth as deep."""
+"""Maximum depth of nested lists and objects: no format has a fifth of it."""
 _MOST_DOTS = 100
-"""Dots in a line of TOML: the parser takes the square of a dotted key's parts."""
+"""Maximum number of dots in a line of TOML: the parser's time grows with the square of the parts of a dotted
+key."""
 _LONG_NUMBER = re.compile(r"\d{19}")
 _BROKEN_OFF = re.compile(r"(-|\.|[eE][+-]?|tr?u?|fa?l?s?|nu?l?)?\s*")
 """What is left of a JSON text that ends within a number or a word, or between two values."""
@@ -256,9 +257,9 @@ def write_together(
 
 
 def user_cache(what: str) -> Path:
-    """The folder of the user's cache for `what` this program keeps; below XDG_CACHE_HOME where that is set.
+    """The folder of the user's cache for `what`; below XDG_CACHE_HOME where that is set.
 
-    It need not be there, nor writable: a container's user of any number has no home.
+    It may not exist, or not be writable: the user of a container may have no home.
     """
     home = os.path.expanduser("~")  # noqa: PTH111
     base = os.environ.get("XDG_CACHE_HOME") or f"{home if home != '~' else ''}/.cache"

@@ -1,4 +1,4 @@
-"""Named sets of arrays that are kept while a run goes on: in memory, or as files that survive the process."""
+"""Named sets of arrays that are kept during a run: in memory, or as files that survive the process."""
 
 import hashlib
 import json
@@ -23,19 +23,19 @@ _SUFFIX = ".safetensors"
 ANEW = "begin that run anew with --restart"
 """What to do where a set is damaged."""
 _SAID = {"about", "arrays", "sha256"}
-"""What a file says of itself: what is to be said about the set, digests of the arrays, and one of all this."""
+"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all this."""
 _ALIGNED = 64
-"""Bytes; arrays begin at multiples of it."""
+"""Alignment of arrays, bytes."""
 
 
 class KeptArrays:
-    """Sets of arrays, each under a name, with what is to be said about it as plain values; here in memory.
+    """Sets of arrays, each under a name, with plain values about it; kept in memory.
 
-    That of a set that is dropped goes back to the system at once.
+    The memory of a set that is dropped is returned to the system at once.
     """
 
     lasting = False
-    """Whether they outlive this process."""
+    """Whether the arrays outlive this process."""
 
     def __init__(self) -> None:
         self._sets: dict[str, tuple[Arrays, Any]] = {}
@@ -53,7 +53,7 @@ class KeptArrays:
         self._sets.pop(name, None)
 
     def about(self, name: str) -> Any:
-        """What is said about a set."""
+        """The plain values about a set."""
         return self._sets[name][1]
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:

@@ -22,9 +22,10 @@ _WRITTEN_BYTES = 1 << 20
 _LEVEL = 1
 """Level of compression: half the time of zlib's usual 6 for files that are 3 % larger."""
 _SMALL_BYTES = 2**28
-"""Arrays of a small file may be so large together, however well they are packed: columns of NaN pack 1000 to 1."""
+"""Maximum total size of the arrays of a small file, bytes, whatever their compression: NaN compresses 1000 to
+1."""
 _MOST_PACKED = 50
-"""Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
+"""Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
 _BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
 """Bytes of the rows that are unpacked at a time, and of those that are skipped at a time."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
