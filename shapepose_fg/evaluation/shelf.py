@@ -13,6 +13,7 @@ from rich.table import Table
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import People, PlainPeople
@@ -213,10 +214,8 @@ def _frames_run(people: People) -> Iterable[int] | None:
 
 def _spans(frames: NDArray[np.int64]) -> str:
     """Frames as people write them: "0-100, 216-230"."""
-    if len(frames) == 0:
-        return "none"
-    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+    spans = spans_of(frames.tolist())
+    return ", ".join(f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans) or "none"
 
 
 def _percent(part: Any, whole: Any) -> Array:

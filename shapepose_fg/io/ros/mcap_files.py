@@ -3,7 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -56,16 +56,13 @@ View = tuple[str, Detections, float, Array | None, Array | None]
 """What `OnlineReconstructor.push_view` takes."""
 
 
-class McapWriter:
+class McapWriter(AbstractContextManager["McapWriter"]):
     """Writes people frame by frame; a context: without its end a file has no index."""
 
     def __init__(self, stream: IO[bytes], rig: Rig | None) -> None:
         self._file = optional("mcap_ros2.writer", "ros").Writer(stream)
         self._schemas: dict[str, Any] = {}
         self._rig, self._begun = rig, False
-
-    def __enter__(self) -> "McapWriter":
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
