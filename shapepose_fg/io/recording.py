@@ -1,4 +1,4 @@
-"""A recording as it is reconstructed: what all cameras saw at the same moments, and when these were."""
+"""A recording for reconstruction: synchronised detections of all cameras, and their times."""
 
 import re
 from dataclasses import replace
@@ -21,11 +21,11 @@ from shapepose_fg.io.timestamps import read_own_times, read_timestamps
 
 _MOST_BYTES = 2**28
 TIMES = "times.csv"
-"""The times of detections, beside them."""
+"""Name of the file with the times of detections, beside them."""
 
 
 def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -> Path | None:
-    """The file with the times of the frames: the one that is given, or without a rate the one beside; or none."""
+    """The file with the times of the frames: the given one, or without a rate the one beside; or none."""
     if fps is not None and timestamps is not None:
         raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
     beside = detections / TIMES

@@ -33,14 +33,14 @@ rounds, before three after eight or more."""
 
 @dataclass(frozen=True)
 class Assigning:
-    """What detections are assigned again from, around drafts."""
+    """The data for reassociation around initial estimates."""
 
     frames: Sequence[Input]
     """All detections of the window's frames."""
     skeleton: Skeleton
     """The detector's joints."""
     rounds: int
-    """How often."""
+    """Maximum number of rounds."""
     over_time: bool
     """Whether people are the same from frame to frame. If not, each round demands a higher probability of
     people (`LEAST_PROBABILITY`)."""

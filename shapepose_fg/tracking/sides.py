@@ -166,8 +166,8 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
             places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
             if len(places) > 0:
                 new = count + np.arange(len(places))
-                tracks = replace(tracks, time_s=time_s)
-                tracks, count = tracks.joined(tracker.at(places, new, 0 * new, time_s)), count + len(new)
+                others = tracker.at(places, new, 0 * new, time_s)
+                tracks, count = Tracks.concatenate([replace(tracks, time_s=time_s), others]), count + len(new)
                 seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton, memory)
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):

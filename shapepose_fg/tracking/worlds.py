@@ -151,10 +151,7 @@ def lasting(times_s: Array) -> Array:
     """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for
     one.
     """
-    if len(times_s) < 2:
-        return np.ones(len(times_s))
-    step = np.diff(times_s)
-    return (np.append(step[:1], step) + np.append(step, step[-1:])) / 2
+    return np.gradient(times_s) if len(times_s) > 1 else np.ones(len(times_s))
 
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
@@ -250,7 +247,7 @@ def _follow(
         tracks = replace(tracks, time_s=time_s)
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
-            tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
+            tracks, candidate = Tracks.concatenate([tracks, own]), np.concatenate([candidate, theirs])
         if abs(time_s - looked_s) < _TWINS_S:
             continue
         looked_s = time_s
@@ -272,7 +269,7 @@ def _follow(
                 )
                 log.add(t, new, theirs)
                 born.append((world, Seed(t, new, theirs, births=False), new.ids))
-                tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+                tracks, candidate = Tracks.concatenate([tracks, new]), np.concatenate([candidate, theirs])
     return born
 
 

@@ -1,7 +1,7 @@
-"""The files of a calibration with the numbers of its cameras replaced: XML, OpenCV's and ROS' YAML, COLMAP's text.
+"""Replaces the numbers of cameras in the files of a calibration: XML, OpenCV's and ROS' YAML, COLMAP's text.
 
-Each function returns the texts of the files by where these were read; what does not fit is left as it was, and who
-calls reads it back.
+Each function returns the texts of the files by their paths; what does not fit is left unchanged, and the caller
+reads the result back.
 """
 
 import re
@@ -130,7 +130,7 @@ def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLik
 
 
 def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
-    """The numbers of a camera, `count` of them, by a name that programs give them; None for other names."""
+    """The `count` numbers of a camera that programs store under `name`; None for unknown names."""
     R, cTw, wTc = camera.cTw[:, :3], camera.cTw.copy(), camera.wTc.copy()
     cTw[:, 3] /= metres
     wTc[:3, 3] /= metres
@@ -260,4 +260,4 @@ REWRITTEN: dict[str, Callable[[Content, Rig, float], Files]] = {
     COLMAP.name: _colmap,
     ROS.name: _ros,
 }
-"""How each format is written again, by its name."""
+"""Functions that rewrite each format, by its name."""

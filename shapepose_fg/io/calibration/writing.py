@@ -1,4 +1,6 @@
-"""A calibration written again in the format it came in; what that cannot hold becomes our own rig file."""
+"""Writes a calibration in the format that it was read in; what that format cannot hold goes into our own rig
+file.
+"""
 
 import json
 import re
@@ -23,10 +25,10 @@ from shapepose_fg.io.calibration.rewriting import REWRITTEN, numbers_of
 from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 
 _SEVERAL = (OPENCV[0].name, COLMAP.name)
-"""Formats of several files, whichever of them is given."""
+"""Formats that consist of several files."""
 _YAML = (".yml", ".yaml")
 _DIGITS, _DIGITS_PX = 1e-6, 1e-4
-"""How far what reads back may be off: metres and no unit, pixels."""
+"""Tolerances of what is read back: metres and numbers without unit, pixels."""
 _TABLE = re.compile(r"\s*\[\s*(?P<key>[^\]]+?)\s*\]\s*(#.*)?$")
 _ENTRY = re.compile(r"(?P<head>\s*(?P<name>matrix|rotation|translation|distortions)\s*=\s*)")
 
@@ -71,7 +73,7 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
 
 
 def check_target(source: Path, target: Path) -> None:
-    """InputError where `target` has the ending of another format than that of `source` and than .json, our own."""
+    """InputError where `target` has a suffix that is neither that of `source`'s format nor .json, our own."""
     _, form, _ = _found(source)
     several = source.is_dir() or form.name in _SEVERAL
     ending, own = target.suffix.lower(), source.suffix.lower()
@@ -85,7 +87,7 @@ def check_target(source: Path, target: Path) -> None:
 
 
 def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
-    """What lies at `source`, in which format, and its cameras."""
+    """The content of `source`, its format, and its cameras."""
     content = load(source)
     read = ((each, each.read(content)) for each in FORMATS)
     found = next(((form, written) for form, written in read if written is not None), None)
@@ -112,7 +114,7 @@ def _write(files: dict[Path, str], target: Path, *, several: bool) -> None:
 
 
 def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
-    """Whether the cameras of a file are those of a rig, to what a file's digits hold."""
+    """Whether the cameras of a file are those of a rig, within the precision of the file."""
     if [each.name for each in written.cameras] != list(rig.names):
         return False
     for each, camera in zip(written.cameras, rig.cameras, strict=True):
@@ -139,7 +141,7 @@ _PLACES: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
     "VoxelPose's JSON": _voxelpose,
     "4D Association's calibration.json": lambda value: list(value.values()),
 }
-"""Where each format of JSON has its cameras, in the order in which they are read."""
+"""Functions that return the cameras in each format of JSON, in the order in which they are read."""
 
 
 def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:
