@@ -211,7 +211,7 @@ def test_lenses_by_a_photo(tmp_path):
     for name in ("left_json", "right_json"):
         (tmp_path / name).mkdir()
     exif = image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 28
+    exif[0x8769] = {0xA405: 28}
     image.new("RGB", (400, 300)).save(tmp_path / "phone.jpg", exif=exif)
     image.new("RGB", (400, 300)).save(tmp_path / "bare.jpg")
     (tmp_path / "torn.jpg").write_bytes((tmp_path / "phone.jpg").read_bytes()[:40])
