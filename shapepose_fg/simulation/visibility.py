@@ -1,4 +1,4 @@
-"""Which joints a camera sees: the first of the posed surfaces on the rays to each joint, and whose skin it is."""
+"""Visibility of joints: the first surface on the rays to each joint, and the person that it belongs to."""
 
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 NOBODY, ITSELF, BORDER = -1, -2, -3
-"""What `Visibility.hidden_by` says where no other person is in front."""
+"""Codes of `Visibility.hidden_by` where no other person is in front."""
 
 _BONES = (
     "head neck+left_collar+right_collar right_shoulder+right_collar right_elbow right_wrist "
@@ -26,43 +26,45 @@ _BONES = (
     "left_ankle head head head head left_foot left_foot left_ankle right_foot right_foot right_ankle"
 ).split()
 """The own bones of each joint of BODY_25: SMPL's that begin there; face, toes and heels have their nearest. A
-collar has next to no skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
+collar has hardly any skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
 FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "LEar"))
-"""They lie on the skin, not inside a limb."""
+"""Joints of the face, which lie on the skin, not inside a limb."""
 
 _RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
-"""Where rays go around a joint, in units of the probe's radius."""
+"""Directions of rays around a joint, in units of the probe's radius."""
 
 FramePeople = tuple[Array, NDArray[np.float32]] | tuple[Array, NDArray[np.float32], Rig]
-"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres; where the cameras are then."""
+"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres; and the cameras' rig at
+that time."""
 AHEAD = 4
-"""Frames a worker that are under way: they are short work."""
+"""Number of frames per worker that are submitted ahead: each is little work."""
 FRAMES_WORTH_A_WORKER = 100
-"""A recording must have this many for each worker, or starting them takes longer than it saves."""
+"""Minimum number of frames per worker; with fewer, starting it takes longer than it saves."""
 
 
 @dataclass(frozen=True)
 class VisibilityConfig:
-    """How the depth buffer is drawn and read."""
+    """Settings of the depth buffer."""
 
     image_scale: float = 0.25
     """The buffer's resolution, as a share of the image's."""
     cell_m: float = 0.04
-    """Vertices of the surface this near to each other are one; 0 keeps all."""
+    """Size of cells within which vertices of the surface are merged, m; 0 keeps all."""
     probe_m: float = 0.03
-    """Radius around a joint in which rays are sent; 0 leaves the ray to the joint itself."""
+    """Radius around a joint in which rays are sent, m; 0 uses the ray to the joint only."""
     front_m: float = 0.02
-    """A surface is in front of a joint when it is nearer by more than this: skin on skin hides nothing."""
+    """Minimum distance of a surface in front of a joint that hides it, m: skin on skin hides nothing."""
     face_depth_m: float = 0.08
-    """The head itself hides nose, eyes and ears that are deeper under its first surface: on its other side."""
+    """Depth under the head's first surface, m, beyond which it hides nose, eyes and ears: they are on its other
+    side."""
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """How much of each joint each view sees, and what hides it."""
+    """Visible share of each joint in each view, and what hides it."""
 
     seen: Array
-    """(V, P, J) share of the rays to a joint that arrive, 0 to 1; 0 outside the image."""
+    """(V, P, J) share of the rays that reach a joint, 0 to 1; 0 outside the image."""
     in_image: Mask
     """(V, P, J) whether the joint projects into the image."""
     hidden_by: Index
