@@ -74,14 +74,14 @@ class Visibility:
 
 @dataclass(frozen=True)
 class Skin:
-    """The surface that is drawn for every person, and which joints each part of it shows."""
+    """The surface that is drawn for every person, and the joints that belong to each part of it."""
 
     vertices: Index
-    """(M,) vertices of the body's mesh that are in use."""
+    """(M,) indices of the used vertices of the body's mesh."""
     faces: NDArray[np.int32]
     """(G, 3) triangles over those."""
     shows: Mask
-    """(M, J) whether a vertex is skinned to the joint's own bone or one next to it: by half its weight or more."""
+    """(M, J) whether at least half of a vertex's weight is on the joint's own bone or one next to it."""
 
     @classmethod
     def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
@@ -131,22 +131,22 @@ def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityC
 
 @dataclass(frozen=True)
 class VisibilityWorker:
-    """Finds what the cameras see of many frames: the same for all frames of a recording."""
+    """Computes the visibility in many frames of a recording."""
 
     rig: Rig
     """The cameras."""
     skin: Skin
     """The surface that is drawn."""
     config: VisibilityConfig
-    """How it is drawn and read."""
+    """Settings of the depth buffer."""
 
     def one(self, people: FramePeople) -> Visibility:
-        """What the cameras see of one frame."""
+        """Visibility in one frame."""
         joints, surfaces, *moved = people
         return see(moved[0] if len(moved) > 0 else self.rig, joints, surfaces, self.skin, self.config)
 
     def all(self, frames: Iterable[FramePeople], workers: int = 1) -> Generator[Visibility, None, None]:
-        """What the cameras see, frame after frame; in `workers` processes, or here if that is 1.
+        """Visibility frame after frame; in `workers` processes, or here if that is 1.
 
         Frames are taken from `frames` as they are needed. Close the iterator (`contextlib.closing`) to end the
         processes early. RuntimeError where one of them dies.
@@ -156,7 +156,9 @@ class VisibilityWorker:
 
 
 def facing(joints: Array, centres: Array) -> Array:
-    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the way out of the head and that to cameras (V, 3)."""
+    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the outward direction of the head and that to
+    cameras (V, 3).
+    """
     face = joints[:, FACE]
     outward = face - joints[:, FACE[3:]].mean(axis=1, keepdims=True)
     to_camera = centres[:, None, None] - face
@@ -165,7 +167,8 @@ def facing(joints: Array, centres: Array) -> Array:
 
 
 def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array) -> Array:
-    """`seen` (V, P, 25) where a face joint's share is less the more it faces away, whatever the depth buffer says.
+    """`seen` (V, P, 25) where a face joint's share decreases with its angle to the camera, whatever the depth
+    buffer says.
 
     `ramp` (5, 2) holds the cosines at which a face joint is wholly lost and wholly there.
     """
@@ -176,7 +179,7 @@ def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array)
 
 
 def _commonest(who: Index, counts: Mask) -> Index:
-    """The value of `who` (..., R) that comes most often among those that count; of equals, the first."""
+    """Mode (...,) of the values `who` (..., R) among those that count; of equally frequent ones, the first."""
     votes = ((who[..., :, None] == who[..., None, :]) & counts[..., None, :]).sum(axis=-1)
     best = np.where(counts, votes, 0).argmax(axis=-1)
     return np.take_along_axis(who, best[..., None], axis=-1)[..., 0]
