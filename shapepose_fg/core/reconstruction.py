@@ -34,7 +34,7 @@ class Status(StrEnum):
     BODY_UNDETERMINED = "body undetermined"
     """Joints are determined, but too few of them to fit a body; joints that no view saw are NaN."""
     CONTRADICTED = "views contradict"
-    """Some views contradict each other without a sign which is wrong, and too few are left without them."""
+    """Some views contradict each other, it is unknown which is wrong, and too few are left without them."""
     NOT_SOLVED = "not solved"
     """A joint diverged from its detections, or nothing determines it: `run` names person, frame and joint."""
 

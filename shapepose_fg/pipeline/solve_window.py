@@ -73,7 +73,7 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
+    # Assign: detections go to the person whose initial joints and body are near them, round by round.
     drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None
