@@ -128,7 +128,9 @@ class InSpace:
         return np.stack(rays, axis=2), np.stack(speed, axis=2), np.stack(xy, axis=2), np.stack(size, axis=1)
 
     def _moving(self, points: Array, speed: Array) -> Array:
-        """(P, J, 3) metres a frame of joints at `points`, from how directions to them change (P, J, V, 3)."""
+        """(P, J, 3) velocities of joints at `points`, metres per frame, from the changes of directions to them
+        (P, J, V, 3).
+        """
         away = points[:, :, None] - centres_of(self.views)
         far = np.linalg.norm(away, axis=-1)[..., None]
         across = (np.eye(3) - (away / far)[..., :, None] * (away / far)[..., None, :]) / far[..., None] ** 2
@@ -140,10 +142,10 @@ class InSpace:
         return np.where(enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan)
 
     def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, Array]:
-        """By how many frames one camera's clock is off against what the others place.
+        """Delay of one camera's clock relative to the others' triangulation, frames; and the contributions of B
+        blocks (B,).
 
-        And what each of B blocks of time adds to that in error (B,): its square sums to the variance. Infinite
-        where nothing is known.
+        The squares of the contributions sum to the variance. Infinite where nothing is known.
         """
         block = block_frames(self.fps, float(np.ptp(self.time)))
         blocks = int(np.ptp(self.time) // block) + 1
@@ -214,7 +216,7 @@ class InSpace:
 
 
 def _across(points: Array, moving: Array, centre: Array) -> Array:
-    """(..., 3) how directions from `centre` to points change that move so."""
+    """(..., 3) change of the directions from `centre` to points that move with `moving`."""
     away = points - centre
     far = np.linalg.norm(away, axis=-1, keepdims=True)
     return (moving - (moving * away).sum(axis=-1, keepdims=True) * away / far**2) / far

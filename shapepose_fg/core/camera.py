@@ -157,7 +157,7 @@ class Rig:
     dark: tuple[int, ...] = ()
     """Views without a picture in the frame for which the rig was made; nobody is expected to be seen there."""
     doubted: tuple[int, ...] = ()
-    """Views that contradict each other in the frame for which the rig was made, without a sign which is wrong."""
+    """Views that contradict each other in the frame for which the rig was made; it is unknown which is wrong."""
     trajectories: tuple[Trajectory, ...] = ()
     """Trajectories of the carriers of moving cameras; two cameras on one robot share its trajectory."""
     notes: tuple[str, ...] = field(default=(), compare=False)

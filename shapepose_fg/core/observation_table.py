@@ -30,7 +30,7 @@ class Gate(IntEnum):
     TOO_FAR = 2
     """Farther than rho_2D from the projected joint (delta_ij = 0 in Eq. 2)."""
     CONTRADICTS_BODY = 3
-    """Views agree on a place that contradicts the rest of the body: their detections belong to somebody else."""
+    """Views agree on a place that contradicts the rest of the body: their detections belong to another person."""
     BEHIND_CAMERA = 4
     """The joint is behind this camera, or nearer than 0.2 m."""
     NOT_PLACED = 5

@@ -77,7 +77,7 @@ def _files(folder: Path, endings: tuple[str, ...]) -> Iterator[Path]:
 
 
 def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
-    """Size and time of last change, as one number, of files, and of the files of numbers in folders.
+    """Size and modification time, as one number, of files, and of the data files in folders.
 
     Plain values: hours of footage are half a million files.
     """
@@ -89,7 +89,7 @@ def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
 
 
 def _digest(path: Path, endings: tuple[str, ...]) -> str:
-    """sha256 in hexadecimal of a file, or of those of a folder with these endings."""
+    """SHA-256 in hexadecimal of a file, or of those of a folder with these suffixes."""
     try:
         if path.is_dir():
             whole = hashlib.sha256()

@@ -64,10 +64,10 @@ def write_result(
 ) -> None:
     """Write the files of a result into `folder`, none before all are complete on the disk.
 
-    A process killed on the way leaves each file as it was or as it shall be; `check_id` tells where they are of
-    two runs. Without `observations`, those of an earlier result are removed. Nothing is replaced where `check`
-    raises, which is given people.npz and observations.npz as they shall be. ValueError where `run` holds what JSON
-    cannot, OSError that names the file where one cannot be written.
+    If the process is killed, each file is the old or the new one; `check_id` notices files of two runs. Without
+    `observations`, those of an earlier result are removed. Nothing is replaced where `check` raises, which is
+    called with the new people.npz and observations.npz. ValueError where JSON cannot hold `run`, OSError that
+    names the file where one cannot be written.
     """
     digest = hashlib.sha256()
 
@@ -190,7 +190,7 @@ class SavedTable(ExitStack, Generic[T]):
             return replace(cast(Any, table), **others) if others else table
 
     def _check_memory(self, count: int) -> None:
-        """InputError where so many rows, and as much again to work with them, are more than there is room for."""
+        """InputError where this many rows, and as much again to work with them, do not fit in memory."""
         needed, free = 2 * count * sum(map(self._npz.row_bytes, self._rows)), free_memory()
         if free is not None and needed > free:
             raise InputError(
@@ -200,7 +200,7 @@ class SavedTable(ExitStack, Generic[T]):
 
 
 def free_memory() -> int | None:
-    """Bytes of memory that programs could have now; None where the system does not say."""
+    """Available memory in bytes; None where the system does not state it."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

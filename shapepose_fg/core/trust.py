@@ -19,7 +19,7 @@ class Trust:
     left_out: tuple[Spell, ...] = ()
     """Cameras that are treated as dark: they contradict others that agree."""
     doubted: tuple[Spell, ...] = ()
-    """Cameras of which some are wrong, without a sign which: rows that need them are not `ok`."""
+    """Cameras of which some are wrong, but it is unknown which: rows that need them are not `ok`."""
 
     def dark(self, frame: int) -> tuple[int, ...]:
         """The views that are left out of a frame."""

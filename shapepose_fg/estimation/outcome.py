@@ -40,12 +40,13 @@ from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution,
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
 RUNAWAY_SIGMA = 20.0
-"""So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
+"""A joint that ends this many standard deviations, and half a metre, from what views and body say of it has run
+away."""
 _HALF_M = 0.5
 WEAK_SCORE = 0.3
 """Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
 WEAK_PROBABILITY = 0.5
-"""So are those that are as probably somebody else's."""
+"""Detections that are less probably the person's are weak."""
 
 
 def outcome(state: State, fitter: BodyFitter) -> WindowSolution:

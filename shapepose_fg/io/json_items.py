@@ -11,7 +11,7 @@ from shapepose_fg.core.storage.files import MIDDLE, bounded, has_long_number, no
 _SPACE = " \t\n\r"
 _NEAR = 16
 r"""Number of characters at the end of what was read in which an error may come from a value that is cut, such
-as `\\u00` of `\\u00e9`."""
+as `\u00` of `\u00e9`."""
 
 
 class JsonItems:

@@ -73,7 +73,7 @@ class Newest:
     fitter: BodyFitter
     """Fits their bodies."""
     doubted: bool = False
-    """Whether cameras contradict each other without a sign which are wrong."""
+    """Whether cameras contradict each other and it is unknown which are wrong."""
     doubt: Array | None = None
     """(A, J, 3, 3) added to covariances, m², for moving cameras (`of_poses`) and ambiguous sides; None for
     nothing."""

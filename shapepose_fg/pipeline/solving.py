@@ -90,12 +90,12 @@ def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors
 def window_solutions(
     people: Reconstruction, rig: Rig, *, extra_factors: ExtraFactors | None = None
 ) -> Iterator[PersonGraph]:
-    """Every person of every window of a result as one graph, whose values and marginals are the result's.
+    """Every person of every window of a result as one graph, with the values and marginals of the result.
 
-    Joints and covariances are those of `people`; the graph below is solved anew from their observations, before
-    the cameras `rig`, in the order of the views. With `extra_factors`, which know people as the result does
-    (`window.track`), joints and covariances are of the graph. Windows overlap: frames near a border are in two.
-    InputError where `people.run` does not say the settings, ValueError where there are no observations.
+    Joints and covariances are those of `people`; the graphs are solved again from their observations, with the
+    cameras `rig`, in the order of the views. With `extra_factors`, whose `window.track` is the result's person,
+    joints and covariances are those of the graph. Windows overlap: frames near a border are in two. InputError
+    where `people.run` has no settings, ValueError where there are no observations.
     """
     solver = Solver.of(people, rig)
     for _, part, solution in _solved(people, solver, extra_factors):
@@ -137,7 +137,7 @@ def _solved(
         if config.windows.keyframe_s > 0:
             part = part.rows(looked_at(part))
         assert part.observations is not None
-        # From the views: the joints as they are may be somebody else's.
+        # From the views: the joints as they are may belong to another person.
         observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
         views = Views.of(rig, observations.time_s)
         found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)

@@ -181,7 +181,7 @@ def _end_with(parent: int) -> None:
 
 
 def _keep(content: bytes) -> None:
-    """Unpack what all work shares; it was packed by this program a moment ago."""
+    """Unpack the shared data, which this program packed."""
     global _shared
     try:
         _shared = cloudpickle.loads(content)

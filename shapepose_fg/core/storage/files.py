@@ -63,7 +63,7 @@ def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> No
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder / name`; InputError where a link there leads out of the folder, in which nothing is written then."""
+    """`folder / name`; InputError where a link there leads out of the folder, so that nothing is written there."""
     place = folder / name
     try:
         stays = place.resolve().is_relative_to(folder.resolve())
@@ -75,7 +75,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
-    """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
+    """Content of the file at `path`; InputError as in `open_regular`, and where it has more than `most` bytes."""
     with open_regular(path, most=most) as stream:
         content = stream.read(most + 1)
     _check_size(path, len(content), most)
@@ -125,7 +125,7 @@ def _empty(path: Path) -> InputError:
 def read_json(path: Path, *, most: int = LARGE) -> Any:
     """Value of the JSON file at `path`; InputError that names the line, also for a key that occurs twice.
 
-    NaN and Infinity are let through as floats: who checks the values names their key.
+    NaN and Infinity are accepted as floats: validation of the values names their key.
     """
     return parse_json(read_text(path, most=most), path)
 
@@ -144,7 +144,7 @@ def parse_json(text: str, path: Path | str) -> Any:
 
 
 def not_text(path: Path, byte: int) -> InputError:
-    """The error of a file whose `byte` is none of UTF-8 text."""
+    """The error for a file that is not UTF-8 text at `byte`."""
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
 
 
@@ -186,10 +186,10 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
 
 
 def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
-    """`value`, parsed from `path`, if its lists and objects are not absurdly deep.
+    """`value`, parsed from `path`; InputError if its lists and objects are nested too deep.
 
-    With `numbers`, also if its whole numbers have 64 bits: longer ones fit no float and no array, and take the
-    square of their length to print.
+    With `numbers`, also if its integers have more than 64 bits: these fit no float and no array, and the time to
+    print them grows with the square of their length.
     """
     waiting: list[tuple[tuple[Any, ...], Any]] = [((), value)]
     while len(waiting) > 0:
@@ -226,9 +226,9 @@ def write_together(
     files: Mapping[Path, Callable[[BinaryIO], object]],
     check: Callable[[Mapping[Path, Path]], object] = lambda _: None,
 ) -> None:
-    """`write_atomically` of several files in order, none of which is put in place before all are complete.
+    """`write_atomically` for several files in order, none of which is put in place before all are complete.
 
-    And before `check`, which is told under which name each is complete, has returned.
+    Before that, `check` is called with the temporary names of the complete files.
     """
     temporary: dict[Path, Path] = {}
     try:
@@ -276,7 +276,7 @@ def sweep(folder: Path, name: str | None = None) -> None:
 
 
 _PART = ".part"
-"""What temporary files end with."""
+"""Suffix of temporary files."""
 
 
 @contextmanager
@@ -291,7 +291,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def unique_keys(pairs: list[tuple[str, Any]], path: Path | str) -> dict[str, Any]:
-    """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
+    """An object's members; InputError if a key occurs twice, of which JSON itself would keep the last."""
     members: dict[str, Any] = {}
     for key, value in pairs:
         if key in members:

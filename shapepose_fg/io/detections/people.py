@@ -138,9 +138,9 @@ Scores = Callable[[Array], Array]
 def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
     """The mapping of all cameras' scores to probabilities, and a note on it; None where they are probabilities.
 
-    - COCO's visibilities (only 0, 1 and 2, and a 2 among them): 2 is 1, and 1, hidden, is 0.5. - Scores that
-    exceed 1.1: divided by the score that 1 in 100 exceeds, if that is above 1, then cut at 1. RTMPose's are
-    heights of two curves and lie mostly under 1; others' are a few units, or per cent.
+    - COCO's visibilities (only 0, 1 and 2, and a 2 among them): 2 is 1, and 1, hidden, is 0.5.
+    - Scores that exceed 1.1: divided by the score that 1 in 100 exceeds, if that is above 1, then cut at 1.
+      RTMPose's are heights of two curves and lie mostly under 1; others' are a few units, or per cent.
     """
     top = max(each.top_score for each in people)
     if top == 2 and all(each.visibilities for each in people):
