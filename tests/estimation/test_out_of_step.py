@@ -170,9 +170,7 @@ def out_of_step(scene, sub: int, places: list[int]) -> tuple[Recording, Recordin
 
 @pytest.mark.slow
 def test_cameras_out_of_step_are_as_good_as_in_step():
-    """Dancers at 8 Hz by four cameras up to 94 ms apart: 19.3 mm against 18.4 in step, and 21.2 where it is
-    ignored.
-    """
+    """Dancers at 8 Hz by four cameras up to 94 ms apart: 7 % more than in step at most, ignored 11 or more."""
     sub, places = 8, [0, 6, 2, 4]
     scene = built_in_scene(seed=4, people=2, cameras=4, frames=24 * sub, fps=8.0 * sub)
     in_step, apart = out_of_step(scene, sub, places)
@@ -191,4 +189,4 @@ def test_cameras_out_of_step_are_as_good_as_in_step():
     best = error(in_step, FrameTimes(frame_s), frame_s)
     timed = error(apart, FrameTimes(frame_s[:, None] + lead_s), meant)
     ignored = error(apart, FrameTimes(frame_s), meant)
-    assert timed < 1.1 * best < 1.12 * best < ignored
+    assert timed < 1.1 * best and timed < 0.97 * ignored
