@@ -1,4 +1,4 @@
-"""What run.json says: checked when it is read, and of several results when their rows are put together."""
+"""The content of run.json: checks it when it is read, and merges that of several results."""
 
 import json
 import math

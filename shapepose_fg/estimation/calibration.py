@@ -5,7 +5,7 @@ from importlib.resources import as_file, files
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask, Whole
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
 
 LASTS_S = 0.25
@@ -26,7 +26,7 @@ WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
 class Clues:
     """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
 
-    The last four are means over the frames around (`lasting_mean`).
+    The last four are means over the frames around (`in_time.smoothed_in_time`).
     """
 
     frame: Whole
@@ -38,7 +38,7 @@ class Clues:
     covariance: Array
     """(N, J, 3, 3) of the graph, errors that last in it, m²."""
     disagreement: Array
-    """(N, J) squared Mahalanobis distance of the joint from where the body has it (`from_body`)."""
+    """(N, J) squared Mahalanobis distance of the joint from where the body has it."""
     association: Array
     """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
     draft: Array
@@ -101,26 +101,3 @@ class Calibration:
         added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
         whole = times[..., None, None] * clues.covariance + added
         return np.exp(self.person * clues.person)[..., None, None] * whole
-
-
-def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:
-    """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where
-    the body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
-    """
-    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
-    away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]
-    both = np.eye(3) + information @ np.where(known[..., None, None], covariance, 0.0)
-    return np.asarray((away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0], dtype=np.float64)
-
-
-def lasting_mean(values: Array, times_s: Array, where: Mask | None = None) -> Array:
-    """Values (T, J, ...) of one person's joints, averaged over the frames around in which they are `where` (T, J).
-
-    What leads a joint astray in one frame does so in the next; and a joint that is not seen is where doubtful
-    frames left it.
-    """
-    where = np.ones(values.shape[:2], dtype=bool) if where is None else where
-    near = np.exp(-0.5 * ((times_s[:, None] - times_s) / LASTS_S) ** 2) + 1e-9
-    total, flat = np.maximum(near @ where, 1e-9), values.reshape(*where.shape, -1) * where[..., None]
-    whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
-    return (whole / total[..., None]).reshape(values.shape)

@@ -5,17 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.joint_names import mirrored as mirror_of
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
-from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
+from shapepose_fg.estimation.limbs import ARMS_AND_LEGS, on_both_sides
+from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
 
 CERTAIN = 0.99
 """Observations that are more probably the person's make no alternatives: four in five."""
 FREE_M = 0.3
 """A joint that nothing but a doubtful observation places is known to this, metres, without it: half an arm."""
 
+DOUBTED = 0.05
+"""Rows most of whose joints are more probably of the other side are not `Status.OK`: 95 % regions cannot hold."""
 REACH_M = 0.6
 """Limbs of two people whose ends are nearer than this may be exchanged."""
 FITS_M = 0.05
@@ -30,9 +34,7 @@ def limbs_to_exchange(joints: Sequence[str]) -> Index:
     A foot goes with its ankle.
     """
     named = [(far, near, far) for near, far in ARMS_AND_LEGS] + [(foot, "Knee", "Ankle") for foot in _FEET]
-    limbs = [tuple(f"{side}{name}" for name in limb) for side in "RL" for limb in named]
-    there = [[joints.index(name) for name in limb] for limb in limbs if {*limb} <= set(joints)]
-    return np.array(there, dtype=np.intp).reshape(-1, 3)
+    return np.array(on_both_sides(named, joints), dtype=np.intp).reshape(-1, 3)
 
 
 def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) -> Array:
@@ -57,11 +59,24 @@ def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) ->
     return spread
 
 
+def mirrored_spread(joints: Array, mirrored: Array, names: Sequence[str]) -> Array:
+    """(N, J, 3, 3) outer products of the ways from joints (N, J, 3) to the same ones of the other side, m².
+
+    They count by how probably the sides are exchanged: what the row's observations of them say, `mirrored`
+    (N, J, V).
+    """
+    other = [names.index(mirror_of(name)) if mirror_of(name) in names else n for n, name in enumerate(names)]
+    doubt = mirrored.max(axis=2, initial=0.0)
+    doubt = np.maximum(doubt, doubt[:, other])
+    away = np.nan_to_num(joints[:, other] - joints) * np.sqrt(doubt)[..., None]
+    return away[..., None] * away[..., None, :]
+
+
 def association_spread(
     observations: Observations,
     sigmas: Array,
     evidence: ViewEvidence,
-    body: Message,
+    body: JointTargets,
     views: Views,
     config: ObservationConfig,
 ) -> Array:

@@ -11,13 +11,13 @@ from functools import cached_property
 import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.in_time import spanned
 from shapepose_fg.estimation.kernels import ready, solve_chains
-from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import Lasting
 
 _SETTLED_M = 5e-4
@@ -65,7 +65,7 @@ class Projections:
 class Said:
     """A message about a window's joints whose error lasts."""
 
-    message: Message
+    message: JointTargets
     """What is said, T rows."""
     scale: float
     """Covariances are multiplied with this."""
@@ -133,7 +133,7 @@ class Chains:
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
 
 
-def solved_apart(seen: Projections, pulls: Message, initial: Array, steps: int, settled_m: float) -> Array:
+def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: int, settled_m: float) -> Array:
     """(R, J, 3) joints of least cost, metres, in R frames that have nothing to do with each other; NaN where
     `initial` (R, J, 3) is. One that is led farther away than `UNDETERMINED_M` stays there. There are at the most
     so many `steps`, until one is shorter than `settled_m`.
@@ -189,7 +189,7 @@ class Problem:
     """(T - 1, J) of the noise in it."""
     seen: Projections
     """Observations that count."""
-    pulls: Message
+    pulls: JointTargets
     """What pulls joints and is new in every frame, T rows."""
     said: tuple[Said, Said]
     """What views and body say with errors that last: an offset each."""

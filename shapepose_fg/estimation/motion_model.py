@@ -77,19 +77,15 @@ class MotionModel:
     law: Motion = CONSTANT_VELOCITY
     """How a state goes on."""
 
-    def density(self, speed_m_s: Array, within_s: float = MEASURED_S) -> Array:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J); see `Motion.density`."""
-        return self.law.density(self.acceleration(speed_m_s), within_s)
+    def density(self, speed_m_s: Array, within_s: float = MEASURED_S, turning: Array | float = 0.0) -> Array:
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
+        have a power spectral density of at least `turning` (..., J), m²/s³; see `Motion.density`.
+        """
+        return self.law.density(np.maximum(self.acceleration(speed_m_s), turning), within_s)
 
     def acceleration(self, speed_m_s: Array) -> Array:
         """Power spectral density (..., J) of the accelerations of joints of this speed (..., J), m²/s³."""
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
-
-    def density_of(self, speed_m_s: Array, turning: Array) -> Array:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
-        have a power spectral density of at least `turning` (..., J), m²/s³.
-        """
-        return self.law.density(np.maximum(self.acceleration(speed_m_s), turning))
 
     def density_lost(self, speed_m_s: Array) -> Array:
         """The same while joints are lost from sight, and their speed is a guess."""

@@ -10,17 +10,23 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
-from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
+from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
 from shapepose_fg.estimation.carried_error import carried_covariance
-from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
-from shapepose_fg.estimation.in_time import carried, waited_s
+from shapepose_fg.estimation.doubt import (
+    DOUBTED,
+    association_spread,
+    exchange_spread,
+    limbs_to_exchange,
+    mirrored_spread,
+)
+from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
-    Message,
     ViewEvidence,
     inverses,
     linearise,
     mean_confidence,
+    squared_distance,
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import LOST_M
@@ -69,8 +75,11 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         waited = waited_s(np.asarray(reported[person.rows].any(axis=-1)), person.times_s)
         moved = np.minimum(elsewhere[person.rows], (SPEED_M_S * waited) ** 2)
         covariance[person.rows] += moved[..., None, None] * np.eye(3)
+    covariance += mirrored_spread(X, rows.mirrored, state.config.joints)
     wrong = problems(state, covariance)
-    status = np.where(fit.ok, Status.OK, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
+    doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
+    sided = np.where(doubted, Status.CONTRADICTED, Status.OK)
+    status = np.where(fit.ok, sided, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
     status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
     return WindowSolution(
         observations=rows,
@@ -136,7 +145,7 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
     calibration = Calibration.load(joints)
-    of_body = from_body(state.joints, covariance, body.xyz, body.information)
+    of_body = np.nan_to_num(squared_distance(body, state.joints, covariance))
     association = association_spread(rows, state.sigmas, final, body, state.views, state.config.observations)
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
@@ -145,9 +154,9 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     for person in state.people:
         mine, times_s = person.rows, person.times_s
         alone[mine] = not person.temporal
-        association[mine] = lasting_mean(association[mine], times_s, count[mine] > 0)
+        association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
-            clue[mine] = lasting_mean(clue[mine], times_s)
+            clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
     clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
     return np.where(
         alone[:, None, None, None],
@@ -228,6 +237,6 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     )
 
 
-def _pull(message: Message, X: Array) -> Array:
+def _pull(message: JointTargets, X: Array) -> Array:
     """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

@@ -8,7 +8,8 @@ recording.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -72,19 +73,19 @@ class Mounted:
     """(T,) rising."""
     time_s: Array
     """(T, V) when each view was taken."""
-    odometry: Array = field(init=False)
-    """(T, B, 4, 4) world from carrier at the frames' times, as given."""
-    sensors: Array = field(init=False)
-    """(T, V, 4, 4) from carrier, at its frame's time, to camera, at its own; unit where a camera stands still."""
 
-    def __post_init__(self) -> None:
-        rig, middle = self.rig, self.time_s.mean(axis=1)
-        odometry = np.stack([each.at(middle) for each in rig.trajectories], axis=1)
-        sensors, on = np.tile(np.eye(4), (*self.time_s.shape, 1, 1)), rig.carrier
-        own = rig.poses(self.time_s)
-        sensors[:, on >= 0] = np.linalg.inv(odometry[:, on[on >= 0]]) @ own[:, on >= 0]
-        object.__setattr__(self, "odometry", odometry)
-        object.__setattr__(self, "sensors", sensors)
+    @cached_property
+    def odometry(self) -> Array:
+        """(T, B, 4, 4) world from carrier at the frames' times, as given."""
+        return np.stack([each.at(self.time_s.mean(axis=1)) for each in self.rig.trajectories], axis=1)
+
+    @cached_property
+    def sensors(self) -> Array:
+        """(T, V, 4, 4) from carrier, at its frame's time, to camera, at its own; unit where it stands still."""
+        sensors, on = np.tile(np.eye(4), (*self.time_s.shape, 1, 1)), self.rig.carrier
+        own = self.rig.poses(self.time_s)[:, on >= 0]
+        sensors[:, on >= 0] = np.linalg.inv(self.odometry[:, on[on >= 0]]) @ own
+        return sensors
 
     def keys(self) -> NDArray[np.int64]:
         """(T, B) key of each pose, `Pose3`, world from carrier: `factors.camera_key(carrier, frame)`."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.linearisation import ObservationConfig, inverses
@@ -118,11 +119,8 @@ def _slope_of_pose(points: Array, slope: Array, views: Views, view: int) -> Arra
     cTw = views.cTw[..., view, :, :]
     R, t = cTw[..., :3], cTw[..., 3]
     before = points @ R.mT + (t[:, None] if cTw.ndim == 3 else t)
-    x, y, z = np.moveaxis(before, -1, 0)
-    zero = np.zeros_like(x)
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=-1).reshape(*x.shape, 3, 3)
     of_camera = slope[:, :, view] @ (R.mT[:, None] if cTw.ndim == 3 else R.mT)
-    return np.concatenate([of_camera @ turned, of_camera], axis=-1)
+    return np.concatenate([of_camera @ -hat(before), of_camera], axis=-1)
 
 
 def _pose_step(slope: Array, off: Array, there: Mask) -> tuple[Array, Array]:

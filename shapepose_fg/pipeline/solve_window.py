@@ -1,4 +1,4 @@
-"""Stage II on one page: a window of frames, from whose detections are whose to joints, bodies and graphs."""
+"""Stage II on one page: from a window of frames with assigned detections to joints, bodies and graphs."""
 
 import time
 from collections.abc import Sequence
@@ -27,23 +27,23 @@ from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
 _SETTLED = 0.002
-"""Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
-three or four rounds, before three after eight or more."""
+"""Share of changed detections below which reassociation ends: in crowds before six cameras after three or four
+rounds, before three after eight or more."""
 
 
 @dataclass(frozen=True)
 class Assigning:
-    """What detections are assigned again from, around drafts."""
+    """The data for reassociation around initial estimates."""
 
     frames: Sequence[Input]
     """All detections of the window's frames."""
     skeleton: Skeleton
     """The detector's joints."""
     rounds: int
-    """How often."""
+    """Maximum number of rounds."""
     over_time: bool
-    """Whether people are the same from frame to frame. If not, each round asks more of who stays
-    (`LEAST_PROBABILITY`)."""
+    """Whether people are the same from frame to frame. If not, each round demands a higher probability of
+    people (`LEAST_PROBABILITY`)."""
 
 
 def solve_window(
@@ -73,7 +73,7 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
+    # Assign: detections go to the person whose initial joints and body are near them, round by round.
     drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None

@@ -11,8 +11,16 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
-from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
+from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, independent, likelihood, match
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    MIN_JOINTS,
+    Pinhole,
+    Sightings,
+    least_of_each,
+    miss_px,
+    same_frame,
+)
 from shapepose_fg.setup_check.over_time import stories
 from shapepose_fg.setup_check.small import ONE, Problem, named, probable
 
@@ -75,7 +83,7 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
     others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
     worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
-    others = Others(others.frame[::step], others.points[::step])
+    others = others.rows(slice(None, None, step))
     still = _nearest(others, seen, camera, 0)
 
     def tried(lag: int) -> Lag:
@@ -107,7 +115,7 @@ class _Nearest:
 
 def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
     person, sighting = same_frame(others.frame, seen.frame - lag)
-    error = miss_px(others.points[person], seen.xy, sighting, camera.K, camera.cTw)
+    error = miss_px(others.points[person], seen.xy[sighting], camera)
     error /= seen.size_px[sighting][:, None]
     both = ~np.isnan(error)
     mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
@@ -149,15 +157,13 @@ def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Near
     return Lag(lag, gain, gain / ERROR * worth, agreement, followed)
 
 
-Fit = Callable[[Array, Array, Pinhole], Pinhole | None]
-
 _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
     Kind.INVERTED: lambda R, t: (R.T, -R.T @ t),
     Kind.TRANSPOSED: lambda R, t: (R.T, t),
     Kind.AXES: lambda R, t: (np.diag([1.0, -1.0, -1.0]) @ R, t * (1.0, -1.0, -1.0)),
 }
 """What a pose is after the usual misunderstandings of its file: of one camera, or of all."""
-_FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
+_FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
     (Kind.PRINCIPAL_POINT, fit.centred_to, fit.CENTRE),

@@ -14,8 +14,9 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import Chosen, own_evidence
-from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of, with_sides_held
+from shapepose_fg.tracking.sides import hold, hold_now
+from shapepose_fg.tracking.tracker import Tracker, Tracks, mean_distance
+from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
 
 BLOCK_S = 3.0
 """People are decided for so long at a time: in some of its frames everybody is seen well."""
@@ -26,6 +27,8 @@ _SAME_M = 0.35
 _WALK_MPS = 1.5
 """How much farther off somebody may be for each second out of sight."""
 
+_ROUNDS = 3
+"""How often people are sought in a frame that stands alone, as long as sides are exchanged."""
 _PACE_S = 0.2
 """How fast somebody went is taken of so many seconds before they vanished."""
 _COASTS_S = 0.5
@@ -87,7 +90,7 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     """Rows of the first `own` keyframes that are pending; and none, for now, of the frames between."""
     keys = [n for n, frame in enumerate(state.pending) if frame.key]
     frames, until = [state.pending[n] for n in keys], [*keys, len(state.pending)][own]
-    frames = with_sides_held(tracker, frames, state.people)
+    frames = hold(tracker, frames, state.people)
     found, chosen = explained(tracker, frames, state.people, own - 1)
     rest = found.account.left_over(chosen)
     for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
@@ -122,11 +125,17 @@ def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bo
     return replace(chosen, start=start, stop=stop)
 
 
-def alone(tracker: Tracker, given: Input, next_id: int) -> Observations:
-    """The people whom stage I finds in a frame that has nothing to do with others, numbered from `next_id` on."""
-    none = np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
-    places, candidate = tracker.newcomers(tracker.nobody(), none, given.detections, given.rig)
-    return observed(given, candidate, places, next_id + np.arange(len(places)))
+def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
+    """A frame that has nothing to do with others, and whom stage I finds in it, numbered from `next_id` on."""
+    nobody, none = tracker.nobody(), np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
+    for _ in range(_ROUNDS):
+        places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
+        there = np.arange(len(places))
+        found = tracker.at(places, there, 0 * there, float(given.time_s.mean()))
+        before, given = given, hold_now(tracker, found, given, followed=False)[1]
+        if given is before:
+            break
+    return given, observed(given, candidate, places, next_id + np.arange(len(places)))
 
 
 def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Index) -> Observations:
@@ -207,12 +216,6 @@ def _left_at(places: Array, times: Array, later_s: float) -> Array:
 
 
 def core_distance(places: Array, others: Array, skeleton: Skeleton) -> Array:
-    """(P, Q) mean distance of the core joints of people (P, J, 3) and others (Q, J, 3), metres.
-
-    Infinite where no joint is known of both.
-    """
+    """(P, Q) `mean_distance` of core joints alone."""
     core = list(skeleton.core)
-    distance = np.linalg.norm(places[:, None, core] - others[None, :, core], axis=-1)
-    known = np.isfinite(distance)
-    mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    return np.where(known.any(axis=-1), mean, np.inf)
+    return mean_distance(places[:, core], others[:, core])

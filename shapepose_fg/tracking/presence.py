@@ -10,6 +10,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.pieces import project
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, limbs_of, tie
 
@@ -49,7 +50,7 @@ hardly more, and a recording of half a second has no time to gather `LEAST_S` of
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Chosen(Rows):
     """K people and from when to when they are there, in the order in which they were chosen, best first."""
 
     hypothesis: Index
@@ -61,9 +62,6 @@ class Chosen:
     evidence_s: Array
     """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken
     off."""
-
-    def __len__(self) -> int:
-        return len(self.hypothesis)
 
     def during(self, frame: int) -> Mask:
         """(K,) who is there in a frame."""

@@ -1,69 +1,268 @@
-"""The side of the body that a detector confuses for a while in some views, held by those who are followed.
+"""Left and right of a person: a detector exchanges them for a while in some views, or arms, legs or face alone.
 
-Seen from behind, people get their left joints called right and the right ones left, for seconds, and in several
-views at once. But nobody turns round between two frames: where a 2D person fits a predicted one only with the
-sides exchanged, they are exchanged back, as long as another view has that person with the sides as they are.
+Nobody turns inside out between two frames, so 2D people whose sides are not as a followed person has them are
+exchanged back, whatever most views say. Whether the person has them right is inferred from the body: with arms,
+legs or face exchanged no body fits, and with the whole person exchanged knees, feet and nose point backwards.
+Detections keep the probability that they are of the other side (`Detections.mirrored`).
 """
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections
+from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.detections import Input
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.body_step import MODEL_SIGMA_M
+from shapepose_fg.estimation.doubt import DOUBTED
 from shapepose_fg.proposal.people_2d import group_people
+from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
+from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 _NEAR_M = 0.05
 """Standard deviation of a detection from where an exactly predicted joint is, as a length at its depth."""
 _FARTHEST = 9.0
-"""Squared distance in variances at which a detection speaks no more against a place."""
+"""Squared distance in variances at which a joint is no more evidence against a place, or against a body."""
 _FITS = 3.0
 """Mean squared distance in variances up to which a 2D person is that of a predicted one."""
-_SURE = 6.0
-"""Log-likelihood ratio from which on sides are exchanged, or are as they should be."""
+_EXCHANGED = 0.02
+"""Probability that a view has a person's sides, or a part's, exchanged: on Shelf 22 of 1,573 times."""
+_CHANGES_HZ = 0.05
+"""How often that changes, a second."""
+_LOST = 0.001
+"""Probability that a followed person's sides, or a part's, are exchanged from one comparison to the next."""
+_LOOK_S = 0.3
+"""Interval between comparisons of a person with a body, and between searches for people, s."""
 
 
-def with_sides_held(found: Detections, places: Array, sigma_m: Array, rig: Rig, skeleton: Skeleton) -> Detections:
-    """The detections of a frame, left and right exchanged where a view has a person's sides the wrong way round.
+@dataclass(frozen=True)
+class _Compared:
+    """2D people of a frame, compared with people who are predicted there."""
 
-    That may be the whole person, or arms, legs or face only.
-    `places` (A, J, 3), metres, are where the joints of A people are predicted, to `sigma_m` (A, J).
+    groups: Sequence[Index]
+    """(G) the detections of each."""
+    who: Index
+    """(G,) number of the predicted person that each is; -1 for none."""
+    log: Array
+    """(G, S) log probability of each of the `exchanges`: that this view has these parts' sides the other way round
+    than the predicted person."""
+
+    @classmethod
+    def of(
+        cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton, memory: "_Memory"
+    ) -> "_Compared":
+        """2D people of a frame and the people `ids` (A,) whose `joints` (A) are predicted there."""
+        found, rig, mirror, part = given.detections, given.rig, np.array(skeleton.mirror), paired_parts(skeleton)
+        states = exchanges(skeleton)
+        if len(ids) == 0:
+            return cls((), ids[:0], np.zeros((0, len(states))))
+        groups = [group for group in group_people(found) if len(group) >= len(skeleton.core) // 2]
+        who, log = np.full(len(groups), -1), np.zeros((len(groups), len(states)))
+        xy, depth = rig.project(joints.position)  # (V, A, J, 2), (V, A, J)
+        unit_px = rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, joints.sigma_m)
+        for number, group in enumerate(groups):
+            view, joint = int(found.view[group[0]]), found.joint[group]
+            apart = [
+                np.square((xy[view][:, each] - found.xy[group]) / unit_px[view][:, each, None]).sum(axis=-1)
+                for each in (joint, mirror[joint])
+            ]
+            of_part = np.eye(states.shape[1] + 1)[part[joint]]
+            same, turned = np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST) @ of_part  # (A, parts)
+            apart_of = np.minimum(same, turned).sum(axis=1) / len(group)
+            best = int(apart_of.argmin())
+            if apart_of[best] < _FITS:
+                who[number] = ids[best]
+                log[number] = memory.with_more(
+                    (int(ids[best]), view), float(given.time_s.mean()), states @ (same - turned)[best, 1:] / 2
+                )
+        return cls(groups, who, log)
+
+    def exchanged(self, skeleton: Skeleton) -> Mask:
+        """(G, K) which parts most probably have their sides exchanged."""
+        return exchanges(skeleton)[self.log.argmax(axis=1)]
+
+    def of_person(self, number: int) -> Array:
+        """(G', S) `log` of the 2D people of one person."""
+        return self.log[self.who == number]
+
+    def corrected(self, given: Input, own: Mapping[int, tuple[Mask, Array]], skeleton: Skeleton) -> Input:
+        """The frame with sides exchanged where they must be.
+
+        Some people have parts exchanged themselves: `own` is by their numbers which (K,), and the
+        probability (K,) that this is wrong. All others have their sides right.
+        """
+        found, mirror, part = given.detections, np.array(skeleton.mirror), paired_parts(skeleton)
+        wrong, mirrored = np.zeros(len(found), dtype=bool), found.mirrored.copy()
+        for group, who, exchanged in zip(self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True):
+            if who >= 0:
+                of = part[found.joint[group]]
+                wrong[group] = np.append(False, exchanged != own[who][0] if who in own else exchanged)[of]
+                if who in own:
+                    mirrored[group] = np.append(0.0, own[who][1])[of]
+        if not wrong.any() and (mirrored == found.mirrored).all():
+            return given
+        first, second = found.pairs.T
+        middle = mirror[found.joint] == found.joint
+        whole = (wrong[first] == wrong[second]) | middle[first] | middle[second]
+        joint = np.where(wrong, mirror[found.joint], found.joint)
+        pairs, affinity = found.pairs[whole], found.affinity[whole]
+        held = replace(found, joint=joint, pairs=pairs, affinity=affinity, mirrored=mirrored)
+        return replace(given, detections=held)
+
+
+class _Memory(dict[tuple[int, int], tuple[float, Array]]):
+    """When a view saw a person last, seconds, and log probabilities (S,) of what it had exchanged."""
+
+    def with_more(self, of: tuple[int, int], time_s: float, likelihood: Array) -> Array:
+        """(S,) the same after a frame with this log-likelihood (S,), which is kept."""
+        prior = _prior(len(likelihood))
+        if of in self:
+            last_s, before = self[of]
+            change = min(_CHANGES_HZ * abs(time_s - last_s), 1.0)
+            prior = (
+                np.logaddexp(np.log1p(-change) + before, np.log(max(change, 1e-9)) + prior)
+                if change < 1
+                else prior
+            )
+        log = prior + likelihood
+        log -= np.logaddexp.reduce(log)
+        self[of] = time_s, log
+        return log
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Where a person was when some view had sides exchanged."""
+
+    frame: int
+    """Index of the frame."""
+    time_s: float
+    """When, seconds."""
+    joints: JointStates
+    """(1) the person's."""
+    views: Array
+    """(G', S) what the views had exchanged (`_Compared.log`)."""
+
+
+def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Input]:
+    """The frames with people's sides held over time, beginning with the people of the frame before."""
+    tracks, sought_s, count = replace(carried, ids=np.arange(len(carried))), -np.inf, len(carried)
+    compared, looks, memory = list[_Compared](), dict[int, list[_Look]](), _Memory()
+    for n, each in enumerate(frames):
+        time_s, skeleton = float(each.time_s.mean()), tracker.skeleton
+        seen = _Compared.of(each, tracks.ids, tracker.ahead(tracks, time_s), skeleton, memory)
+        frame = seen.corrected(each, {}, skeleton)
+        candidate = np.zeros((0, len(skeleton), len(frame.rig)), dtype=np.intp)
+        if len(tracks) > 0:
+            tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
+            alive = tracker.alive(tracks)
+            tracks, candidate = tracks.rows(alive), candidate[alive]
+        if time_s - sought_s >= _LOOK_S:
+            sought_s = time_s
+            places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
+            if len(places) > 0:
+                new = count + np.arange(len(places))
+                others = tracker.at(places, new, 0 * new, time_s)
+                tracks, count = Tracks.concatenate([replace(tracks, time_s=time_s), others]), count + len(new)
+                seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton, memory)
+        compared.append(seen)
+        for row, number in enumerate(tracks.ids.tolist()):
+            views, before = seen.of_person(number), looks.get(number, [])
+            if views.argmax(axis=1).any() and (not before or time_s - before[-1].time_s >= _LOOK_S):
+                looks[number] = [*before, _Look(n, time_s, tracks.joints.rows(np.array([row])), views)]
+    own = {name: _own_sides(tracker, found, followed=name < len(carried)) for name, found in looks.items()}
+    held = list[Input]()
+    for n, (each, seen) in enumerate(zip(frames, compared, strict=True)):
+        now = dict[int, tuple[Mask, Array]]()
+        for number, (turned, doubt) in own.items():
+            at = max(int(np.searchsorted([look.frame for look in looks[number]], n, side="right")) - 1, 0)
+            now[number] = turned[at], doubt[at]
+        held.append(seen.corrected(each, now, tracker.skeleton))
+    return held
+
+
+def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool = True) -> tuple[Tracks, Input]:
+    """The tracks and the next frame, both with people's sides as they are most probably.
+
+    `followed` says whether people had their sides right most probably before this frame.
     """
-    mirror, part = np.array(skeleton.mirror), paired_parts(skeleton)
-    groups = [group for group in group_people(found) if len(group) >= len(skeleton.core) // 2]
-    if len(groups) == 0 or len(places) == 0:
-        return found
-    xy, depth = rig.project(places)  # (V, A, J, 2), (V, A, J)
-    unit_px = rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, sigma_m)
-    who, gain = np.full(len(groups), -1), np.zeros((len(groups), part.max() + 1))
-    for number, group in enumerate(groups):
-        view, joint = found.view[group[0]], found.joint[group]
-        apart = [
-            np.square((xy[view][:, each] - found.xy[group]) / unit_px[view][:, each, None]).sum(axis=-1)
-            for each in (joint, mirror[joint])
-        ]
-        of_part = np.eye(gain.shape[1])[part[joint]]
-        same, turned = np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST) @ of_part  # (A, parts)
-        apart_of = np.minimum(same, turned).sum(axis=1) / len(group)
-        best = int(apart_of.argmin())
-        if apart_of[best] < _FITS:
-            who[number], gain[number] = best, (same - turned)[best] / 2
-    # The middle takes no side: its column is the whole person, where no part speaks against it.
-    gain[:, 0] = np.where((gain > -_SURE).all(axis=1) | (gain < _SURE).all(axis=1), gain.sum(axis=1), 0.0)
-    wrong = np.zeros(len(found), dtype=bool)
-    for number, of in np.argwhere(gain > _SURE).tolist():
-        if (gain[who == who[number], of] < -_SURE).any():
-            wrong[groups[number]] |= (part[found.joint[groups[number]]] == of) | (of == 0)
-    if not wrong.any():
-        return found
-    first, second = found.pairs.T
-    middle = mirror[found.joint] == found.joint
-    whole = (wrong[first] == wrong[second]) | middle[first] | middle[second]
-    joint = np.where(wrong, mirror[found.joint], found.joint)
-    return replace(found, joint=joint, pairs=found.pairs[whole], affinity=found.affinity[whole])
+    joints, skeleton = tracker.ahead(tracks, float(given.time_s.mean())), tracker.skeleton
+    seen, own = _Compared.of(given, tracks.ids, joints, skeleton, _Memory()), dict[int, tuple[Mask, Array]]()
+    mean, covariance = tracks.joints.mean.copy(), tracks.joints.covariance.copy()
+    for row, number in enumerate(tracks.ids.tolist()):
+        views = seen.of_person(number)
+        if views.argmax(axis=1).any():
+            look = _Look(given.frame, 0.0, joints.rows(np.array([row])), views)
+            (turned,), (doubt,) = _own_sides(tracker, [look], followed=followed)
+            if (
+                not followed and np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED
+            ):  # the person may be a mixture of views that contradict
+                turned, seen.log[seen.who == number] = np.zeros_like(turned), _prior(views.shape[1])
+            own[number], order = (turned, doubt), _order(turned, skeleton)
+            mean[row], covariance[row] = mean[row, order], covariance[row, order]
+    return replace(tracks, joints=JointStates(mean, covariance)), seen.corrected(given, own, skeleton)
+
+
+def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> tuple[Mask, Array]:
+    """Which parts (N, K) a person has exchanged in each look, and probabilities (N, K) that this is wrong.
+
+    A hidden Markov model: in each look the person is compared with a body, and views that would have sides
+    exchanged are counted. `followed`: the person had them right before.
+    """
+    states = exchanges(tracker.skeleton)
+    order = np.array([_order(state, tracker.skeleton) for state in states])  # (S, J)
+    joints = JointStates.concatenate([look.joints for look in looks])
+    weight = _likeness(joints.position[:, order], joints.sigma_m[:, order], tracker.fitter)
+    number = np.arange(len(states))
+    prior = _prior(len(states))[number ^ number[:, None]]  # of what a view has exchanged, if the person has
+    for look, row in zip(looks, weight, strict=True):
+        row += np.logaddexp.reduce(look.views[:, None] + prior, axis=2).sum(axis=0)
+    change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))
+    ahead, back = np.zeros_like(weight), np.zeros_like(weight)
+    ahead[0] = change[0] if followed else 0.0
+    for n in range(1, len(looks)):
+        ahead[n] = np.logaddexp.reduce(change + ahead[n - 1] + weight[n - 1], axis=1)
+        back[-n - 1] = np.logaddexp.reduce(change + back[-n] + weight[-n], axis=1)
+    log = ahead + weight + back
+    probability = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
+    best = states[probability.argmax(axis=1)]
+    return best, np.einsum("ns,nsk->nk", probability, best[:, None] != states)
+
+
+def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array:
+    """(N, S) log-likelihood of people with joints at `places` (N, S, J, 3), metres, to `sigma_m` (N, S, J), from
+    how near to them a body's can be; 0 without a `fitter`.
+    """
+    N, S, J, _ = places.shape
+    if fitter is None:
+        return np.zeros((N, S))
+    known = sigma_m < LOST_M
+    information = (known / np.square(sigma_m))[..., None, None] * np.eye(3)
+    fit = fitter.fit_whole(JointTargets(places.reshape(-1, J, 3), information.reshape(-1, J, 3, 3)))
+    squared = np.square(fit.joints.reshape(places.shape) - places).sum(axis=-1)
+    squared = np.nan_to_num(squared / (np.square(sigma_m) + MODEL_SIGMA_M**2), nan=_FARTHEST)
+    return -np.where(known, np.minimum(squared, _FARTHEST), 0.0).sum(axis=-1) / 2
+
+
+def _order(exchanged: Array, skeleton: Skeleton) -> Index:
+    """(J,) the joints in order when some parts (K,) are exchanged."""
+    mirror = np.array(skeleton.mirror)
+    return np.where(np.append(False, exchanged)[paired_parts(skeleton)], mirror, np.arange(len(mirror)))
+
+
+def _prior(count: int) -> Array:
+    """(S,) log probability of each of the `exchanges` in a view."""
+    return np.log(np.where(np.arange(count) == 0, 1 - _EXCHANGED, _EXCHANGED / max(count - 1, 1)))
+
+
+@cache
+def exchanges(skeleton: Skeleton) -> Mask:
+    """(S, K) which parts have their sides exchanged: all that may be; entry n is n in binary."""
+    return np.array(list(product([False, True], repeat=paired_parts(skeleton).max())))
 
 
 @cache

@@ -10,20 +10,20 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import CONSTANT_VELOCITY, Motion
+from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
-from shapepose_fg.tracking.sides import with_sides_held
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 FindPeople = Callable[[Detections, Rig], Observations]
@@ -63,7 +63,7 @@ class BodyScale:
 
 
 @dataclass(frozen=True)
-class Tracks:
+class Tracks(Rows):
     """The people who are followed, of all worlds; arrays only, so that they can be saved."""
 
     time_s: float
@@ -84,25 +84,6 @@ class Tracks:
         joints = JointStates.at(np.zeros((*shape, 3)), np.zeros(shape), motion.start)
         return cls(-np.inf, empty, empty, joints, np.zeros(0))
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def rows(self, index: NDArray) -> "Tracks":
-        """Some of the tracks."""
-        return Tracks(
-            self.time_s, self.ids[index], self.world[index], self.joints.rows(index), self.evident_s[index]
-        )
-
-    def joined(self, others: "Tracks") -> "Tracks":
-        """These tracks and others, at the time of these."""
-        return Tracks(
-            self.time_s,
-            np.append(self.ids, others.ids),
-            np.append(self.world, others.world),
-            JointStates.concatenate([self.joints, others.joints]),
-            np.append(self.evident_s, others.evident_s),
-        )
-
 
 @dataclass(frozen=True)
 class Tracker:
@@ -118,6 +99,8 @@ class Tracker:
     """How people are followed."""
     observation: ObservationConfig
     """How far detections are trusted."""
+    fitter: BodyFitter | None = None
+    """Fits bodies: tells whether people have left and right exchanged (`sides.py`)."""
     drop: NoteDropped = lambda reason, frames: None
     """Is told why somebody was not kept, and in which frames."""
     search: Callable[[int], None] = lambda frame: None
@@ -143,14 +126,12 @@ class Tracker:
         evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 
-    def with_sides_held(self, tracks: Tracks, given: Input) -> Input:
-        """The frame with the detections of people on the sides of the body on which the `tracks` have them."""
+    def ahead(self, tracks: Tracks, time_s: float) -> JointStates:
+        """Where the joints of the tracks are predicted at `time_s`."""
         if len(tracks) == 0:
-            return given
-        step_s = float(given.time_s.mean()) - tracks.time_s
-        joints, _ = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)
-        held = with_sides_held(given.detections, joints.position, joints.sigma_m, given.rig, self.skeleton)
-        return given if held is given.detections else replace(given, detections=held)
+            return tracks.joints
+        step_s = time_s - tracks.time_s
+        return predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)[0]
 
     @cached_property
     def _bones(self) -> Bones:
@@ -187,8 +168,9 @@ class Tracker:
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
-            new = (own >= 0).sum(axis=2)[:, core] >= 2
-            new = (new.sum(axis=1) >= self.config.min_new_joints) & standing_apart(people.initial, there)
+            twice = (own >= 0).sum(axis=2)[:, core] >= 2
+            apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
+            new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
             theirs.append(own[new])
             there = np.concatenate([there, people.initial[new]])
@@ -206,9 +188,12 @@ class Tracker:
         return int(twice.sum()) >= self.config.min_new_joints
 
 
-def standing_apart(places: Array, others: Array) -> Mask:
-    """(P,) people at `places` (P, J, 3) who stand apart from all `others` (A, J, 3); NaN joints count nothing."""
+def mean_distance(places: Array, others: Array) -> Array:
+    """(P, Q) mean distance of the joints of people (P, J, 3) from those of others (Q, J, 3), metres.
+
+    Infinite where no joint is known of both.
+    """
     distance = np.linalg.norm(places[:, None] - others[None], axis=-1)
     known = np.isfinite(distance)
     mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    return (mean > _APART_M).all(axis=1)
+    return np.where(known.any(axis=-1), mean, np.inf)

@@ -133,26 +133,6 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
     return found, found.account.choose(found.world)
 
 
-def with_sides_held(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Input]:
-    """The frames with people's sides held from frame to frame, beginning with the people of the frame before."""
-    held, tracks, sought_s = list[Input](), carried, -np.inf
-    for each in frames:
-        time_s, frame = float(each.time_s.mean()), tracker.with_sides_held(tracks, each)
-        candidate = np.zeros((0, len(tracker.skeleton), len(frame.rig)), dtype=np.intp)
-        if len(tracks) > 0:
-            tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
-            alive = tracker.alive(tracks)
-            tracks, candidate = tracks.rows(alive), candidate[alive]
-        if time_s - sought_s >= _SEARCH_S:
-            sought_s = time_s
-            places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
-            if len(places) > 0:
-                new = np.zeros(len(places), dtype=np.intp)
-                tracks = replace(tracks, time_s=time_s).joined(tracker.at(places, new, new, time_s))
-        held.append(frame)
-    return held
-
-
 def _plain(found: Hypotheses, times: Array) -> bool:
     """Whether everybody is there in all frames, and always seen well."""
     if not found.there.all():
@@ -171,10 +151,7 @@ def lasting(times_s: Array) -> Array:
     """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for
     one.
     """
-    if len(times_s) < 2:
-        return np.ones(len(times_s))
-    step = np.diff(times_s)
-    return (np.append(step[:1], step) + np.append(step, step[-1:])) / 2
+    return np.gradient(times_s) if len(times_s) > 1 else np.ones(len(times_s))
 
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
@@ -270,7 +247,7 @@ def _follow(
         tracks = replace(tracks, time_s=time_s)
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
-            tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
+            tracks, candidate = Tracks.concatenate([tracks, own]), np.concatenate([candidate, theirs])
         if abs(time_s - looked_s) < _TWINS_S:
             continue
         looked_s = time_s
@@ -292,7 +269,7 @@ def _follow(
                 )
                 log.add(t, new, theirs)
                 born.append((world, Seed(t, new, theirs, births=False), new.ids))
-                tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+                tracks, candidate = Tracks.concatenate([tracks, new]), np.concatenate([candidate, theirs])
     return born
 
 

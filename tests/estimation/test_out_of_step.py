@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factors import joint_key, moving_projection_factors, project_with_jacobian, velocity_key
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
@@ -14,7 +15,6 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import velocities
-from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import carried_to_frames, leads
 from shapepose_fg.estimation.window_graph import WindowGraph
@@ -122,7 +122,7 @@ def test_a_window_places_joints_at_the_frames_time(five_cameras, moving, shutter
     def solved(observations: Observations, views: Views) -> WindowGraph:
         T, J, V = observations.confidence.shape
         graph = WindowGraph(observations, np.full((T, J, V), 1.0), views, EstimatorConfig(), motion)
-        nothing = Message(np.zeros((T, J, 3)), np.zeros((T, J, 3, 3)))
+        nothing = JointTargets(np.zeros((T, J, 3)), np.zeros((T, J, 3, 3)))
         graph.solve(np.ones((T, J, V), bool), nothing, nothing, observations.initial + 0.003)
         assert graph.failure == ""
         return graph

@@ -23,6 +23,7 @@ from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import BodyScale, TrackingConfig, Tracks
 from tests.marks import slow
 
@@ -218,9 +219,9 @@ class NobodyIsThere:
         """Nobody."""
         return np.zeros((0, 25, 3)), np.zeros((0, 25, 1), dtype=np.intp)
 
-    def with_sides_held(self, _: object, given: Input) -> Input:
-        """As they are."""
-        return given
+    def ahead(self, tracks: Tracks, _: float) -> JointStates:
+        """Where they are."""
+        return tracks.joints
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.kept_kernels core.errors",
+    "factors core.arrays core.kept_kernels core.errors core.rows",
     "core.compiling",
     "core.compiled",
     "core.decompositions core.skeleton core.pieces core.assignment core.lens core.trajectory",

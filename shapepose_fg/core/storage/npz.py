@@ -22,9 +22,10 @@ _WRITTEN_BYTES = 1 << 20
 _LEVEL = 1
 """Level of compression: half the time of zlib's usual 6 for files that are 3 % larger."""
 _SMALL_BYTES = 2**28
-"""Arrays of a small file may be so large together, however well they are packed: columns of NaN pack 1000 to 1."""
+"""Maximum total size of the arrays of a small file, bytes, whatever their compression: NaN compresses 1000 to
+1."""
 _MOST_PACKED = 50
-"""Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
+"""Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
 _BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
 """Bytes of the rows that are unpacked at a time, and of those that are skipped at a time."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -186,10 +187,7 @@ class NpzFile(ExitStack):
         if name not in self._open:
             info = self._members[name]
             stream = self.enter_context(self._archive.open(info))
-            version = npy.read_magic(stream)
-            if version not in _HEADERS:
-                raise ValueError(f"{info.filename} is of NumPy's format {version}, 1.0 and 2.0 are read")
-            shape, fortran, dtype = _HEADERS[version](stream)
+            shape, fortran, dtype = read_npy_header(stream)
             if dtype.kind not in "biufU":
                 raise ValueError(f"{info.filename} holds {dtype}, neither numbers nor text")
             if stream.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
@@ -209,6 +207,17 @@ class NpzFile(ExitStack):
             raise InputError(
                 f"{self.file}: cannot be read as an .npz file without pickled objects ({reason}); {self._cure}"
             ) from None
+
+
+def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether in Fortran's order, and type of an array in NumPy's format; its numbers follow in the stream.
+
+    ValueError for other versions of the format than 1.0 and 2.0; NumPy raises many others for a damaged header.
+    """
+    version = npy.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"it is of NumPy's format {version}, 1.0 and 2.0 are read")
+    return _HEADERS[version](stream)
 
 
 def _go_to(stream: IO[bytes], place: int) -> None:

@@ -1,5 +1,6 @@
-"""Tables of arrays: what each column holds is said once, in the type of its field, and checked wherever one is
-made: `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
+"""Tables of arrays whose columns are declared in the types of fields and checked whenever a table is created.
+
+For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.storage.npz import Pieces
 
 _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
-"""Kinds of NumPy types that may stand for a column's own kind: whole and real numbers, text, yes and no."""
+"""Kinds of NumPy types that are accepted for a column's own kind: integers, floats, text, booleans."""
 
 
 @dataclass(frozen=True)
@@ -22,20 +23,20 @@ class Column:
     """What an array of a table holds."""
 
     axes: str
-    """Its axes, apart by spaces: a letter is a length that is the same in all columns of a table, N counts
+    """Axes, separated by spaces: a letter is a length that is the same in all columns of a table, N counts
     rows."""
     dtype: Any = np.float64
     """The type of its values."""
     unit: str = ""
     """The unit of its values, where they have one."""
     most: float = np.inf
-    """The largest magnitude in a file, beyond which no result goes and products of it are no numbers."""
+    """Largest magnitude in a file; no result exceeds it, and products of larger numbers overflow."""
     missing: Any = None
-    """What it holds where it is not given, as in files of earlier versions; None where it must be given."""
+    """Value of a column that is not given, as in files of earlier versions; None where it must be given."""
     codes: type[Enum] | None = None
-    """What its codes mean, counted from 0."""
+    """Meanings of the codes, counted from 0."""
     stored: Any = None
-    """The type in files, where that is another."""
+    """Type in files, where it is another."""
 
     @property
     def has_rows(self) -> bool:
