@@ -17,7 +17,8 @@ _LEAST_STEP_S = 0.1
 """Minimum time between used frames, s: nearer ones have correlated errors of the detector (0.8)."""
 _MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
-"""Maximum number of sightings: more cost time and add little, because errors within a second are correlated."""
+"""Maximum number of sightings; more of them, or of frames, cost time and add little, because errors within a
+second are correlated."""
 _MIN_DEPTH_M = 0.3
 _WEAKEST_M = 0.15
 """Largest standard deviation of a joint in its worst direction with which it is used, m."""
@@ -47,7 +48,7 @@ class People:
         return np.asarray(np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1]))
 
     def only(self, keep: Mask) -> "People":
-        """Some of the people."""
+        """The people of a mask `keep` (P,)."""
         return People(self.frame[keep], self.xy[keep], self.sigma_px[keep], self.points[keep])
 
 
@@ -79,7 +80,7 @@ class Footage:
         return cls(replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core))
 
     def at(self, frames: Index) -> "Footage":
-        """Some of the frames."""
+        """The sightings in some of the frames."""
         return replace(self, sightings=self.sightings.rows(np.isin(self.sightings.frame, frames)))
 
     def undistorted(self, rig: Rig) -> Sightings:

@@ -1,4 +1,4 @@
-"""When each frame of a recording was taken, and where the recording is cut."""
+"""Times of the frames of a recording, and its cuts."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

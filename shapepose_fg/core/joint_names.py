@@ -78,7 +78,7 @@ _BONES = {
     **dict.fromkeys(("arm", "upperarm"), "Shoulder"),
     **dict.fromkeys(("forearm", "lowerarm"), "Elbow"),
 }
-"""Where joints are called after the bones that begin there: Apple's, Mixamo's."""
+"""Joints by the bones that begin there, after which Apple and Mixamo name them."""
 _LEFT_OUT = {"mid", "middle", "center", "centre", "joint", "jc", "c", "of", "the", "keypoint", "landmark"}
 """Words that are ignored: a joint without a side is in the middle."""
 _SIDES = {"l": "L", "left": "L", "r": "R", "right": "R"}

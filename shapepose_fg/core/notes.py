@@ -82,7 +82,7 @@ class Notes:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
-        """What `as_dict` gave; ValueError where `values` are something else."""
+        """The notes from the result of `as_dict`; ValueError where `values` are something else."""
         try:
             return TypeAdapter(cls).validate_python(values)
         except ValidationError as error:

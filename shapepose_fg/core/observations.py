@@ -11,7 +11,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.storage.schema import Column, Table
 
 _LATER: Any = None
-"""In place of a column that is not given."""
+"""Default of a column that is not given."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ class Observations(Table):
     probability: Annotated[Array, Column("N J V", missing=1.0)] = _LATER
     """(N, J, V) probability that the observation is this person's; 1 where it is not given."""
     mirrored: Annotated[Array, Column("N J V", missing=0.0)] = _LATER
-    """(N, J, V) how probably the observation is of the other side of the body; 0 where it is not said."""
+    """(N, J, V) probability that the observation belongs to the other side of the body; 0 where it is not
+    given."""
     evidence: Annotated[Array, Column("N", missing=np.nan)] = _LATER
     """(N,) evidence for the existence of the person: over time that of `tracking/presence.py`, `own_evidence`;
     frame by frame a probability; NaN where it is not given."""

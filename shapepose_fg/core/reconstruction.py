@@ -247,7 +247,7 @@ class OpenedReconstruction(ExitStack):
             self.frame, self.person = (self._people.column(name) for name in ("frame", "person"))
             """(N,) frame of each row, and identity of each row's person."""
             self.run = _read_run(file.with_name(RUN), self._people.run_id)
-            """What run.json says."""
+            """Content of run.json."""
             if table.is_file():
                 self._observed = self.enter_context(ObservationTable.open(table, self._people.run_id))
         except InputError:
@@ -320,7 +320,7 @@ _CHECKED_ROWS = 4096
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
-    """What run.json says, if it is of the run with that id; empty where there is none."""
+    """Content of run.json, if it is of the run with that id; empty where there is none."""
     run = read_json(file) if file.is_file() else {}
     with naming(file, "restore it or delete it"):
         if not isinstance(run, dict):

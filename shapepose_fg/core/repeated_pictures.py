@@ -24,7 +24,7 @@ class WithoutRepeats(DerivedFrames):
     views: int
     """V, the number of cameras."""
     _read: dict[int, tuple[Detections, Mask]] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What was read last, by its number: all detections, and which views (V,) repeat themselves."""
+    """The frames that were read last, by number: all detections, and which views (V,) repeat themselves."""
 
     @property
     def trust(self) -> Trust:

@@ -156,5 +156,5 @@ class Carried:
         return cls(carrier, poses, np.stack([each.covariance_at(time_s) for each in every], axis=1))
 
     def rows(self, index: Index) -> "Carried":
-        """Some of the rows."""
+        """The carriers in some of the rows."""
         return Carried(self.carrier, self.wTb[index], self.covariance[index])

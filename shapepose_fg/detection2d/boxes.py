@@ -35,7 +35,7 @@ class BoxForm(BaseModel, extra="forbid"):
     """Description of a box network: the table `boxes` of a network's TOML file."""
 
     network: str = ""
-    """Its ONNX file."""
+    """ONNX file of the box network."""
     size: tuple[Side, Side] = (640, 640)
     """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     min_score: _Share | None = None
@@ -51,7 +51,7 @@ class BoxNetwork:
     network: OnnxNetwork
     """The network that proposes boxes."""
     form: BoxForm
-    """Its description."""
+    """Description of the network."""
 
     def find(self, picture: NDArray[np.uint8]) -> Real:
         """(P, 4) left, top, right, bottom in pixels of a `picture` (H, W, 3), the surest first."""

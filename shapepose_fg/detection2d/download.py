@@ -36,7 +36,7 @@ class NamedNetwork:
     """A network with a name."""
 
     file: str
-    """Its archive, at each of `BASES`."""
+    """Archive of the network, at each of `BASES`."""
     size: tuple[int, int]
     """Width and height of the network's input, pixels."""
     boxes: str | None = None

@@ -36,7 +36,7 @@ class CameraDetector:
     camera: Camera
     """The camera."""
     footage: Footage
-    """Its pictures."""
+    """Pictures of the camera."""
     placement: Placement
     """Place of calibrated pixels in them."""
     network: Network

@@ -30,7 +30,7 @@ class KeypointForm(BaseModel, extra="forbid"):
     """Description of a network of keypoints: a TOML file; defaults are those of RTMPose."""
 
     network: str = ""
-    """Its ONNX file."""
+    """ONNX file of the network."""
     skeleton: str | None = None
     """One of `SKELETONS`, or a skeleton's TOML file; None where the number of joints determines it."""
     joints: list[str] | None = None
@@ -83,7 +83,7 @@ class TopDownNetwork:
     network: OnnxNetwork
     """The network that finds joints."""
     form: KeypointForm
-    """Its description."""
+    """Description of the network."""
     skeleton: Skeleton
     """Skeleton of its joints."""
     place: Index

@@ -36,7 +36,7 @@ class Clues:
     views: Whole
     """(N, J) how many views see each."""
     covariance: Array
-    """(N, J, 3, 3) of the graph, errors that last in it, m²."""
+    """(N, J, 3, 3) covariance from the graph, with errors that last, m²."""
     disagreement: Array
     """(N, J) squared Mahalanobis distance of the joint from where the body has it."""
     association: Array
@@ -70,20 +70,21 @@ class Calibration:
     """(J,) what the variances of each joint are multiplied with where nothing speaks against them: by the whole
     recording's errors a shoulder or a hip is known less well than the graph takes it, a nose or a knee better."""
     power: float
-    """And with one plus the disagreement, to this."""
+    """Exponent of one plus the disagreement, by which variances are multiplied, too."""
     unseen: float
-    """And, of a joint that no view sees, with its sigma over `SURE_M`, to this, where that is over 1: body and
+    """Exponent of the sigma over `SURE_M`, where over 1, of a joint that no view sees: body and
     motion, which carry it then, err rarely and by much."""
     association: float
     """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
     frames are one."""
     draft: float
-    """Likewise."""
+    """How many times the clue of this name is added."""
     exchange: float
-    """Likewise: how probable it is that two limbs that both bodies can have are exchanged."""
+    """How many times the clue of this name is added: how probable it is that two limbs that both bodies can have
+    are exchanged."""
     person: float
-    """And all by the exponential of this times how badly the person is known as a whole (`Clues.person`): where
-    that is badly, detections are somebody else's more often, and nothing tells which."""
+    """Covariances are multiplied by the exponential of this times how badly the person is known as a whole
+    (`Clues.person`): where that is badly, detections are somebody else's more often, and nothing tells which."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":

@@ -17,7 +17,7 @@ from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 _SIGMA_M = 0.02
-"""Of a joint that several views see, about, metres."""
+"""Usual standard deviation of a joint that several views see, metres."""
 
 
 def solve_between(

@@ -20,7 +20,9 @@ _FARTHEST_M = 1e6
 
 
 def ready(values: Array) -> Array:
-    """The same as kernels take it: other types and orders, and what must not be written, are compiled anew."""
+    """Return an array as kernels take it: other types and orders, and what must not be written, are compiled
+    anew.
+    """
     return np.require(values, np.float64, ("C", "W"))
 
 

@@ -24,8 +24,8 @@ LEAST_PROBABILITY = 0.01
 _DAMPING = 1e-7
 """Share of the information of the joint that is added in all directions: a ray's length stays as it is."""
 _DEPTH_M = 8.0
-"""Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
-the paper's setting."""
+"""Median depth of joints before the cameras of the `tune` sequences (7 to 10 m), metres: where lengths become
+pixels in the paper's setting."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class ViewEvidence:
 
     @property
     def message(self) -> JointTargets:
-        """The same as Gaussians."""
+        """The evidence as Gaussians."""
         return JointTargets(self.target, self.information)
 
 

@@ -14,7 +14,7 @@ from shapepose_fg.core.storage.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
 GAP_S = 0.4
-"""So long joints were hidden whose densities across gaps were measured."""
+"""Length of the gaps across which densities of hidden joints were measured, seconds."""
 LOST_M = 0.1
 """A joint whose views leave it less certain than this in some direction, metres, is lost from sight."""
 
@@ -88,7 +88,7 @@ class MotionModel:
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
     def density_lost(self, speed_m_s: Array) -> Array:
-        """The same while joints are lost from sight, and their speed is a guess."""
+        """Density (..., J) while joints are lost from sight, and their speed is a guess."""
         return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 
     @classmethod

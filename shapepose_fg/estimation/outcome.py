@@ -40,12 +40,13 @@ from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution,
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
 RUNAWAY_SIGMA = 20.0
-"""So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
+"""A joint that ends this many standard deviations, and half a metre, from what views and body say of it has run
+away."""
 _HALF_M = 0.5
 WEAK_SCORE = 0.3
 """Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
 WEAK_PROBABILITY = 0.5
-"""So are those that are as probably somebody else's."""
+"""Detections that are less probably the person's are weak."""
 
 
 def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
@@ -130,11 +131,7 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
         return fit
     rows = np.concatenate(chosen)
     rows = rows[fit.ok[rows]]
-    xyz, information = state.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
-    known = np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance[rows]).all(axis=(2, 3))
-    information[known] = np.linalg.inv(covariance[rows][known])
-    information = (information + information.swapaxes(2, 3)) / 2
-    again = fitter.fit_whole(JointTargets(np.nan_to_num(xyz), information), fit.rows(rows))
+    again = fitter.fit_whole(JointTargets.solved(state.joints[rows], covariance[rows]), fit.rows(rows))
     return fit.with_rows(rows[again.ok], again.rows(np.flatnonzero(again.ok)))
 
 

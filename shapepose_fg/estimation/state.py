@@ -25,7 +25,7 @@ class State:
     views: Views
     """The cameras."""
     sigmas: Array
-    """(N, J, V) of the observations, pixels; 0 where there are none."""
+    """(N, J, V) standard deviations of the observations, pixels; 0 where there are none."""
     first: Array
     """(N, J, 3) X_0, metres; NaN where unknown."""
     config: EstimatorConfig

@@ -45,7 +45,8 @@ _SAME_PERSON = 2.5
 _ERRORS = ((0.45, 3.5), (0.25, 0.25))
 """Shares of a detector's errors that last, and how long, seconds; all as in `calibration/refinement.py`."""
 _AVERAGED_S = 1.0
-"""So long an odometry of 1 % is better than what people say of a pose: over this, errors would average out."""
+"""Time for which an odometry of 1 % is better than what people say of a pose: over this, errors would average
+out."""
 _ANYWHERE_M = 10.0
 """Joints are about there: without it one that ends behind its cameras would make the system singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
@@ -253,5 +254,5 @@ def poses_of(values: gtsam.Values, keys: NDArray[np.int64]) -> Array:
 
 
 def symmetric(covariance: Array) -> Array:
-    """The same without what rounding left on one side of the diagonal."""
+    """Return a covariance without what rounding left on one side of the diagonal."""
     return (covariance + covariance.swapaxes(-1, -2)) / 2

@@ -41,7 +41,7 @@ SURFACE_M = 0.015
 _REACH_M = 0.15
 """Joints within about this of a point of the surface carry it."""
 _NODES, _WIDE = 24, 6.0
-"""Of the quadrature, per axis; and how many standard deviations it spans on either side."""
+"""Number of nodes of the quadrature, per axis; and how many standard deviations it spans on either side."""
 _STEPS = 64
 """Limits at which a distance's probabilities are tabled for its quantiles."""
 
@@ -80,7 +80,7 @@ class Distance:
     apart: Array
     """(..., 3) from one to the other, metres."""
     covariance: Array
-    """(..., 3, 3) of that, m²."""
+    """(..., 3, 3) covariance of `apart`, m²."""
 
     def below(self, limit_m: ArrayLike) -> Array:
         """Probability (...,) that the distance is under a limit (...,), metres.
@@ -324,7 +324,7 @@ def surface_distance(
 
 
 def correlation(one: Sequence[str], other: Sequence[str]) -> Array:
-    """(A, B) of the errors, in standard deviations, of joints of one person in one frame, by their names; those
+    """(A, B) correlation of the errors of joints of one person in one frame, by their names; those
     that are no part of a body known here correlate with themselves alone.
     """
     return np.array([[_together(a, b) for b in other] for a in one]).reshape(len(one), len(other))

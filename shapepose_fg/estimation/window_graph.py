@@ -200,7 +200,7 @@ class WindowGraph:
 
     @property
     def seen(self) -> Mask:
-        """(T, J, V) of which joints there are detections."""
+        """(T, J, V) whether there is a detection of the joint."""
         return self._observations.seen
 
     @property
@@ -556,7 +556,7 @@ def name_of(function: FactorFunction) -> str:
 
 
 def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
-    """Of which joint a singular system leaves open."""
+    """Name the joint that a singular system leaves open."""
     key = undetermined_key(error)
     if key is None or all(key not in set(person.states.ravel().tolist()) for person in people):
         return ""

@@ -122,7 +122,7 @@ class PersonGraph:
     solved: Array
     """(T, J, 3) where the solver has the joints, metres."""
     solved_covariance: Array
-    """(T, J, 3, 3) and how surely: marginals of its graph, m²."""
+    """(T, J, 3, 3) covariance of `solved`: marginals of its graph, m²."""
     lasting: Lasting
     """How the error goes on that is in the report and not in the solver's graph."""
     body: JointTargets
@@ -235,7 +235,7 @@ class PersonGraph:
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
-    """The same people, each with the others to whom factors of the user's own tie them."""
+    """Return the people, each with the others to whom factors of the user's own tie them."""
     together, found = dict[int, list[PersonGraph]](), list[PersonGraph]()
     for person in people:
         group = together.setdefault(id(person.window.ties), [])

@@ -19,7 +19,7 @@ _WIDTH, _ROUNDS = 3.0, 12
 _TURN_RAD, _SHIFT_M = np.radians(5.0), 0.5
 """How far a camera may have come off, one sigma per axis."""
 _TOGETHER = 50.0
-"""So many detections tell as much as one: errors last from frame to frame and go through a whole person."""
+"""Number of detections that tell as much as one: errors last from frame to frame and go through a whole person."""
 _LEAST = 30
 """Detections by which a camera is judged."""
 _BETTER = 1.2
@@ -40,7 +40,7 @@ class WrongView:
     before: float
     """Mean squared distance of its detections from what the others say, in sigmas, up to 36; 2 is usual."""
     after: float
-    """The same if its pose gave way."""
+    """Mean squared distance if its pose gave way."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Seen:
     sigmas_px: Array
     """(N, J, V)"""
     there: Mask
-    """(N, J, V) of which detections of placed joints."""
+    """(N, J, V) whether there is a detection of a placed joint."""
     used: Mask
     """(N, J, V) which are part of the solution."""
 

@@ -20,7 +20,7 @@ from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
 """The list of corrections, and the folder of the uncorrected result."""
 _PART = f".{UNCORRECTED}.part"
-"""That folder while it is created, or deleted."""
+"""Name of the folder of the uncorrected result while it is created, or deleted."""
 _FILES = (PEOPLE, RUN, OBSERVATIONS)
 _CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to begin anew"
 

@@ -86,7 +86,7 @@ def write_moments(file: Path, rig: Rig, picture: Index) -> None:
 
 
 def read_moments(file: Path) -> dict[str, Index]:
-    """What `write_moments` wrote: (T,) pictures by the camera's name; InputError on anything else."""
+    """Read a file of `write_moments`: (T,) pictures by the camera's name; InputError on anything else."""
     lines = [re.split(r",\s*", line) for line in read_text(file, most=_MOST_BYTES).splitlines()]
     names, *rows = lines if len(lines) > 0 else [[""]]
     try:

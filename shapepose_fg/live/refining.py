@@ -80,7 +80,7 @@ class Refined:
     """A solved window."""
 
     rows: Reconstruction
-    """Its settled rows."""
+    """Rows that the window settles."""
     newest: Reconstruction
     """The rows of its newest frame, whose bodies are the initial ones of the newest people."""
 

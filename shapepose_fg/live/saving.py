@@ -74,9 +74,8 @@ _COLUMNS = {
     "seen.pairs": Column("E 2", _WHOLE),
     "seen.affinity": Column("E", most=1e9),
 }
-"""What is kept of the frames, one after the other; `slots` says how much of it is each frame's: its number,
-whether it is settled, the next track and identity, and how many tracks, detections, pairs and people who left it
-has."""
+"""Arrays of the frames, one frame after the other; `slots` has the share of each frame: its number, whether it
+is settled, the next track and identity, and its numbers of tracks, detections, pairs and ended tracks."""
 
 
 def setup_id(rig: Rig, skeleton: Skeleton, config: PipelineConfig, lag_s: float) -> str:

@@ -60,11 +60,11 @@ def solve_window(
     Rows of one track at several frames are a window, one factor graph; a row whose track has no other is the
     frame-by-frame method, and with `EstimatorConfig` of the paper its Algorithm 1. `views` are the cameras, row by
     row if they move. `extra_factors`, one function or several, add factors of your own to every window. Without
-    `assigning` detections stay with whom they are.
+    `assigning` detections keep their people.
 
-    In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
-    says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice.
-    Motion acts on the joints, never on what the body is fitted to.
+    In each round the body is fitted to the estimates of all joints from the views alone, and then constrains the
+    joints. Its constraint on a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is
+    counted twice. Motion constrains the joints, never the targets of the body.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
         raise ValueError(

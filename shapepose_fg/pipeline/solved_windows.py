@@ -149,7 +149,7 @@ class SolvedChunk:
     """A solved chunk; its tracks count from 0."""
 
     parts: tuple[Part, ...]
-    """Its windows."""
+    """Windows of the chunk."""
     notes: Notes
     """Notes about tracking its people."""
     begins: Border

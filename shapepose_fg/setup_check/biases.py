@@ -62,7 +62,9 @@ class Residuals:
 
     @classmethod
     def of(cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index) -> "Residuals":
-        """Of what is `observed`. Weights are by how far a residual is from its median over the person's frames."""
+        """Make residuals of what is `observed`. Weights are by how far a residual is from its median over the
+        person's frames.
+        """
         xy, confidence, size = seen
         scale, lasting = np.nan_to_num(size, nan=1.0)[:, None, :, None], np.zeros_like(xy)
         for _ in range(4):

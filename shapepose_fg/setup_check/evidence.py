@@ -39,7 +39,7 @@ ANCHORS = 100
 _WHOLE = 600
 """A recording of so many frames is looked at whole, for offsets in time."""
 _LAG_ANCHORS = 16
-"""Of a longer one the neighbours of so many frames are."""
+"""Number of frames of a longer recording whose neighbours are looked at."""
 MOST_LAG = 60
 """Largest offset in time that is looked for, frames; less in a short recording."""
 _MOST_PAIRS = 25_000
@@ -62,7 +62,7 @@ class Evidence:
     """(V,) in what part of these frames each camera shows the picture before once more."""
 
     def thinned(self, frames: int) -> "Evidence":
-        """The same with fewer frames that are looked at."""
+        """Return the evidence with fewer frames that are looked at."""
         return replace(self, anchors=self.anchors[:: max(1, len(self.anchors) // frames)])
 
 
@@ -205,14 +205,14 @@ class Look:
         return Pinhole(self.views.K[view], self.views.cTw[view])
 
     def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Look":
-        """The same with other cameras in the place of some."""
+        """Return the look with some cameras replaced."""
         K, cTw = self.views.K.copy(), self.views.cTw.copy()
         for view, camera in cameras.items():
             K[view], cTw[view] = camera.K, camera.cTw
         return replace(self, views=replace(self.views, K=K, cTw=cTw))
 
     def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "Look":
-        """The same with other detections of one camera."""
+        """Return the look with other detections of one camera."""
         every = self.evidence.sightings
         mine = np.flatnonzero(every.view == view)
         xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
@@ -222,7 +222,7 @@ class Look:
         )
 
     def later(self, view: int, frames: int) -> "Look":
-        """The same with one camera known to be late."""
+        """Return the look with one camera known to be late by so many frames more."""
         lag = self.lag.copy()
         lag[view] += frames
         return replace(self, lag=lag)

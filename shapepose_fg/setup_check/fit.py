@@ -14,8 +14,8 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pinhole, Sightings, distances, same_frame
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
-"""Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the
-principal point (px), and the logarithm of the focal length."""
+"""Parameters of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the
+calibration), the principal point (px), and the logarithm of the focal length."""
 Q = len(PARAMETERS)
 TURN, MOVE, CENTRE, FOCAL, POSE = [0, 1, 2], [3, 4, 5], [6, 7], [8], [0, 1, 2, 3, 4, 5]
 _MOST_ZOOM = 5.0
@@ -169,7 +169,7 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
 def best_of(
     others: Others, seen: Sightings, camera: Pinhole, pairs: Sequence[tuple[Array, Array]], fitted: Fitted
 ) -> Pinhole | None:
-    """Of the cameras that fit one person exactly, the one that fits all people best."""
+    """Return the camera that fits all people best, of those that fit one person exactly."""
     step = max(1, len(others) // 40)
     few = others.rows(slice(None, None, step))
     tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]

@@ -51,14 +51,14 @@ class Lag:
     gain: float
     """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
     likely: float
-    """The same as the likelihood's logarithm."""
+    """Gain of the likelihood's logarithm."""
     agreement: float
     """The gain over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
     none, 0 without motion. Of the half of the frames in which it is less: an offset is in both halves, while
     in one of them people may come by chance to where they were."""
     followed: float
-    """The same of those alone who are seen near enough with and without it: with people who hide each other, more
-    are near by chance at some offset."""
+    """Agreement of people who are seen near enough with and without the offset: with people who hide each other,
+    more are near by chance at some offset."""
 
     @property
     def is_offset(self) -> bool:
@@ -177,8 +177,8 @@ _FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 GOOD = 0.45
 """A camera that matches the others' people so well is where it is said to be, but for small errors."""
 GOOD_PAIR = 0.65
-"""Of two cameras more is asked, because rays have only to meet: sound pairs had 0.67 and more, most of those with
-one that was mirrored, or turned by 8 degrees half-way, less."""
+"""Score from which on two cameras fit each other; higher, because their rays have only to meet: sound pairs had
+0.67 and more, most of those with one that was mirrored, or turned by 8 degrees half-way, less."""
 GAIN, _LIKELY = 0.12, 10.0
 """What a change must bring of a camera's score, and of the likelihood's logarithm, to be named."""
 _EXPLAINED = 0.65

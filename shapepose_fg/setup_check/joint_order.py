@@ -28,7 +28,7 @@ _GAIN, _SHARE = 0.02, 0.8
 an exchange gains up to 0.035 over the right order, in at most 0.7 of the frames; undoing the exchange of two
 joints gains 0.02 to 0.5."""
 _GAIN_2D, _SHARE_2D = 0.01, 0.85
-"""The same in pictures, where people are not placed in space, or badly."""
+"""Least gain and share of people in pictures, where people are not placed in space, or badly."""
 _OTHER_LAYOUT = 0.1
 """Least gain of a known layout, nats a pair; right ones gain 0.7 to 1.7, but for two that differ in two joints."""
 _FACING = 0.25

@@ -283,7 +283,7 @@ def miss_px(points: Array, xy: Array, camera: Pinhole) -> Array:
     camera, NaN where nothing was seen.
     """
     at, depth = camera.project(points)
-    miss = np.linalg.norm(at - xy, axis=-1)
+    miss = np.sqrt(np.square(at - xy).sum(axis=-1))
     return np.where((depth <= 0) & ~np.isnan(xy[..., 0]), np.inf, miss)
 
 

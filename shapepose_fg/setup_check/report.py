@@ -39,13 +39,13 @@ class CameraFigures:
     high_px: float | None
     """Nine of ten are nearer."""
     median_mm: float | None
-    """The same median as a length."""
+    """Median distance as a length, millimetres."""
     high_mm: float | None
     """Nine of ten are nearer."""
     left_out_px: float | None
     """Median distance to where the other cameras alone put the joint, pixels."""
     left_out_mm: float | None
-    """The same as a length."""
+    """Median distance to there as a length, millimetres."""
     left_out_matched: float
     """Share of the people seen by the others that the camera could match and does match."""
     late_frames: int
@@ -72,7 +72,7 @@ class SetupReport:
     findings: tuple[Finding, ...]
     """One after the other, gross mistakes first; none where nothing is wrong."""
     warnings: tuple[str, ...]
-    """The same in words, a sentence each."""
+    """The findings in words, a sentence each."""
     cameras: tuple[CameraFigures, ...]
     """By camera, as the set-up was given."""
     pairs: tuple[PairFigures, ...]
@@ -199,7 +199,7 @@ def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
 
 
 def quantile(values: Array, part: float) -> float | None:
-    """Of the finite values; None where there are none."""
+    """Return a quantile of the finite values; None where there are none."""
     values = values[np.isfinite(values)]
     return float(np.quantile(values, part)) if len(values) > 0 else None
 
@@ -216,13 +216,13 @@ _ROWS = 300
 _MOST_BETA = 5.0
 """A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
-"""Of so many rows: fewer are single people that hardly any camera saw."""
+"""Share of rows from which on shapes are named: fewer are single people that hardly any camera saw."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
 """Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
 _MOST, _FEW = 0.5, 50
 """A camera of which less than this share of at least so many detections was used is named."""
 _LOST, _LOST_SHARE = 0.5, 0.1
-"""So many people a frame, and such a share of them, are missing before it is said."""
+"""Least number of people a frame, and least share of them, that are missing for a warning."""
 _LOOKED_AT = 200
 """Frames, spread over the recording, in which detections are counted for that."""
 _SHORT_S = 1.0
@@ -235,7 +235,7 @@ _REASONS = {
 }
 """Why detections that were given to people were not used."""
 _LEAST_USED = 0.1
-"""Of detections on Shelf, false candidates among them, most are somebody's."""
+"""Least share of detections that people explain; on Shelf, false candidates included, it is most."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -252,11 +252,11 @@ class Distances:
     """Median, and what nine of ten are below, pixels; None without any."""
     median_mm: float | None
     high_mm: float | None
-    """The same as lengths, millimetres."""
+    """Both as lengths, millimetres."""
 
     @classmethod
     def of(cls, px: Array, mm: Array) -> "Distances":
-        """Of all finite distances `px` and `mm`, arrays of one shape."""
+        """Summarise all finite distances `px` and `mm`, arrays of one shape."""
         finite = np.isfinite(px) & np.isfinite(mm)
         return cls(int(finite.sum()), *(quantile(each[finite], part) for each in (px, mm) for part in (0.5, 0.9)))
 

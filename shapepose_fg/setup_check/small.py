@@ -72,7 +72,7 @@ class Problem:
 
     @classmethod
     def of(cls, look: Look, given: Views | None = None) -> "Problem":
-        """Of people spread over the frames, against the look's own cameras or others."""
+        """Make the problem of people spread over the frames, against the look's own cameras or others."""
         groups, structure = look.structure(steps=2)
         who = followed(groups.frame, structure.points)
         step = max(1, -(-len(groups) // _MOST_PEOPLE))

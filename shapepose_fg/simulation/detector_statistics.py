@@ -1,4 +1,4 @@
-"""How a real detector errs, as tables measured on the Shelf recording (docs/simulation.md).
+"""Errors of a real detector, as tables measured on the Shelf recording (docs/simulation.md).
 
 The code that measures is `simulation/measurement` of commit 77ab725.
 """

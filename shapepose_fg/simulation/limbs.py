@@ -123,7 +123,7 @@ def _turn_head(turned: Array, position: Array, gaze: Array) -> None:
 
 
 def _hand_target(puppet: Puppet, turned: Array, position: Array, bones: Array, side: int) -> Array:
-    """Where a wrist goes (T, 3): to its target, or to hang beside the hip and swing, or between the two."""
+    """Target of a wrist (T, 3): its own, or hanging beside the hip and swinging, or between the two."""
     shoulder, elbow, wrist = ARMS[side][1:]
     length = np.linalg.norm(bones[elbow]) + np.linalg.norm(bones[wrist])
     sign = (1.0, -1.0)[side]

@@ -51,7 +51,7 @@ class Motion:
         return cls(parts[0].betas, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def __getitem__(self, frames: slice) -> "Motion":
-        """Some consecutive frames."""
+        """The motion in some consecutive frames."""
         return Motion(self.betas, self.global_orient[frames], self.body_pose[frames], self.transl[frames])
 
     def __post_init__(self) -> None:

@@ -57,7 +57,7 @@ class Scene:
         return replace(self, body=self.body.with_keypoint_offsets(offsets))
 
     def part(self, span: range) -> "Scene":
-        """Some consecutive frames."""
+        """The scene in some consecutive frames."""
         # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
         segments = zip((0, *self.cuts), (*self.cuts, len(self)), self.clips, strict=False)
         clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)

@@ -114,8 +114,8 @@ def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
 
 
 def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bool) -> Chosen:
-    """The same people from their first detection on, where nobody was there before the `first` frame, and up to
-    their last one, where nothing follows the `last`: to be there unseen costs less at the ends than to appear.
+    """Shorten people to begin with their first detection, where nobody was there before the `first` frame, and up
+    to their last one, where nothing follows the `last`: to be there unseen costs less at the ends than to appear.
     """
     frame = np.arange(found.there.shape[1])
     seen = (found.candidate[chosen.hypothesis] >= 0).any(axis=(2, 3))

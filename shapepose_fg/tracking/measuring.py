@@ -142,7 +142,7 @@ def _apart_m(place, camera, focal, xy):
 
 @part
 def _mean_depth(mean, camera):
-    """Of the joints in front of a view."""
+    """Mean depth of a person's joints in front of a view, metres."""
     total, count = 0.0, 0
     for j in range(len(mean)):
         depth = project(camera, mean[j])[2]

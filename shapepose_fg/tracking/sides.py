@@ -118,7 +118,7 @@ class _Memory(dict[tuple[int, int], tuple[float, Array]]):
     """When a view saw a person last, seconds, and log probabilities (S,) of what it had exchanged."""
 
     def with_more(self, of: tuple[int, int], time_s: float, likelihood: Array) -> Array:
-        """(S,) the same after a frame with this log-likelihood (S,), which is kept."""
+        """(S,) log probabilities after a frame with this log-likelihood (S,), which is kept."""
         prior = _prior(len(likelihood))
         if of in self:
             last_s, before = self[of]

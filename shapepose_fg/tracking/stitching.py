@@ -51,7 +51,7 @@ class Trace(Rows):
 
     @classmethod
     def of(cls, track: int, time_s: Array, joints: Array, skeleton: Skeleton) -> "Trace":
-        """Of solved rows with `joints` (N, J, 3)."""
+        """Make the trace of solved rows with `joints` (N, J, 3)."""
         core = list(skeleton.core)
         bone = np.array([(j, p) for j, p in enumerate(skeleton.parents) if j in core and p in core])
         known = np.asarray(np.isfinite(joints[:, core]).all(axis=-1))[..., None]
@@ -73,7 +73,7 @@ class Ends:
     track: Index
     """(G,) identities."""
     time_s: Array
-    """(G, 2) of the first and the last row."""
+    """(G, 2) times of the first and the last row, seconds."""
     place: Array
     """(G, 2, 3) centre of the core joints there, metres."""
     bones: Array
@@ -81,7 +81,7 @@ class Ends:
 
     @classmethod
     def of(cls, traces: Iterable[Trace]) -> "Ends":
-        """Of tracks, of which one at a time is in memory."""
+        """Summarise tracks, one of which at a time is in memory."""
         rows = [(each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces]
         if len(rows) == 0:
             return cls(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0)))

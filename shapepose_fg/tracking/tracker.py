@@ -57,7 +57,7 @@ class BodyScale:
     longest_m: Array
     """(J,) the longest distance of a joint to its parent on the skeleton, metres; the root's counts nothing."""
     density: Array
-    """(J,) of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
+    """(J,) density of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
     motion: Motion = CONSTANT_VELOCITY
     """How joints move."""
 

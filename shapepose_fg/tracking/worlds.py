@@ -28,7 +28,7 @@ _SEARCH_S = 0.3
 are sought among all detections. In a world that lacks somebody the others take that person's detections, so new
 people are sought in all of them: crowds before three cameras gain two to six people of a hundred."""
 _TWINS_S = 0.1
-"""So often it is looked whether two worlds have become one, seconds."""
+"""Interval between checks for worlds that have become one, seconds."""
 _RESTART_S = 1.3
 """Whoever was chosen is followed again from a frame in each so many seconds."""
 _ROUNDS = 2
@@ -75,7 +75,7 @@ class Hypotheses:
 
     @cached_property
     def account(self) -> Account:
-        """The same as evidence."""
+        """The hypotheses as evidence."""
         return Account.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
 
     def __len__(self) -> int:
@@ -104,7 +104,7 @@ class Seed:
     forwards: bool = True
     """Whether they are followed forwards."""
     backwards: bool = True
-    """And backwards."""
+    """Whether they are followed backwards."""
     births: bool = True
     """Whether others are sought beside them."""
 

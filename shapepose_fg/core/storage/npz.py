@@ -38,7 +38,7 @@ class Pieces:
     dtype: np.dtype[Any]
     """The type of its values."""
     shape: tuple[int, ...]
-    """Its whole shape."""
+    """Shape of the whole array."""
     pieces: Callable[[], Iterable[NDArray[Any]]]
     """The pieces in order; can be asked for several times."""
 
@@ -53,7 +53,7 @@ class Pieces:
         return np.concatenate(pieces) if len(pieces) > 0 else np.zeros(self.shape, dtype=self.dtype)
 
     def blocks(self) -> Iterator[bytes]:
-        """Its bytes in C order; ValueError where the pieces do not make up the shape."""
+        """Bytes of the array in C order; ValueError where the pieces do not make up the shape."""
         length, waiting = 0, b""
         for piece in self.pieces():
             if piece.shape[1:] != self.shape[1:]:
@@ -89,10 +89,11 @@ def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> 
 
 
 def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray[Any]]:
-    """Those arrays of an `.npz` file that are called one of `names`; InputError with the `cure` where that fails.
+    """Read the arrays of an `.npz` file whose names are among `names`; InputError with the `cure` where that
+    fails.
 
-    Of the file's other members nothing is read. An array takes memory only after its size, as zip and NumPy's
-    header say it, was found to be one that the file can hold.
+    Other members of the file are not read. An array takes memory only after its size, from the headers of zip and
+    NumPy, was found to be one that the file can hold.
     """
     with NpzFile(file, names, cure) as opened:
         return {name: opened.array(name) for name in opened.names}
@@ -148,7 +149,7 @@ class NpzFile(ExitStack):
             return self._member(name).shape
 
     def row_bytes(self, name: str) -> int:
-        """What a row of an array takes in memory."""
+        """Size of a row of an array in memory, bytes."""
         with self._telling():
             return self._member(name).row_bytes
 

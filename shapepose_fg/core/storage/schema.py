@@ -20,7 +20,7 @@ _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
 
 @dataclass(frozen=True)
 class Column:
-    """What an array of a table holds."""
+    """Axes, type, unit and bounds of an array of a table."""
 
     axes: str
     """Axes, separated by spaces: a letter is a length that is the same in all columns of a table, N counts
@@ -49,7 +49,7 @@ class Column:
         return tuple(int(axis) if axis.isdecimal() else axis for axis in self.axes.split())
 
     def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
-        """Its shape where letters have these lengths."""
+        """Shape of the array where letters have these lengths."""
         return tuple(sizes.get(each, 0) if isinstance(each, str) else each for each in self._lengths)
 
     def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
@@ -160,14 +160,14 @@ class Table:
             column.check_range(name, getattr(self, name))
 
     def columns(self) -> dict[str, Pieces]:
-        """What a file holds: rows, what they share, and what their codes mean."""
+        """The arrays of a file: rows, shared columns, and meanings of codes."""
         stored = {name: column.stored for name, column in columns_of(type(self)).items()}
         own = {name: Pieces.of(getattr(self, name), stored[name]) for name in (*self.ROWS, *self.shared())}
         return own | {name: Pieces.of(words) for name, words in self.meanings().items()}
 
     @classmethod
     def meanings(cls) -> dict[str, NDArray[np.str_]]:
-        """What codes mean, as the arrays that make a file readable: `gate_names` for the column `gate`."""
+        """Meanings of codes, as the arrays that make a file readable: `gate_names` for the column `gate`."""
         coded = {name: column.codes for name, column in columns_of(cls).items() if column.codes is not None}
         return {f"{name}_names": code_names(codes) for name, codes in coded.items()}
 

@@ -96,7 +96,7 @@ class NumberStream:
 
     @property
     def known(self) -> int:
-        """How many numbers of the file have been read."""
+        """Number of the file's numbers that have been read."""
         return self.first + len(self.values)
 
     def reaches(self, count: int) -> bool:

@@ -123,7 +123,7 @@ def _surely(more: Array) -> bool:
 
 
 def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
-    """How many keypoints a person has, and the first camera with people; None without people."""
+    """Number of keypoints per person, and the first camera with people; None without people."""
     counts: dict[int, CameraPeople] = {}
     for each in people:
         if each.keypoint_count is not None:

@@ -196,7 +196,7 @@ def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> D
 
 
 def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int) -> ViewCandidates:
-    """What a view saw in some of its frames, as frames `begin` and on; -1 is none."""
+    """Candidates of a view in some of its frames, as frames `begin` and on; -1 is none."""
     there = np.flatnonzero(picture >= 0)
     every = [recording[frame] for frame in picture[there].tolist()]
     parts = [each.only(each.view == view) for each in every]

@@ -306,7 +306,7 @@ def log_pictures(
 
 
 def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where in a picture each pixel of the calibrated picture without distortion is: columns and rows, (H, W)."""
+    """Place of each pixel of the calibrated picture without distortion in a picture: columns and rows, (H, W)."""
     width, height = camera.image_size
     column, row = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([column.ravel(), row.ravel()], axis=1)

@@ -48,7 +48,7 @@ class Part:
     """One window, solved."""
 
     rows: Reconstruction
-    """Its rows; a person is a track there, or frame by frame a number within the frame."""
+    """Rows of the window; a person is a track there, or frame by frame a number within the frame."""
     notes: Notes
     """Notes about it."""
     checkpoint: Checkpoint | None = None

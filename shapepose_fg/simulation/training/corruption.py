@@ -1,10 +1,10 @@
-"""What a detector and a triangulation make of true joints: the targets that a fitter is trained on.
+"""Corrupts true joints as a detector and triangulation do, for the targets that a fitter is trained on.
 
 Half of the people are seen by a few virtual cameras: each view hides some joints, misses some, and reports the
 others with a confidence and an error drawn from the simulator's tables; the views' rays are triangulated with the
-weights that the pipeline gives them. So depth is worse than width, a joint may be a single ray, and claims are
-sometimes wrong. The rest have plain isotropic noise. Then whole limbs, sides and halves go missing, joints are
-outliers, sides swap.
+weights that the pipeline gives them. So depth is worse than width, a joint may be a single ray, and stated
+covariances are sometimes wrong. The rest have plain isotropic noise. Then whole limbs, sides and halves are
+removed, joints become outliers, and sides are swapped.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _NEAREST = {
     "head": "Nose", "collar": "Neck", "hip": "LHip", "knee": "LKnee", "ankle": "LAnkle", "foot": "LBigToe",
     "shoulder": "LShoulder", "elbow": "LElbow", "wrist": "LWrist", "hand": "LWrist",
 }  # fmt: skip
-"""Points that the detector has no statistics for err as their nearest joint does."""
+"""Nearest joint of the points for which there are no statistics of the detector, whose errors they get."""
 _GROUP = torch.tensor(
     [
         int(JOINT_GROUP[BODY_25.index(name if name in BODY_25.joints else _NEAREST[name.split("_")[-1]])])
@@ -54,7 +54,7 @@ _SWAPPED = torch.stack([_LEG, _SHIN, _ARM, _HAND, _LEG + _ARM])
 _MIRROR = torch.tensor(MIRROR)
 
 _PIPELINE_SIGMA_M = 0.013
-"""Information that the pipeline states: this sigma over the confidence, m (see `observations`)."""
+"""Standard deviation that the pipeline states for a joint, m, divided by the confidence (see `observations`)."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ class Overlay:
     people: OpenedReconstruction
     """The result, as it was saved."""
     rig: Rig
-    """Its cameras."""
+    """Cameras of the result."""
     cameras: Sequence[tuple[CameraFootage, Footage]]
     """The pictures of the cameras that are drawn."""
     skeletons: bool = True

@@ -114,7 +114,9 @@ def overall(people: Reconstruction) -> dict[str, Any]:
 
 
 def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:
-    """How many joints are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the rows."""
+    """Number of joints that are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the
+    rows.
+    """
     kinds = people.known[..., None] == np.array(KINDS)
     if by is None:
         return kinds.sum(axis=0)

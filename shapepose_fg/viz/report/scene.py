@@ -36,7 +36,7 @@ _TURN = 32767
 
 @dataclass(frozen=True)
 class Scene:
-    """What a page draws, and the frames of the recording that it has."""
+    """Data of a page, and the frames of the recording that it has."""
 
     data: dict[str, Any]
     """The data for the page's script: plain values for JSON."""
