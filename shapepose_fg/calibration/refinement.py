@@ -35,7 +35,8 @@ _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is not determined."""
 
 _BUMPED_DEG = 2.5
-"""Rotation above which a camera was bumped, degrees: its prior is then not used."""
+"""Rotation above which a camera was bumped, degrees: its prior is then centred on the pose at which it sees the
+others' people."""
 
 PARTS = {"turn": TURN, "move": MOVE, "focal": FOCAL, "centre": CENTRE, "lens": LENS}
 """Parameters of a camera that may change."""

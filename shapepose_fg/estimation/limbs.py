@@ -69,10 +69,8 @@ def limb_steps(joints: Array, covariance: Array, unseen: Mask, fitter: BodyFitte
     steps = np.zeros(joints.shape)
     if len(rows) == 0:
         return steps
+    body = fitter.fit_whole(JointTargets.solved(joints[rows], covariance[rows]))
     C = np.where(known[rows][..., None, None], covariance[rows], np.eye(3))
-    information = np.where(known[rows][..., None, None], np.linalg.inv(C), 0.0)
-    targets = JointTargets(np.nan_to_num(joints[rows]), (information + information.swapaxes(2, 3)) / 2)
-    body = fitter.fit_whole(targets)
     share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
     step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
     steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)

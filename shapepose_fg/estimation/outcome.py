@@ -131,11 +131,7 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
         return fit
     rows = np.concatenate(chosen)
     rows = rows[fit.ok[rows]]
-    xyz, information = state.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
-    known = np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance[rows]).all(axis=(2, 3))
-    information[known] = np.linalg.inv(covariance[rows][known])
-    information = (information + information.swapaxes(2, 3)) / 2
-    again = fitter.fit_whole(JointTargets(np.nan_to_num(xyz), information), fit.rows(rows))
+    again = fitter.fit_whole(JointTargets.solved(state.joints[rows], covariance[rows]), fit.rows(rows))
     return fit.with_rows(rows[again.ok], again.rows(np.flatnonzero(again.ok)))
 
 

@@ -113,7 +113,9 @@ class CameraWatch:
         return replace(self, apart_m=apart_m)
 
     def _judged(self) -> Whole:
-        """(V,) which cameras contradict the others; where these are more than half, or two, all are doubted."""
+        """(V,) codes of `CameraState`: cameras that contradict the others; all are doubted unless at least two
+        agree, and more agree than contradict.
+        """
         known = np.isfinite(self.apart_m)
         was = self.state == CameraState.CONTRADICTS
         if not known.any():

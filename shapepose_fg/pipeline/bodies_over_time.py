@@ -59,11 +59,7 @@ class Person:
     @classmethod
     def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
         """Data of the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
-        solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
-        information = np.zeros_like(covariance)
-        information[solved] = np.linalg.inv(covariance[solved])
-        information = (information + information.swapaxes(-1, -2)) / 2
-        return cls(number, JointTargets(np.where(solved[..., None], joints, 0.0), information), time_s)
+        return cls(number, JointTargets.solved(joints, covariance), time_s)
 
     def fitted(self, fitter: BodyFitter) -> dict[str, NDArray[Any]]:
         """Fit the bodies; returns arrays: `ok` (N,) which rows have one, `betas` to `transl` as in

@@ -103,6 +103,14 @@ class JointTargets(Rows):
         object.__setattr__(self, "xyz", xyz)
         object.__setattr__(self, "information", information)
 
+    @classmethod
+    def solved(cls, joints: Array, covariance: Array) -> "JointTargets":
+        """Targets at `joints` (B, J, 3), metres, known to `covariance` (B, J, 3, 3); none where either is NaN."""
+        known = np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
+        information = np.zeros(covariance.shape)
+        information[known] = np.linalg.inv(covariance[known])
+        return cls(np.where(known[..., None], joints, 0.0), (information + information.mT) / 2)
+
     @property
     def known(self) -> Mask:
         """(B, J) joints that have a target."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
@@ -26,7 +26,7 @@ from shapepose_fg.io.footage.placement import CameraFootage, Placement
 
 _CAMERAS = "world/cameras"
 """Path of the cameras in the recording."""
-_REGION = float(np.sqrt(chi2.ppf(0.95, 3)))
+_REGION = float(np.sqrt(2 * gammaincinv(1.5, 0.95)))
 """Radius, in standard deviations, of the ellipsoid that holds 95 % of a Gaussian."""
 _JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
 _PALE = 0.6
