@@ -37,7 +37,7 @@ _HOMES = {
     "refine_trajectories": "shapepose_fg.pipeline.pipeline",
     "write_rig": "shapepose_fg.io.calibration",
 }
-"""Where each public name lives. It is imported when it is asked for, so that this import loads no torch."""
+"""Module of each public name, which is imported on first use, so that this import loads no torch."""
 
 
 def __getattr__(name: str) -> Any:

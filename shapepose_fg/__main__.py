@@ -1,4 +1,4 @@
-"""The program's beginning: `shapepose-fg`, and `python -m shapepose_fg`."""
+"""The entry point: `shapepose-fg`, and `python -m shapepose_fg`."""
 
 import gc
 import os
@@ -6,10 +6,10 @@ import signal
 
 
 def main() -> None:
-    """Run the command line. Until it is loaded, Ctrl-C ends the program without a word.
+    """Run the command line. Until it is loaded, Ctrl-C ends the program without a message.
 
-    Of processor time that of an eighth of a second is saved: what modules consist of is hardly looked through for
-    garbage, and not taken apart at the end.
+    An eighth of a second of processor time is saved: garbage collection hardly visits imported modules, and they
+    are not torn down at the end.
     """
     gc.set_threshold(50_000, 20, 100)
     # NumPy's matrices are small here: its threads wait for each other, a tenth of all processor time.

@@ -1,1 +1,1 @@
-"""Where the cameras stand, and when they expose, from the people whom they see."""
+"""Calibration from people: poses of the cameras, and their time offsets."""

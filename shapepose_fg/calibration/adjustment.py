@@ -1,9 +1,9 @@
-"""The solver: poses and lenses of all cameras, and joints of the people they see, in one factor graph (GTSAM).
+"""Bundle adjustment: poses and lenses of all cameras, and joints of people, in one factor graph (GTSAM).
 
 A joint seen by a camera is `ProjectionFactorPPPC` between pose, joint and lens, with a robust kernel; its fourth
-variable, where the lens sits on the camera's body, is held at zero. (`GeneralSFMFactor2` takes joints behind a
-camera for ones without error, and prints that.) What is known of each camera beforehand is a prior on its pose and
-its lens.
+variable, the pose of the lens on the camera's body, is held at zero. (`GeneralSFMFactor2` treats joints behind a
+camera as ones without error, and prints that.) Prior knowledge about each camera is a prior on its pose and its
+lens.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,11 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
 
 TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
-"""Where a camera's parameters stand: rad and m along its own axes, log of the focal length, px, k1 k2 p1 p2."""
+"""Slices of a camera's parameters: rotation, rad, and translation, m, along its own axes; log of the focal
+length; principal point, px; k1 k2 p1 p2."""
 Q = 13
 _HELD = 1e-6
-"""Sigma of what must not change, as a part of what it would be."""
+"""Standard deviation of fixed parameters, rad or m."""
 _HELD_PX = 0.1
 """Standard deviation that is added to those of the intrinsics and of the lens, pixels; tighter constraints of
 single numbers would damp what they share."""
@@ -32,23 +33,24 @@ _ANYWHERE_M = 10.0
 _STEPS = 6
 _ENOUGH = 1e-4
 _PRIOR_WIDTH = 4.0
-"""Sigmas, of six numbers, at which a camera's prior gives way: one that was bumped must not pull the rig."""
+"""Standard deviations, of six parameters, at which the robust kernel of a camera's prior takes effect: a camera
+that was bumped must not pull the rig."""
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """How far each camera may be from what its file says, one sigma; 0 is not at all."""
+    """Prior standard deviations of the cameras' parameters from the values in their file; 0: fixed."""
 
     turn_deg: float = 1.0
-    """Any turn, degrees."""
+    """Rotation, degrees."""
     move_m: float = 0.02
-    """Any way, metres."""
+    """Translation, metres."""
     focal: float = 0.0
-    """Part of the focal length."""
+    """Focal length, as a share of it."""
     centre_px: float = 0.0
     """Principal point, each axis, pixels."""
     lens: float = 0.0
-    """Each of k1 k2 p1 p2."""
+    """Each of k1 k2 p1 p2, without unit."""
 
     @property
     def sigmas(self) -> Array:
@@ -59,17 +61,17 @@ class Freedom:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Cameras that fit the people, and how well they are known."""
+    """Adjusted cameras with covariances."""
 
     rig: Rig
-    """The cameras."""
+    """The adjusted cameras."""
     covariance: Array
     """(V, Q, V, Q) covariance of the cameras' parameters relative to the rig as a whole, whose place is that of
     the given rig."""
     people: People
-    """Their joints moved to where the cameras see them."""
+    """The people, with joints at their adjusted positions."""
     scale: float
-    """The detector's errors as a part of what was measured of detectors: robust, from the residuals."""
+    """Ratio of the detector's errors to those that were measured for detectors: robust, from the residuals."""
 
     def sigma(self, part: slice) -> Array:
         """(V,) standard deviation of some of the parameters together: root of their summed variances."""
@@ -87,14 +89,14 @@ def adjust(
     reference: int | None = None,
     scaled: bool = False,
 ) -> Adjusted:
-    """The cameras from `start` on, `given` beforehand to within `freedom`, adjusted to `people`.
+    """Adjust cameras to `people`, starting at `start`, with the prior `given` and its `freedom`.
 
-    The camera `reference` keeps its pose; without one the rig stays where it is as a whole, and `scaled` says that
-    its size is nothing that the covariance is of.
+    The camera `reference` keeps its pose; without one the mean pose of the rig is kept, and `scaled` leaves its
+    size out of the covariance.
 
-    `dilution` is how many of the errors of a detection, of joints and of frames, are one error: the priors are
-    weighed up by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies
-    the detections' sigmas.
+    `dilution` is the number of correlated errors of a detection, over joints and frames, that count as one: the
+    priors are strengthened by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale`
+    multiplies the detections' standard deviations.
     """
     free = freedom.lens > 0
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -150,7 +152,7 @@ def adjust(
 
 
 def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
-    """How large residuals are as against what sigmas (times `scale`) say, by their median: 1 as they should."""
+    """Ratio of the median residual to its expectation under the standard deviations (times `scale`): ideally 1."""
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
     away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
@@ -166,7 +168,7 @@ def _lens(camera: Camera, free: bool) -> gtsam.Cal3DS2 | gtsam.Cal3_S2:
 
 
 def _lens_columns(camera: Camera, free: bool) -> Array:
-    """(5 or 9, Q - 6) how fx fy s u v k1 k2 p1 p2 change with the parameters."""
+    """(5 or 9, Q - 6) derivatives of fx fy s u v k1 k2 p1 p2 by the parameters."""
     columns = np.zeros((9 if free else 5, Q - 6))
     columns[0, 0], columns[1, 0] = camera.K[0, 0], camera.K[1, 1]
     columns[3, 1] = columns[4, 2] = 1.0
@@ -182,7 +184,7 @@ def _lens_covariance(camera: Camera, sigmas: Array, free: bool) -> Array:
 
 
 def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Camera:
-    """The camera as it was found."""
+    """The adjusted camera."""
     wTc, lens = values.atPose3(X(view)).matrix(), values.atCal3DS2(C(view)) if free else values.atCal3_S2(C(view))
     K, distortion = lens.K(), camera.distortion.copy()
     if free:
@@ -199,7 +201,7 @@ def _information(
     rig: Rig,
     free: bool,
 ) -> Array:
-    """(V Q, V Q) what the people say of the cameras' parameters, their joints eliminated."""
+    """(V Q, V Q) information about the cameras' parameters, joints eliminated."""
     first, last = gtsam.Ordering(), gtsam.Ordering()
     for each in joints:
         first.push_back(each)

@@ -1,4 +1,4 @@
-"""Cameras as poses of pairs of them say: the spanning tree that most pairs agree with, then all pairs together."""
+"""Poses of all cameras from relative poses of pairs: the spanning tree with most agreement, then a pose graph."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,21 +15,22 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.setup_check.fit import difference
 
 _TREES = 100
-"""Spanning trees that are looked at: the best, and others drawn by how well pairs fit."""
+"""Number of spanning trees that are tried: the best, and random ones weighted by the scores of pairs."""
 _AGREE_DEG = 8.0
-"""Pairs' poses are off by 0.3 to 4 degrees where they are right, in simulated recordings and on Shelf."""
+"""Deviation within which a pair agrees, degrees: right pairs are off by 0.3 to 4 in simulated recordings and on
+Shelf."""
 _LEAST, _LENGTH = np.radians(0.3), 0.1
-"""How far a pair's turn and direction may be off at the least, one sigma; and its length, as a part of it."""
+"""Minimum standard deviation of a pair's rotation and direction, rad, and of its length, as a share."""
 
 
 @dataclass(frozen=True)
 class Edge:
-    """How one camera stands to another, in metres if people have the stature that they are taken to have."""
+    """The relative pose of two cameras, in metres if people have the assumed stature."""
 
     bTa: Array
     """(4, 4) the second camera's frame from the first's."""
     score: float
-    """How well what both saw fits (`Relative.score`)."""
+    """Score of the pair (`Relative.score`)."""
     covariance: Array
     """(6, 6) covariance of bTa as GTSAM's poses change, in the first camera's frame: rotation, rad, then
     translation, m."""
@@ -61,12 +62,12 @@ def arranged(edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
 
 
 def agreement(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> float:
-    """How well poses (V, 4, 4) are those of all pairs: the sum of the scores of pairs that agree."""
+    """Agreement of poses (V, 4, 4) with all pairs: the sum of the scores of agreeing pairs."""
     return float(sum(edge.score * _alike(poses, *pair, edge) for pair, edge in edges.items()))
 
 
 def _alike(poses: Array, a: int, b: int, edge: Edge) -> float:
-    """1 where a pair stands as its edge says, 0 where far from it."""
+    """Agreement of a pair's poses with its edge: 1 where they are equal, 0 where they are far apart."""
     bTa = np.linalg.solve(poses[b], poses[a])
     turn, _ = difference(bTa[:3], edge.bTa[:3])
     ways = [each[:3, 3] / np.linalg.norm(each[:3, 3]) for each in (bTa, edge.bTa)]
@@ -75,7 +76,7 @@ def _alike(poses: Array, a: int, b: int, edge: Edge) -> float:
 
 
 def _tree(order: list[tuple[int, int]], edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
-    """Poses along the edges that come first in `order` and close no ring."""
+    """Poses along the first edges in `order` that close no loop."""
     poses, found = np.tile(np.eye(4), (views, 1, 1)), {0}
     while len(found) < views:
         a, b = next(pair for pair in order if (pair[0] in found) != (pair[1] in found))
@@ -88,7 +89,7 @@ def _tree(order: list[tuple[int, int]], edges: Mapping[tuple[int, int], Edge], v
 
 
 def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
-    """The poses that fit all pairs best, by a graph of poses; pairs that are wrong give way (Cauchy)."""
+    """Poses that fit all pairs best, by a pose graph with a robust kernel (Cauchy)."""
     graph, values, kernel = gtsam.NonlinearFactorGraph(), gtsam.Values(), robust_kernel("cauchy")
     for view, pose in enumerate(poses):
         values.insert(X(view), gtsam.Pose3(pose))
@@ -101,7 +102,7 @@ def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
 
 
 def parts(pairs: Mapping[tuple[int, int], object], views: int) -> list[list[int]]:
-    """The cameras that are connected by `pairs`, part by part, the largest first."""
+    """The connected components of cameras under `pairs`, the largest first."""
     ends = np.array(list(pairs), dtype=np.intp).reshape(-1, 2).T
     count, part = connected_components(coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(views, views)))
     return sorted((np.flatnonzero(part == n).tolist() for n in range(count)), key=len, reverse=True)

@@ -1,7 +1,7 @@
-"""Where cameras of known lenses stand, from people who walk about, and nothing else.
+"""Estimates the poses of cameras with known lenses from walking people alone.
 
-Two cameras at a time (`relative`), all together (`arrangement`), then who is whom and where everything is in turns
-(`adjustment`), and at last metres, up and the floor (`levelling`). What people do not determine is refused.
+Pairs of cameras (`relative`), all cameras (`arrangement`), then association and bundle adjustment in turn
+(`adjustment`), and at last scale, up and the floor (`levelling`). An undetermined result is refused.
 """
 
 from collections.abc import Callable, Iterable
@@ -36,19 +36,20 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import Sightings
 
 _BURST_S, _BURSTS = 10.0, 6
-"""People are followed for so long, at so many places of the recording."""
+"""Duration of the intervals in which people are tracked, s, and their number, spread over the recording."""
 _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
-"""Frames of the first rounds; how many rounds there are of these, of all frames, and of each half of them."""
+"""Frames of the first rounds; number of these rounds, of rounds with all frames, and of rounds with each half
+of them."""
 _STILL_DEG = 0.03
-"""Cameras that turn by less from round to round have settled."""
+"""Rotation per round below which cameras have converged, degrees."""
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
-"""Pairs of cameras that fit worse, or have fewer person-seconds in common, say nothing of each other."""
+"""Minimum score of a pair of cameras, and minimum common person-seconds."""
 _LEAST_PEOPLE = 10
-"""People, one per frame, by whom cameras are adjusted at the least."""
+"""Minimum number of people, one per frame, from which a camera is adjusted."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
-"""A turn that is known worse than the first, or differs by more between halves of the recording, is not known."""
+"""Maximum standard deviation of a rotation, and maximum difference between halves of the recording, degrees."""
 _UNUSUAL = 3.0
-"""Sigmas of stature by which people are taken to be adults."""
+"""Standard deviations of stature within which people are assumed to be adults."""
 _FREE = Freedom(turn_deg=20.0, move_m=1.0)
 _FILM = (
     "film a minute of two or more people who walk through all that the cameras see, near and far, not on one line"
@@ -56,7 +57,7 @@ _FILM = (
 
 
 class Undetermined(ValueError):
-    """People do not determine the cameras: a sentence each that says which, why, and the cure."""
+    """People do not determine the cameras: a sentence each that names the cause and the cure."""
 
     def __init__(self, problems: tuple[str, ...], found: "Calibrated | None" = None):
         super().__init__("; ".join(problems))
@@ -65,28 +66,28 @@ class Undetermined(ValueError):
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Cameras that were found, and how well they are known."""
+    """Estimated cameras with their uncertainty."""
 
     adjusted: Adjusted
     """The cameras, people's places and covariances, in metres; z is up, the floor at 0."""
     world: World
-    """Its scale, up and floor."""
+    """Scale, up and floor of the rig."""
     apart_deg: Array
-    """(V,) by how much the turns of halves of the recording differ, each found without the other."""
+    """(V,) difference of rotations between halves of the recording, each estimated without the other, degrees."""
     apart_m: Array
     """(V,) distance between the places of each camera as halves of the recording give them, each without the
     other, metres."""
     held_out_px: float
-    """Median distance of a joint from where the other cameras put it, on halves that were not used."""
+    """Median distance of a joint from where the other cameras put it, on halves that were not used, pixels."""
     counts: Index
-    """(V,) people, one per frame, by whom each camera was placed."""
+    """(V,) number of people, one per frame, from which each camera was estimated."""
     explained: Array
-    """(V,) which part of the people that each saw another camera saw too."""
+    """(V,) share of the people seen by each camera that another camera sees too."""
     missed_px: Array
     """(N, V) distances of joints from where the other cameras put them, on halves that were not used, pixels;
     NaN where unknown."""
     notes: tuple[str, ...] = field(default=())
-    """What is weak, a sentence each."""
+    """Notes on what is weakly observed, a sentence each."""
 
     @property
     def rig(self) -> Rig:
@@ -94,7 +95,7 @@ class Calibrated:
         return self.adjusted.rig
 
     def as_dict(self) -> dict[str, Any]:
-        """All figures, as plain values."""
+        """All figures as plain values."""
         sigmas = {"turn_deg": np.degrees(self.adjusted.sigma(TURN)), "move_mm": 1e3 * self.adjusted.sigma(MOVE)}
         sigmas |= {"focal_percent": 100 * self.adjusted.sigma(FOCAL)}
         cameras = [
@@ -130,11 +131,12 @@ def calibrate(
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Rig | None = None,
 ) -> Calibrated:
-    """Where the cameras of `rig` stand, whose poses are not looked at, by the people whom `detections` show.
+    """Estimate the poses of the cameras of `rig`, whose own poses are ignored, from the people in `detections`.
 
-    `focal` is the part by which focal lengths may be off, one sigma; 0 leaves them. The scale is that of what
-    was `measured`, or of adults. Cameras that are about as in `start` are not sought. Undetermined where cameras
-    share too little, or motion does not tell; InputError where measured distances do not go together.
+    `focal` is the prior standard deviation of focal lengths, as a share; 0 keeps them. The scale comes from
+    `measured` distances, or from adults. Cameras that are about as in `start` are not searched. Undetermined where
+    cameras share too little, or motion does not determine them; InputError where measured distances contradict
+    each other.
     """
     measured = measured or Measured()
     views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
@@ -181,7 +183,7 @@ def calibrate(
 def _pairs(
     detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range, told: Callable[[], None]
 ) -> dict[tuple[int, int], Relative]:
-    """How cameras stand to each other, of pairs that tell."""
+    """Relative poses of pairs of cameras with sufficient evidence."""
     taken = times.frame_s[frames.start : frames.stop]
     lasts = float(taken[-1] - taken[0])
     fps = (len(taken) - 1) / max(lasts, 1e-6)
@@ -209,7 +211,7 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
 
 
 def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
-    """Which cameras share too little with the others, in words."""
+    """Cameras that share too little with the others, in words."""
     most = " ".join(rig.names[view] for view in connected[0])
     return [
         f"{_named(rig, part)}: too few people are seen at the same moments there and by {most}, or cameras are not"
@@ -219,7 +221,7 @@ def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
 
 
 def _named(rig: Rig, views: Iterable[int]) -> str:
-    """Some cameras, in words."""
+    """Names of some cameras, in words."""
     names = [rig.names[view] for view in views]
     return f"camera{'s' if len(names) > 1 else ''} {' '.join(names)}"
 
@@ -234,7 +236,7 @@ def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
 
 @dataclass(frozen=True)
 class _How:
-    """What rounds of adjusting have in common."""
+    """Arguments that all rounds of adjustment share."""
 
     given: Rig
     times: FrameTimes
@@ -244,7 +246,7 @@ class _How:
     told: Callable[[int], None]
 
     def settled(self, footage: Footage, now: Rig, rounds: int) -> Adjusted:
-        """Cameras from `now` on, in turns with who is whom, in metres."""
+        """Cameras after several rounds of association and adjustment, starting at `now`, in metres."""
         adjusted: Adjusted | None = None
         for step in range(rounds):
             people = footage.people(now)
@@ -284,7 +286,7 @@ def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
 
 
 def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, footage: Footage) -> Calibrated:
-    """The result, or what is wrong with it."""
+    """The result, or an error that says what is wrong with it."""
     rig, people = adjusted.rig, adjusted.people
     apart_deg, apart_m = _apart_by(*halves)
     counts = people.seen.any(axis=1).sum(axis=0)
@@ -310,7 +312,7 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
 
 
 def _apart_by(one: Rig, other: Rig) -> tuple[Array, Array]:
-    """(V,) degrees and metres between the cameras of two rigs, the one laid on the other by a similarity."""
+    """(V,) degrees and metres between the cameras of two rigs, after alignment by a similarity."""
     near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
     a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
     size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)

@@ -1,4 +1,6 @@
-"""Offsets of three cameras or more: where the others place a joint, and how it moves, against what each sees."""
+"""Time offsets of three or more cameras: a joint's place and motion from the others, compared with each
+camera's view.
+"""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -13,21 +15,23 @@ from shapepose_fg.setup_check.evidence import triangulate
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pairs, Sightings, centres_of
 
 _MOST_PLACED = 20_000
-"""Rows of tracks of all cameras that are placed in space."""
+"""Maximum number of rows of tracks that are triangulated, over all cameras."""
 _LEAST_MISS = 0.004
-"""No detector misses by less than this part of a person's size: 7 mm."""
+"""Minimum error of a detector as a share of a person's size: 7 mm."""
 _REWEIGHED = 10
 _NUDGE = 0.25
-"""Frames by which a clock is moved to see what that changes: more than the errors that are looked for."""
+"""Shift of a clock for numerical derivatives, frames: more than the errors to be found."""
 _LEAST_OTHERS = 0.2
-"""What all other blocks weigh at the least when one is judged."""
+"""Minimum weight of all other blocks when one is weighted."""
 _FASTEST = 2.5
-"""Statures a second: joints that move faster have changed their person."""
+"""Maximum speed of a joint, statures per second: faster ones have changed their person."""
 
 
 @dataclass(frozen=True)
 class InSpace:
-    """People in space, and their tracks: offsets are those at which each camera sees what the others place."""
+    """People in space, and their tracks: offsets are those at which each camera sees what the others
+    triangulate.
+    """
 
     tracks: list[Tracks]
     """Tracks of each camera."""
@@ -42,12 +46,12 @@ class InSpace:
     step: int
     """Frames from one time to the next."""
     fps: float
-    """Frames a second."""
+    """Frame rate, Hz."""
 
     @classmethod
     def of(cls, pairwise: Pairwise) -> "InSpace":
-        """People at times one after the other, as many as pay; tracks that most others of the person are not are
-        left out: two who dance are nearer to each other than what a camera sees of one may be.
+        """People at consecutive times, as many as are useful. Tracks that contradict most others of the person
+        are left out, because two dancers may be nearer to each other than a camera's error.
         """
         tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))
@@ -72,7 +76,7 @@ class InSpace:
         xy, whose = np.concatenate(xy), np.concatenate(track)
         seen = Sightings(np.concatenate(time), np.concatenate(view), xy, np.isfinite(xy[..., 0]).astype(float))
         enough = np.isfinite(xy[..., 0]).sum(axis=1) >= MIN_JOINTS
-        seen, whose = seen.only(enough), whose[enough]
+        seen, whose = seen.rows(enough), whose[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
         member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
         agree = np.zeros(member.shape)
@@ -87,7 +91,9 @@ class InSpace:
         return cls(tracks, views, shift, times[groups.frame[many]], member[many], step, fps)
 
     def settled(self) -> tuple[Array, Array]:
-        """(V,) shifts in frames and their covariance (V, V) as against the first camera; infinite for unknown."""
+        """(V,) shifts in frames and their covariance (V, V) relative to the first camera; infinite where
+        unknown.
+        """
         V, shift = len(self.tracks), self.shift.copy()
         late, errors = self.all_late(shift)
         shift -= late - late.mean()
@@ -122,7 +128,9 @@ class InSpace:
         return np.stack(rays, axis=2), np.stack(speed, axis=2), np.stack(xy, axis=2), np.stack(size, axis=1)
 
     def _moving(self, points: Array, speed: Array) -> Array:
-        """(P, J, 3) metres a frame of joints at `points`, from how directions to them change (P, J, V, 3)."""
+        """(P, J, 3) velocities of joints at `points`, metres per frame, from the changes of directions to them
+        (P, J, V, 3).
+        """
         away = points[:, :, None] - centres_of(self.views)
         far = np.linalg.norm(away, axis=-1)[..., None]
         across = (np.eye(3) - (away / far)[..., :, None] * (away / far)[..., None, :]) / far[..., None] ** 2
@@ -134,10 +142,10 @@ class InSpace:
         return np.where(enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan)
 
     def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, Array]:
-        """By how many frames one camera's clock is off against what the others place.
+        """Delay of one camera's clock relative to the others' triangulation, frames; and the contributions of B
+        blocks (B,).
 
-        And what each of B blocks of time adds to that in error (B,): its square sums to the variance. Infinite
-        where nothing is known.
+        The squares of the contributions sum to the variance. Infinite where nothing is known.
         """
         block = block_frames(self.fps, float(np.ptp(self.time)))
         blocks = int(np.ptp(self.time) // block) + 1
@@ -208,7 +216,7 @@ class InSpace:
 
 
 def _across(points: Array, moving: Array, centre: Array) -> Array:
-    """(..., 3) how directions from `centre` to points change that move so."""
+    """(..., 3) change of the directions from `centre` to points that move with `moving`."""
     away = points - centre
     far = np.linalg.norm(away, axis=-1, keepdims=True)
     return (moving - (moving * away).sum(axis=-1, keepdims=True) * away / far**2) / far

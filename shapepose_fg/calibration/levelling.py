@@ -1,4 +1,4 @@
-"""A rig without a world gets one: metres from people's stature, up from who stands, the floor at 0."""
+"""Gives a rig a world: scale from people's stature, up from standing people, the floor at 0."""
 
 from dataclasses import dataclass
 
@@ -15,31 +15,31 @@ from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.findings import ADULT_M as ADULT_M
 
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
-"""One sigma of the scale by `build_of`, as parts of it: what bones vary by among adults, and among people of a
-known stature; what a detector's joints, and where in the world people are from, are off by for all of them."""
+"""Standard deviations of the scale from `build_of`, as shares of it: of bones among adults, and among people of
+a known stature; and the error that all people share, from the detector and their origin."""
 _TAPE_M = 0.02
-"""One sigma of a distance between lenses as it is measured with a tape."""
+"""Standard deviation of a distance between lenses that was measured with a tape, m."""
 _CONTRADICTS = 4.0
-"""Sigmas by which no measurement is off."""
+"""Number of standard deviations from which on measurements contradict each other."""
 _LEAN_RAD = np.radians(3.0)
-"""How far people's mean trunk leans: from it the floor is sought."""
+"""Largest lean of people's mean trunk, from which the floor is searched, rad."""
 _ANKLE_M = 0.10
-"""Ankles of who stands are so far above the floor."""
+"""Height of a standing person's ankles above the floor, m."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What says how large the rig is: distances between cameras, or people's stature, or that they are adults."""
+    """Prior on the size of the rig: distances between cameras, or people's stature, or that they are adults."""
 
     stature_m: float | None = None
     """People's median stature; None for adults'."""
     distances: tuple[tuple[int, int, float], ...] = ()
-    """Two cameras, and metres between their lenses; these decide where there are any."""
+    """Pairs of cameras, and metres between their lenses; these determine the scale where there are any."""
 
     def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
-        """By how much the distances say that the cameras are too near each other, a factor, and its sigma.
+        """Factor by which the distances scale the cameras, and its standard deviation.
 
-        InputError where distances do not go together.
+        InputError where distances contradict each other.
         """
         rig, V = adjusted.rig, len(adjusted.rig)
         length, metres = np.empty(len(self.distances)), np.array([each for *_, each in self.distances])
@@ -66,23 +66,23 @@ class Measured:
 
 @dataclass(frozen=True)
 class World:
-    """How a rig was laid on the floor."""
+    """Scale, up and floor of a levelled rig."""
 
     sigma_scale: float
     """Standard deviation of the scale, as a share of the scale."""
     stature_m: float
     """Median stature of the people, metres, at this scale."""
     persons: int
-    """People, as many as were seen at a time."""
+    """Number of people who were seen at a time."""
     floor: Floor | None
-    """What ankles say, in the frame before; None where they stand on nothing level."""
+    """Floor under the ankles, in the frame before; None where they are on no level plane."""
     upright: float
-    """How alike people stand: the length of their trunks' mean direction, 1 at the most."""
+    """Agreement of people's upright directions: the length of their trunks' mean direction, 1 at most."""
 
 
 def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
-    """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if
-    nobody's bones are seen.
+    """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if no
+    bones are seen.
     """
     return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
 
@@ -95,13 +95,15 @@ def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
 
 
 def at_once(people: People) -> int:
-    """How many people were seen at a time, in all but the fullest tenth."""
+    """Number of people who were seen at a time, in all but the fullest tenth of the frames."""
     _, counts = np.unique(people.frame, return_counts=True)
     return int(np.percentile(counts, 90)) if len(counts) > 0 else 0
 
 
 def sigma_of_scale(persons: int, known: bool) -> float:
-    """One sigma of the scale, a part of it, from the bones of so many people, their stature `known` or not."""
+    """Standard deviation of the scale, as a share of it, from the bones of this many people, of `known` stature
+    or not.
+    """
     return float(np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON))
 
 

@@ -13,14 +13,14 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
 
 _GATE = 0.06
-"""Tracks whose rays miss each other by more than this part of the person's size are not one person."""
+"""Largest distance between the rays of two tracks of one person, as a share of the person's size."""
 _MOST_SAMPLES = 3000
 """Maximum number of frames of tracks that are compared for a pair of cameras."""
 
 
 @dataclass(frozen=True)
 class Pairwise:
-    """Tracks of all cameras, and what is thought of their clocks."""
+    """Tracks of all cameras, and the current estimate of their clocks."""
 
     tracks: list[Tracks]
     """Tracks of each camera."""
@@ -29,10 +29,10 @@ class Pairwise:
     shift: Array
     """(V,) frames: frame f of the first camera is frame f + shift of another."""
     fps: float
-    """Frames a second."""
+    """Frame rate, Hz."""
 
     def same(self, a: int, b: int, gate: float = _GATE) -> list[tuple[int, int]]:
-        """Tracks of camera a and of camera b that are one person, over all the time that both last."""
+        """Pairs of tracks of cameras a and b that are one person over all the time that both have."""
         one, other, apart = self.tracks[a], self.tracks[b], self.shift[b] - self.shift[a]
         stride = max(1, round(0.1 * self.fps))
         rows = np.arange(0, len(one.frame), stride)
@@ -73,7 +73,9 @@ class Pairwise:
         return every[::thin], tracks[::thin]
 
     def miss(self, a: int, b: int, rows: Index, track: Index, apart: float) -> tuple[Array, Array]:
-        """(N, J) by how much camera b's rays, `apart` frames later, miss those of `rows`; its change a frame."""
+        """(N, J) distance between camera b's rays, `apart` frames later, and those of `rows`; and its change
+        per frame.
+        """
         one, other = self.tracks[a], self.tracks[b]
         rays, speed, size = other.at(track, np.asarray(one.frame[rows] + apart, dtype=np.float64))
         normal = normals(one.rays[rows], self.views, a, b)
@@ -152,7 +154,9 @@ class Pairwise:
 
 
 def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
-    """Values (N, J) less their means over the time around, track by track: errors that last are in these."""
+    """Values (N, J) minus their means over the time around, track by track: correlated errors are in these
+    means.
+    """
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
     for start, stop in zip([0, *edges], [*edges, len(one)], strict=True):
@@ -163,7 +167,7 @@ def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, 
 
 
 def without_means(values: Array, known: Mask, width: float) -> Array:
-    """Values (T, ...) less the means of those that are `known` over the time around: `width` steps, one sigma."""
+    """Values (T, ...) minus the means of the `known` ones over the time around: `width` steps, one sigma."""
     weight = gaussian_filter1d(known.astype(np.float64), width, axis=0, mode="constant")
     mean = gaussian_filter1d(np.where(known, values, 0.0), width, axis=0, mode="constant")
     return values - mean / np.maximum(weight, 1e-9)

@@ -1,4 +1,4 @@
-"""The people by whom cameras are adjusted: seen by several cameras at frames that are apart in time."""
+"""The people from which cameras are adjusted: seen by several cameras, in frames that are apart in time."""
 
 from dataclasses import dataclass, replace
 
@@ -14,13 +14,14 @@ from shapepose_fg.setup_check.evidence import observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
 _LEAST_STEP_S = 0.1
-"""Frames nearer than this show the same errors of the detector: their correlation is 0.8."""
+"""Minimum time between used frames, s: nearer ones have correlated errors of the detector (0.8)."""
 _MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
-"""More of either cost time, and what they tell has been told: errors of one second are one error by a third."""
+"""Maximum number of sightings; more of them, or of frames, cost time and add little, because errors within a
+second are correlated."""
 _MIN_DEPTH_M = 0.3
 _WEAKEST_M = 0.15
-"""A joint that is known worse than this, in its worst direction, says nothing of cameras."""
+"""Largest standard deviation of a joint in its worst direction with which it is used, m."""
 _NOISE = ObservationConfig()
 
 
@@ -47,22 +48,22 @@ class People:
         return np.asarray(np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1]))
 
     def only(self, keep: Mask) -> "People":
-        """Some of the people."""
+        """The people of a mask `keep` (P,)."""
         return People(self.frame[keep], self.xy[keep], self.sigma_px[keep], self.points[keep])
 
 
 @dataclass(frozen=True)
 class Footage:
-    """What the cameras saw at the frames that are used."""
+    """The sightings of the cameras in the frames that are used."""
 
     sightings: Sightings
-    """The people of single cameras, in pixels as the lens gives them."""
+    """The people of single cameras, in distorted pixels."""
     joints: tuple[str, ...]
     """(J,) names of the joints."""
 
     @classmethod
     def of(cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range) -> "Footage":
-        """At frames spread over the recording, as many as tell something new."""
+        """Sightings in frames spread over the recording, as many as add information."""
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])
         count = max(2, min(_MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
@@ -70,7 +71,7 @@ class Footage:
         chosen = frames.start + np.unique(wanted)
         sightings = seen_at(detections, chosen.tolist())
         thin = -(-len(sightings) // _MOST_SIGHTINGS)
-        sightings = sightings.only(np.isin(sightings.frame, chosen[::thin]))
+        sightings = sightings.rows(np.isin(sightings.frame, chosen[::thin]))
         xy = sightings.xy.copy()
         for view, camera in enumerate(rig.cameras):
             here = sightings.view == view
@@ -79,8 +80,8 @@ class Footage:
         return cls(replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core))
 
     def at(self, frames: Index) -> "Footage":
-        """Some of the frames."""
-        return replace(self, sightings=self.sightings.only(np.isin(self.sightings.frame, frames)))
+        """The sightings in some of the frames."""
+        return replace(self, sightings=self.sightings.rows(np.isin(self.sightings.frame, frames)))
 
     def undistorted(self, rig: Rig) -> Sightings:
         """The sightings under the lenses of `rig`."""
@@ -91,7 +92,7 @@ class Footage:
         return replace(self.sightings, xy=xy)
 
     def people(self, rig: Rig) -> People:
-        """Who is whom in other cameras, as the cameras `rig` have it, and where everybody is."""
+        """Associate people between the cameras `rig`, and triangulate them."""
         sightings, views = self.undistorted(rig), Views.of(rig)
         groups = Pairs.of(sightings, views).groups(len(sightings), tuple(range(len(rig))))
         xy, confidence, size = observed(groups, sightings)
@@ -106,7 +107,9 @@ class Footage:
 
 
 def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
-    """(P, J) which points are known in all directions from views that know them across their rays by `sigma_m`."""
+    """(P, J) which points are well determined in all directions, if views determine them across their rays by
+    `sigma_m`.
+    """
     rays = points[:, :, None] - rig.centres
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
@@ -115,9 +118,9 @@ def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
 
 
 def missed_px(people: People, rig: Rig) -> Array:
-    """(P, J, V) how far each detection is from where the *other* cameras alone put the joint, pixels.
+    """(P, J, V) distance of each detection from where the *other* cameras alone put the joint, pixels.
 
-    NaN where fewer than two others see it. Of two cameras alone: from where both put it.
+    NaN where fewer than two others see it. With only two cameras: from where both put it.
     """
     missed = np.full(people.sigma_px.shape, np.nan)
     weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)

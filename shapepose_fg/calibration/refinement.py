@@ -1,4 +1,6 @@
-"""Better cameras from the people of a recording: who is whom and where cameras are, in turns; tried elsewhere."""
+"""Refines cameras with the people of a recording: association and adjustment in turn; validated on held-out
+frames.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -11,68 +13,70 @@ from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN,
 from shapepose_fg.calibration.levelling import scaled
 from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.setup_check.diagnosis import Diagnosis, build_of, diagnose
-from shapepose_fg.setup_check.findings import SURE, Kind
+from shapepose_fg.setup_check.diagnosis import build_of, put_right
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.small import Problem
 
 _ROUNDS = 4
-"""Times that people are grouped anew under the cameras of the round before."""
+"""Number of times that people are associated again with the cameras of the round before."""
 _LEAST_PEOPLE = 10
-"""People, one per frame, by whom a camera is adjusted at the least."""
+"""Minimum number of people, one per frame, from which a camera is adjusted."""
 _SAME_PERSON = 2.5
-"""Joints of one person in one view err together: what so many say is one."""
+"""Number of joints of one person in one view whose correlated errors count as one independent error."""
 _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
-"""Shares of a detector's errors, and how long each lasts, seconds: measured on simulated recordings, whose
-detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
+"""Shares of a detector's errors, and their time constants, s: measured on simulated recordings, whose detector
+has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
 _UNKNOWN = 0.8
-"""A parameter whose sigma is still this part of what it was beforehand is not determined."""
+"""Ratio of posterior to prior standard deviation above which a parameter is not determined."""
 
 _BUMPED_DEG = 2.5
-"""A camera that is turned by more was bumped: what is said of it beforehand is not where it stands."""
+"""Rotation above which a camera was bumped, degrees: its prior is then centred on the pose at which it sees the
+others' people."""
 
 PARTS = {"turn": TURN, "move": MOVE, "focal": FOCAL, "centre": CENTRE, "lens": LENS}
-"""What of a camera may change."""
+"""Parameters of a camera that may change."""
 _UNITS = {"turn": float(np.degrees(1)), "move": 1e3, "focal": 100.0, "centre": 1.0}
-"""Degrees, millimetres, percent and pixels."""
+"""Factors to degrees, millimetres, percent and pixels."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What became of a rig."""
+    """The result of refining a rig."""
 
     given: Rig
-    """As the user has it."""
+    """The cameras of the user."""
     adjusted: Adjusted
-    """As the people have it."""
+    """The cameras adjusted to the people."""
     freedom: Freedom
-    """How far the cameras might be off."""
+    """Prior standard deviations of the cameras' parameters."""
     before_px: float
     """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
-    used; given cameras."""
+    used, pixels; given cameras."""
     after_px: float
     """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
-    used; cameras refined on the other half of the recording."""
+    used, pixels; cameras refined on the other half of the recording."""
     counts: Index
-    """(V,) people, one per frame, by whom each camera was adjusted."""
+    """(V,) number of people, one per frame, from which each camera was adjusted."""
     notes: tuple[str, ...] = field(default=())
-    """What motion does not determine, a sentence each."""
+    """Notes on what motion does not determine, a sentence each."""
     missed_px: tuple[Array, Array] = (np.zeros((0, 1)), np.zeros((0, 1)))
     """(N, V) how far detections on frames that were not used are from where the other cameras put the joint, with
     the given cameras and the refined; NaN where unknown.
     """
     stature_m: float = float("nan")
-    """Median of the people's statures as their bones say, in the adjusted cameras' metres."""
+    """Median of the people's statures from their bones, in the adjusted cameras' metres."""
     probability: float = 1.0
-    """That the given cameras are off, and not only the detector biased, which frames of the same people share."""
+    """Probability that the given cameras are off, instead of a bias of the detector, which frames of the same
+    people share."""
 
     @property
     def better(self) -> bool:
-        """Whether the refined cameras fit people better whom they were not refined by, and no bias explains it."""
+        """Whether the refined cameras fit held-out people better, and no bias explains it."""
         return self.after_px < self.before_px and self.probability > SURE
 
     @property
@@ -85,7 +89,9 @@ class Refinement:
         return scaled(self.rig, stature_m / self.stature_m, self.rig.centres.mean(axis=0))
 
     def change(self) -> dict[str, Array]:
-        """(V,) how far each camera was adjusted: turn in degrees, move in mm, focal in %, centre in pixels."""
+        """(V,) change of each camera: rotation in degrees, translation in mm, focal length in %, principal
+        point in pixels.
+        """
         turn, move, focal, centre = [], [], [], []
         for old, new in zip(self.given.cameras, self.adjusted.rig.cameras, strict=True):
             angle, way = difference(old.cTw, new.cTw)
@@ -101,7 +107,7 @@ class Refinement:
         return each
 
     def as_dict(self) -> dict[str, Any]:
-        """All figures, as plain values."""
+        """All figures as plain values."""
         change, sigma = self.change(), self.sigma()
         cameras = [
             {
@@ -131,13 +137,13 @@ def refine(
     reference: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Refinement:
-    """Refine the cameras of `rig`, which may be off by about `freedom`, by the people whom `detections` show.
+    """Refine the cameras of `rig`, with prior standard deviations `freedom`, from the people in `detections`.
 
-    The scale is that of the cameras' places beforehand. InputError where hardly anybody is seen by two cameras.
+    The scale is that of the given cameras' places. InputError where hardly anybody is seen by two cameras.
     """
     freedom = Freedom() if freedom is None else freedom
-    diagnosis = diagnose(detections, rig, frames)
-    footage, start = Footage.of(detections, rig, times, frames), _found_again(diagnosis, rig)
+    given, right, findings = put_right(detections, rig, frames)
+    footage, start = Footage.of(detections, rig, times, frames), _found_again(findings, right.views, rig)
     taken = np.unique(footage.sightings.frame)
     halves = np.array_split(taken, 2)
     spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
@@ -167,15 +173,15 @@ def refine(
     sure = 1.0
     if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
         order = [*range(6), 7, 8, 6]  # in which the check has the parameters
-        sure = Problem.of(diagnosis.look).off(freedom.sigmas[order], reference)
+        sure = Problem.of(given).off(freedom.sigmas[order], reference)
     return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature, sure)
 
 
-def _found_again(diagnosis: Diagnosis, rig: Rig) -> Rig:
-    """The rig with cameras that look somewhere else, by degrees, turned to where they see the others' people."""
+def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
+    """The rig with cameras that point elsewhere, by degrees, rotated to where they see the others' people."""
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
-    turned = {view for each in diagnosis.findings if each.kind in kinds for view in each.cameras}
-    cameras, found = list(rig.cameras), diagnosis.corrected.views
+    turned = {view for each in findings if each.kind in kinds for view in each.cameras}
+    cameras = list(rig.cameras)
     for view in turned:
         camera = rig.cameras[view]
         right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # hardly told from a turn
@@ -195,7 +201,7 @@ def _fitted(
     reference: int | None,
     told: Callable[[int], None],
 ) -> Adjusted:
-    """The cameras by the people of some frames."""
+    """The cameras adjusted to the people of some frames."""
     rig_now, adjusted = rig, None
     for step in range(_ROUNDS):
         people = footage.people(rig_now)
@@ -214,14 +220,16 @@ def _fitted(
 
 
 def dilution(time_s: Array) -> float:
-    """How many errors of a detection are one, at frames taken at `time_s` (T,): over time, and over joints."""
+    """Number of correlated errors of a detection that count as one, in frames at `time_s` (T,): over time and
+    joints.
+    """
     apart = np.abs(time_s[:, None] - time_s)
     alike = sum(share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS)
     return float(_SAME_PERSON * np.sum(alike) / len(time_s))
 
 
 def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[str]:
-    """What the people do not tell, in words."""
+    """Parameters that the people do not determine, in words."""
     prior = {name: float(np.sqrt((freedom.sigmas[part] ** 2).sum())) for name, part in PARTS.items()}
     words = {
         "turn": "which way it looks",

@@ -1,8 +1,8 @@
-"""How two cameras stand to each other, from tracks of people whose identity in the other picture is unknown.
+"""Relative poses of two cameras, from tracks of people whose identity in the other picture is unknown.
 
 Any track of one camera may be the person of any track of the other at the same time: each such pair gives an
-essential matrix, and what most tracks agree with, over all frames, is taken (RANSAC over tracks; Nistér 2004 for
-five joints in one track).
+essential matrix, and the one with which most tracks agree, over all frames, is taken (RANSAC over tracks; Nistér
+2004 for five joints in one track).
 """
 
 from dataclasses import dataclass
@@ -19,24 +19,25 @@ from shapepose_fg.core.decompositions import basis_across
 from shapepose_fg.setup_check.matching import MIN_JOINTS
 
 _LOOK_S = 0.2
-"""Between frames that are compared: people's joints move by more than a detector errs."""
+"""Interval between compared frames, s: people's joints move by more than a detector's error."""
 _MOST_LOOKS = 80
-"""Frames of a recording by which guesses are scored."""
+"""Maximum number of frames by which hypotheses are scored."""
 _MOST_TRIED = 30
-"""Pairs of tracks from which poses are guessed; those longest in common."""
+"""Maximum number of pairs of tracks from which hypotheses are made; those with the longest common time."""
 _JOINTS_A_TRY = 240
 _LEAST_TRY = 60
-"""Joints of a pair of tracks from which a pose is guessed, at most and at least."""
+"""Maximum and minimum number of joints of a pair of tracks from which a hypothesis is made."""
 _RANSAC = 0.02
-"""Joints that miss by less than this part of a person's size agree: a detector errs by 3 cm of 170."""
+"""Largest residual of an inlier, as a share of a person's size: a detector errs by 3 cm of 170."""
 _GATE = 0.06
-"""Tracks whose joints miss by more, in the mean, are not one person."""
+"""Largest mean residual of tracks of one person, as a share of the person's size."""
 _CLIP = 0.15
-"""A joint misses by no more: that of somebody else."""
+"""Maximum of a joint's residual in the mean; larger ones are of other people."""
 _SAMPLES = 60
-"""Sets of five joints that are tried of each; of a person's joints two thirds agree, in simulated recordings."""
+"""Number of samples of five joints per pair of tracks; two thirds of a person's joints are inliers in simulated
+recordings."""
 _FINALISTS = 6
-"""Guesses that are refined."""
+"""Number of hypotheses that are refined."""
 _STEPS = 8
 _DILUTION = 25.0
 """Number of correlated errors of joints that count as one independent error: those of a person in one frame,
@@ -45,14 +46,15 @@ and in frames that are near each other."""
 
 @dataclass(frozen=True)
 class Relative:
-    """Where one camera stands as seen from another: x_b = R x_a + t."""
+    """The relative pose of two cameras: x_b = R x_a + t."""
 
     R: Array
     """(3, 3) rotation."""
     t: Array
     """(3,) direction of the translation, of length one."""
     score: float
-    """How much of what both saw at a time is matched, and how well: 1 if all is without error, 0 if nothing."""
+    """Share of the common sightings that are matched, weighted by their residuals: 1 for all without error, 0
+    for none."""
     seconds: float
     """Person-seconds that are matched."""
     covariance: Array
@@ -62,7 +64,7 @@ class Relative:
 
 
 class _Together:
-    """What two cameras saw at the same moments: N pairs of rows, K pairs of tracks."""
+    """Sightings of two cameras in the same frames: N pairs of rows, K pairs of tracks."""
 
     def __init__(self, one: Tracks, other: Tracks, looks: Index) -> None:
         rows = [_rows(each, looks) for each in (one, other)]
@@ -78,14 +80,14 @@ class _Together:
         self.alike = _at_once(rows[0]), _at_once(rows[1])
 
     def misses(self, E: Array) -> Array:
-        """(H, K) by how much tracks miss each other under essential matrices (H, 3, 3), parts of people's size."""
+        """(H, K) residuals of pairs of tracks under essential matrices (H, 3, 3), as shares of people's size."""
         total, count = (np.zeros((len(E), len(self.tracks))) for _ in range(2))
         _misses(*self.rays, *self.size, self.rows, self.pair, np.ascontiguousarray(E), total, count)
         enough = count >= 0.5 * self.count
         return np.where(enough & (count > 0), total / np.maximum(count, 1), _CLIP)
 
     def chosen(self, miss: Array) -> tuple[Mask, float]:
-        """Which pairs of tracks (K,) are one person each, the best first, and what that is worth."""
+        """Which pairs of tracks (K,) are one person each, greedily by residual, and their total score."""
         worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
         order = np.argsort(-worth, kind="stable")
         kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
@@ -103,8 +105,8 @@ class _Together:
 
 
 def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
-    """How the camera of `other` stands to that of `one`, whose rays are in their own frames; None where too few
-    people are seen by both at a time, or nothing agrees.
+    """Relative pose of the camera of `other` to that of `one`, whose rays are in their own frames; None where
+    too few people are seen by both at a time, or no pose fits.
     """
     frames = np.intersect1d(one.frame, other.frame)
     if len(frames) == 0:
@@ -149,7 +151,7 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
 
 
 def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | None:
-    """The pose of a guess, refined by all tracks that agree with it, in turns."""
+    """The pose of a hypothesis, refined in turn with the set of tracks that agree with it."""
     kept, score = seen.chosen(seen.misses(E[None])[0])
     best: Relative | None = None
     for _ in range(4):
@@ -178,7 +180,9 @@ def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
-    """Where rays (N, J, 3) of two cameras meet, in the frame of the first, and which in front of both."""
+    """Intersections of rays (N, J, 3) of two cameras, in the frame of the first, and which are in front of
+    both.
+    """
     back, centre = b @ R, -R.T @ t
     cosine, along_a, along_b = (a * back).sum(axis=-1), a @ centre, back @ centre
     sine2 = np.maximum(1 - cosine**2, 1e-6)
@@ -187,8 +191,8 @@ def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
 
 
 def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array, Array]:
-    """The pose by which rays a, b (N, J, 3) of people of `size` (N,) rad are nearest to planes (Sampson, Cauchy),
-    and its covariance as `Relative` has it.
+    """The pose with the least Sampson residuals (Cauchy) of rays a, b (N, J, 3) of people of `size` (N,) rad,
+    and its covariance as in `Relative`.
     """
     known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
     size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
@@ -227,14 +231,14 @@ def _crossed(a: Array, b: Array) -> Array:
 
 
 def _rows(tracks: Tracks, looks: Index) -> Index:
-    """(K, F) the row of each track at each frame that is looked at, -1 where it is not there."""
+    """(K, F) the row of each track at each compared frame, -1 where it has none."""
     begins = tracks.frame[tracks.first]
     there = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
     return np.where(there, tracks.first[:, None] + looks - begins[:, None], -1)
 
 
 def _at_once(rows: Index) -> Mask:
-    """(K, K) which tracks are there at the same time, another person each."""
+    """(K, K) which tracks overlap in time, so that they are different people."""
     there = (rows >= 0).astype(np.float64)
     return np.asarray(there @ there.T > 0)
 

@@ -1,8 +1,8 @@
-"""Offsets of cameras that stand nobody knows where: joints rise and fall at the same times in all of them.
+"""Time offsets of cameras with unknown poses: joints rise and fall at the same times in all of them.
 
-Each track of one camera may be the person of any track of the other: how fast their joints rise, as parts of the
-people's size, is correlated at all offsets, and what is improbable by chance is summed. People who walk or dance
-repeat themselves: of the offsets that stand out those are taken at which one pose of the cameras fits.
+Each track of one camera may be the person of any track of the other: the vertical speeds of their joints, relative
+to the people's size, are correlated at all offsets, and improbable correlations are summed. People who walk or
+dance repeat themselves: among the best offsets, those are chosen at which one pose of the cameras fits.
 """
 
 from collections.abc import Callable
@@ -19,24 +19,26 @@ from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index
 
 _STEP_S = 0.04
-"""Between frames that are compared."""
+"""Interval between compared frames, s."""
 _FASTEST = 2.0
-"""Statures a second: joints that rise faster have changed their person."""
+"""Maximum speed of a rising joint, statures per second: faster ones have changed their person."""
 _BRISK_S = 0.5
-"""What lasts longer is taken out: who walks towards one camera, and sinks in its picture, rises in another's."""
+"""Duration above which changes are removed, s: a person who walks towards one camera sinks in its picture and
+rises in another's."""
 _LEAST_S = 1.0
-"""Seconds that two tracks must have in common."""
+"""Minimum common duration of two tracks, s."""
 _AROUND_S = 0.3
-"""Offsets that are nearer than this to each other are one answer."""
+"""Distance below which two offsets are the same, s."""
 _LEAST_ALIKE = 0.1
-"""Correlations below are those of strangers."""
+"""Minimum correlation that counts: that of different people is below."""
 _PEAKS, _PAIRS = 8, 3
-"""Offsets of two cameras, or groups of cameras, that are looked at; and by so many pairs of these."""
+"""Number of offsets per pair of cameras, or of groups of cameras, that are tested, and number of pairs that
+test them."""
 _SURE = 2.0
-"""Offsets are right that stand out so far, times how well one pose fits (`Relative.score`): wrong ones stay below
-1.6, four in five right ones are above, on Shelf and simulated."""
+"""Minimum of an offset's prominence times the score of the pose that fits (`Relative.score`): wrong ones stay
+below 1.6, four in five right ones are above, on Shelf and simulated."""
 _FITS_S = 5.0
-"""Person-seconds below which a fit counts for less."""
+"""Person-seconds below which a fit has a lower weight."""
 
 
 def offsets_without_poses(
@@ -44,8 +46,8 @@ def offsets_without_poses(
 ) -> Array:
     """(V,) shifts in frames: frame f of the first camera is frame f + shift of another, to a few frames.
 
-    `tracks` are in their cameras' own frames, y down. Cameras were started up to `most_s` apart. Those that are
-    surest of each other come together first, one or several at a time.
+    `tracks` are in their cameras' own frames, y down. Cameras were started up to `most_s` apart. The cameras with
+    the most prominent offset are joined first, one or several at a time.
     """
     step = max(1, round(_STEP_S * fps))
     parts = [_rises(each, step, fps) for each in tracks]
@@ -60,7 +62,7 @@ def offsets_without_poses(
     fits = dict[tuple[int, int, int], float]()
 
     def fit(a: int, b: int, apart: int) -> float:
-        """How well two cameras see the same people, one so many steps later."""
+        """Score of the same people in two cameras, one of them `apart` steps later."""
         if (a, b, apart) not in fits:
             moved = replace(tracks[b], frame=tracks[b].frame - apart * step)
             found = relative(tracks[a], moved, fps)
@@ -93,7 +95,7 @@ def offsets_without_poses(
 def _peaks(
     one: dict[int, int], other: dict[int, int], curves: dict[tuple[int, int], Array], most: int, around: int
 ) -> list[tuple[float, int]]:
-    """Offsets between two groups of cameras that stand out, and how far, the best first."""
+    """Offsets between two groups of cameras with their prominence, the best first."""
     total = np.zeros(2 * most + 1)
     for a, b in product(one, other):
         moved = np.arange(-most, most + 1) + other[b] - one[a]
@@ -111,7 +113,7 @@ def _peaks(
 
 
 class _Rises(NamedTuple):
-    """How fast the joints of one camera's tracks rise."""
+    """Vertical speeds of the joints of one camera's tracks."""
 
     values: list[Array]
     """Speeds (N, J) of each track, in parts of the person's size a frame; 0 where unknown."""
@@ -120,7 +122,7 @@ class _Rises(NamedTuple):
 
 
 def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
-    """How joints rise, one sample every `step` frames."""
+    """Vertical speeds of joints, one sample every `step` frames."""
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
     known = np.abs(values) < _FASTEST / fps  # nor NaN
     (values,) = fast_part((np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps)

@@ -1,7 +1,7 @@
-"""Two cameras compared at all offsets, and those at which all fit: whoever is whom.
+"""Compares two cameras at all time offsets, without association of people.
 
-Two rays to one joint lie in a plane with both cameras if they were taken at one time. For everybody whom one
-camera sees, the person of another camera that fits best is taken, so that no association is needed.
+Two rays to one joint lie in a plane with both cameras if they were taken at one time. For each person of one
+camera, the best fitting person of the other is used, so that no association is needed.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from shapepose_fg.core.compiled import kernel
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
 
 _LEAST_SPREAD = 0.004
-"""Misses, as a part of people's size, that differ by less from offset to offset are the detector's noise."""
+"""Minimum spread of the residuals over offsets, as a share of people's size: less is noise of the detector."""
 _ANCHORS = 150
-"""Frames of one camera that are compared with those of another, at every offset."""
+"""Number of frames of one camera that are compared with those of another, at every offset."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """One camera's people at some frames, and all of another's."""
+    """The people of one camera in some frames, and of another in all frames."""
 
     normal: Array
     """(A, J, 3) normals of the planes through both cameras and a joint."""
@@ -39,11 +39,11 @@ class Scan:
     @classmethod
     def of(cls, sightings: Sightings, views: Views, a: int, b: int) -> "Scan":
         """Scan of cameras `a` and `b`."""
-        one, other = (sightings.only(sightings.view == view) for view in (a, b))
+        one, other = (sightings.rows(sightings.view == view) for view in (a, b))
         taken = np.unique(one.frame)
         wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
-        one = one.only(np.isin(one.frame, wanted))
-        other = other.only(np.argsort(other.frame, kind="stable"))
+        one = one.rows(np.isin(one.frame, wanted))
+        other = other.rows(np.argsort(other.frame, kind="stable"))
         begin = int(other.frame[0])
         first = np.searchsorted(other.frame, np.arange(begin, other.frame[-1] + 2))
         size = other.size_px / views.focal_px[b]
@@ -51,7 +51,9 @@ class Scan:
         return cls(normal, one.frame, rays_of(other, views), size, first, begin)
 
     def over(self, lags: Index, common: float) -> Array:
-        """(L,) mean miss of all that could be somebody, a part of their size; NaN where too little is common."""
+        """(L,) mean residual of possible matches, as a share of people's size; NaN where too few frames are
+        common.
+        """
         cost, count = np.zeros(len(lags)), np.zeros(len(lags))
         normal, rays = np.ascontiguousarray(self.normal), np.ascontiguousarray(self.rays)
         _scan(normal, rays, self.frame, self.size, self.first, self.begin, lags, GATE, MIN_JOINTS, cost, count)
@@ -104,16 +106,16 @@ def normals(rays: Array, views: Views, a: int, b: int) -> Array:
 
 
 def chosen(curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int) -> tuple[Array, Array]:
-    """(V,) shifts on the first camera's clock, and how far each stands out of all others (V,).
+    """(V,) shifts on the first camera's clock, and their prominence (V,).
 
-    Cameras are added one by one, the surest first, each where it fits all those before it: frame f of the first
-    camera is frame f + shift of another.
+    Cameras are added one by one, the most prominent first, each where it fits all those before it: frame f of the
+    first camera is frame f + shift of another.
     """
     step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
     half = len(lags) // 2
 
     def fit(one: int, other: int, apart: Index) -> Array:
-        """How well two cameras fit, `apart` by so many steps: standard deviations under the median of all."""
+        """Fit of two cameras at offsets `apart`: standard deviations below the median of all offsets."""
         curve = curves[one, other] if one < other else curves[other, one][::-1]
         known = np.isfinite(curve)
         if known.sum() < 3:

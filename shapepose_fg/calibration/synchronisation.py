@@ -1,8 +1,8 @@
-"""When cameras of known poses expose, from the people whom they see: offsets of any size, to a part of a frame.
+"""Time offsets of cameras with known poses, of any size, to a fraction of a frame, from people.
 
-First all offsets between two cameras are looked at (`scanning`); then tracks that are one person are found, and
-offsets between pairs of cameras refined (`pairwise`); then each camera is compared with where the others place
-people (`in_space`).
+First all offsets between two cameras are scanned (`scanning`); then tracks are associated, and offsets between
+pairs of cameras refined (`pairwise`); then each camera is compared with the people that the others triangulate
+(`in_space`).
 """
 
 from collections.abc import Callable
@@ -23,20 +23,20 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.setup_check.matching import Sightings
 
 _STEP_S = 0.1
-"""Between offsets that are looked at first: people's joints move by 10 cm."""
+"""Step of the first scan of offsets, s: people's joints move by 10 cm."""
 _LEAST_S = 3.0
-"""Seconds that two cameras must have in common, or a third of the recording if that is less."""
+"""Minimum common duration of two cameras, s; a third of the recording if that is less."""
 _AROUND_S = 0.6
-"""Offsets that are nearer than this to each other are one answer."""
+"""Distance below which two offsets are the same, s."""
 _LEAST_SEEN = 50
-"""People, one per frame, whom a camera must see at the least."""
+"""Minimum number of people, one per frame, that a camera must see."""
 _SURE = 1.5
-"""How far the best offset must stand out of all others, in their standard deviations: wrong ones stayed below
-0.5, right ones of Shelf above 1.9."""
+"""Minimum prominence of the best offset among all, in their standard deviations: wrong ones stayed below 0.5,
+right ones of Shelf above 1.9."""
 _WORST_S = 0.05
-"""An offset that is not known to this is not known."""
+"""Largest standard deviation of an offset that is determined, s."""
 _WIDER = 1.5
-"""Sigmas are multiplied by this: as they come, 82 % of 95 % regions hold, Shelf among them; with it 92 %."""
+"""Factor on standard deviations: without it 82 % of 95 % regions hold, Shelf among them; with it 92 %."""
 WHOLE_S, _END_S, _DRIFT_S = 180.0, 60.0, 2.0
 """Duration that is used of a longer recording, s; duration at its end that is used to estimate drift, s; and
 the largest drift that is searched there, s."""
@@ -44,20 +44,20 @@ the largest drift that is searched there, s."""
 
 @dataclass(frozen=True)
 class Synchronised:
-    """When cameras exposed their frames: frame f of camera v, at t = f / fps on its own clock, at `at(t)`."""
+    """Time offsets of cameras: frame f of camera v, at t = f / fps on its own clock, was exposed at `at(t)`."""
 
     offset_s: Array
-    """(V,) seconds at `middle_s`; 0 of the first camera."""
+    """(V,) offset at `middle_s`, seconds; 0 for the first camera."""
     sigma_s: Array
-    """(V,) one sigma; 0 of the first camera."""
+    """(V,) standard deviation of the offset, seconds; 0 for the first camera."""
     sure: Array
-    """(V,) how far the offset stands out of all others, in their standard deviations."""
+    """(V,) prominence of the offset among all others, in their standard deviations."""
     drift: Array
-    """(V,) seconds a second by which the camera falls behind; 0 in recordings of under four minutes."""
+    """(V,) drift, seconds per second by which the camera falls behind; 0 in recordings of under four minutes."""
     drift_sigma: Array
-    """(V,) one sigma."""
+    """(V,) standard deviation of the drift."""
     middle_s: float
-    """When the offset holds, on the camera's own clock."""
+    """Time at which the offset holds, on the camera's own clock, s."""
 
     def at(self, time_s: Array | float) -> Array:
         """(..., V) the times on the common clock of times (...,) on each camera's own."""
@@ -68,7 +68,7 @@ class Synchronised:
         return np.asarray(time_s + self.offset_s + self.drift * (time_s - self.middle_s))
 
     def as_dict(self, rig: Rig) -> dict[str, Any]:
-        """All figures, as plain values; null for a sigma that is not known."""
+        """All figures as plain values; null for an unknown standard deviation."""
         figures = zip(rig.names, self.offset_s, self.sigma_s, self.sure, self.drift, strict=True)
         cameras = [
             {
@@ -100,9 +100,10 @@ def synchronise(
     most_s: float = 60.0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Synchronised:
-    """The offsets, up to `most_s` between any two cameras, from what cameras at known poses saw in `frames`.
+    """Estimate offsets, up to `most_s` between any two cameras, from what cameras with known poses saw in
+    `frames`.
 
-    In recordings of over four minutes the drift, too. InputError where a camera sees nobody.
+    In recordings of over four minutes drift is estimated, too. InputError where a camera sees nobody.
     """
     whole, end = round(WHOLE_S * fps), round(_END_S * fps)
     first = frames if len(frames) <= whole + end else frames[:whole]
@@ -128,8 +129,8 @@ def offsets(
     around_s: Array,
     progress: Callable[[int, int], None],
 ) -> tuple[Array, Array, Array]:
-    """Offsets (V,) within `most_s` of those `around_s`, their sigmas, and how far they stand out, from all that
-    was seen in `frames`.
+    """Offsets (V,) within `most_s` of `around_s`, their standard deviations, and their prominence, from the
+    sightings in `frames`.
     """
     views = Views.of(rig)
     for view, name in enumerate(rig.names):

@@ -1,4 +1,4 @@
-"""People of one camera followed from frame to frame in its picture, before anything is known of other cameras."""
+"""Tracks people in the pictures of one camera, without knowledge of the other cameras."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,36 +14,38 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, median_of, rays_of
 
 _SAME = 0.08
-"""A person's joints move by less than this part of their size from frame to frame, in the median."""
+"""Median motion of a person's joints between frames, as a share of the person's size, below which it is one
+track."""
 _SHORTEST_S = 0.4
-"""Tracks that are shorter say nothing of motion."""
+"""Minimum duration of a track, s."""
 _SMOOTH_S = 0.05
-"""One sigma of the kernel by which tracks are smoothed: what lies between two frames is no smoother than they."""
+"""Standard deviation of the smoothing kernel of tracks, s."""
 FAST_S = 1.0
-"""What lasts longer than this is taken out of misses: a detector's errors last, and those of cameras."""
+"""Duration above which changes are removed from residuals, s: errors of detectors and of cameras are
+correlated."""
 _BLOCK_S = 1.0
-"""Errors of one second are one error."""
+"""Duration within which errors are one correlated error, s."""
 
 _LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25
-"""What is known around a frame, and how far apart in time, as parts of what they are where all is known."""
+"""Minimum share of known values around a frame, and minimum share of their spread in time."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """K people as one camera followed them: M rows, those of a track side by side, a frame apart."""
+    """K tracks of people in one camera: M rows, those of a track together, one per frame."""
 
     first: Index
-    """(K,) row at which each begins."""
+    """(K,) first row of each track."""
     frame: Index
     """(M,) frame of each row."""
     track: Index
-    """(M,) its track."""
+    """(M,) track of each row."""
     rays: Array
     """(M, J, 3) directions in the world, smoothed; NaN where a joint is not seen."""
     speed: Array
-    """(M, J, 3) how these change per frame."""
+    """(M, J, 3) change of these directions per frame."""
     size: Array
-    """(M,) how large the person is, rad."""
+    """(M,) size of the person, rad."""
 
     @property
     def lasts(self) -> Index:
@@ -65,8 +67,8 @@ class Tracks:
 
     @classmethod
     def of(cls, sightings: Sightings, views: Views, view: int, fps: float) -> "Tracks":
-        """What camera `view` saw, followed and smoothed."""
-        seen = sightings.only(sightings.view == view)
+        """The tracks of camera `view`, smoothed."""
+        seen = sightings.rows(sightings.view == view)
         rays, size = rays_of(seen, views), seen.size_px / views.focal_px[view]
         shortest = max(4, round(_SHORTEST_S * fps))
         parts = [rows for rows in _followed(seen) if len(rows) >= shortest]
@@ -88,22 +90,22 @@ class Tracks:
 
 @dataclass(frozen=True)
 class OneClock:
-    """What cameras saw that were started at different times, at moments of one clock."""
+    """Sightings of cameras that were started at different times, on one clock."""
 
     skeleton: Skeleton
-    """The detector's."""
+    """The detector's joints."""
     sightings: Sightings
-    """`frame` is a moment of the common clock, 0 or later."""
+    """Sightings; `frame` counts on the common clock, from 0."""
     frames: range
-    """Moments at which two cameras run, or more."""
+    """Frames of the common clock in which two or more cameras run."""
 
     def at(self, frames: Iterable[int]) -> Sightings:
-        """What was seen at some moments."""
-        return self.sightings.only(np.isin(self.sightings.frame, np.fromiter(frames, np.intp)))
+        """The sightings in some frames."""
+        return self.sightings.rows(np.isin(self.sightings.frame, np.fromiter(frames, np.intp)))
 
 
 def on_one_clock(sightings: Sightings, following: Index, shift: Array, skeleton: Skeleton) -> OneClock:
-    """The sightings at moments: camera v's frame of moment t is t + shift[v], on a line between its two frames.
+    """The sightings on the common clock: frame t of it is frame t + shift[v] of camera v, interpolated linearly.
 
     `following` (S,) is the sighting of the same person in the next frame (`next_of`).
     """
@@ -126,7 +128,7 @@ def next_of(sightings: Sightings) -> Index:
     following = np.full(len(sightings), -1, dtype=np.intp)
     for view in np.unique(sightings.view):
         rows = np.flatnonzero(sightings.view == view)
-        for track in _followed(sightings.only(rows)):
+        for track in _followed(sightings.rows(rows)):
             one, other = rows[track[:-1]], rows[track[1:]]
             near = sightings.frame[other] - sightings.frame[one] == 1
             following[one[near]] = other[near]
@@ -134,7 +136,7 @@ def next_of(sightings: Sightings) -> Index:
 
 
 def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -> Sightings:
-    """The 2D people of some frames, or moments."""
+    """The 2D people of some frames, on the common clock for `OneClock`."""
     return detections.at(frames) if isinstance(detections, OneClock) else Sightings.of(detections, frames)
 
 
@@ -150,8 +152,7 @@ def _followed(seen: Sightings) -> list[Index]:
         if open_:
             last = np.array([each[-1] for each in open_])
             away = np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1) / seen.size_px[rows][:, None]
-            both = np.isfinite(away)
-            cost = np.where(both.sum(axis=-1) >= MIN_JOINTS, np.minimum(median_of(away, both), 1.0), 1.0)
+            cost = np.minimum(median_of(away, MIN_JOINTS), 1.0)
             for one, other in zip(*linear_sum_assignment(cost), strict=True):
                 if cost[one, other] < _SAME:
                     open_[one].append(int(rows[other]))
@@ -161,16 +162,17 @@ def _followed(seen: Sightings) -> list[Index]:
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:
-    """`lines` of directions (N, J, 3) seen at rising frames (N,), in every frame from the first to the last."""
+    """`lines` of directions (N, J, 3) at rising frames (N,), in every frame from the first to the last."""
     full = np.full((frame[-1] - frame[0] + 1, *rays.shape[1:]), np.nan)
     full[frame - frame[0]] = rays
     return lines(full, width)
 
 
 def lines(values: Array, width: float) -> tuple[Array, Array]:
-    """Values (T, J, 3) and their change per step: lines through what is known around each, within `width` steps.
+    """Values (T, J, 3) and their change per step: lines through the known values around each, within `width`
+    steps.
 
-    Means would be those of another time beside gaps. NaN where little is known around.
+    Means would belong to another time beside gaps. NaN where little is known around.
     """
     known = np.isfinite(values[..., :1])
     apart = np.arange(-np.ceil(3 * width), np.ceil(3 * width) + 1)
@@ -187,5 +189,7 @@ def lines(values: Array, width: float) -> tuple[Array, Array]:
 
 
 def block_frames(fps: float, lasts: float) -> float:
-    """Frames whose errors are one error; fewer in recordings of few seconds, `lasts` frames."""
+    """Number of frames whose errors are one correlated error; fewer in recordings of few seconds, `lasts`
+    frames.
+    """
     return max(1.0, min(_BLOCK_S * fps, lasts / 12))

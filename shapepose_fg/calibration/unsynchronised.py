@@ -1,4 +1,4 @@
-"""Where cameras stand that were also started by hand: rough offsets, then poses and offsets in turns."""
+"""Calibrates cameras that were started at different times: rough offsets, then poses and offsets in turn."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ from shapepose_fg.setup_check.matching import Sightings
 
 _ROUNDS = 4
 _STILL_S = 0.001
-"""Offsets that change by less from round to round have settled."""
+"""Change per round below which offsets have converged, s."""
 
 
 def calibrate_unsynchronised(
@@ -29,9 +29,10 @@ def calibrate_unsynchronised(
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Calibrated, Synchronised]:
-    """Where the cameras of `rig` stand, as `calibrate` says, and when each was started, up to `most_s` apart.
+    """Estimate the poses of the cameras of `rig`, as `calibrate` does, and their start times, up to `most_s`
+    apart.
 
-    Undetermined where the people do not tell the poses, or when cameras were started.
+    Undetermined where the people do not determine poses or offsets.
     """
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]

@@ -1,4 +1,4 @@
-"""The command `calibrate`: where cameras stand, from people who walk about."""
+"""The command `calibrate`: poses of cameras from walking people."""
 
 import json
 import tempfile
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
 _CAMERAS = "What is known"
 _FILE_OFF, _GUESS_OFF = 0.02, 0.2
-"""How far focal lengths of a calibration, and of a field of view, may be off, one sigma, as parts of them."""
+"""Prior standard deviations of focal lengths from a calibration, and from a field of view, as shares of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensOptions:
-    """What a 2D detector saw, and the lenses it saw it through."""
+    """2D detections, and the lenses of the cameras."""
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
     skeleton: str | None = option(
@@ -55,7 +55,7 @@ class LensOptions:
     without: str | None = option(INPUT, "All cameras but these.", metavar="A,B")
 
     def rig(self) -> "Rig":
-        """The cameras, at no place yet; InputError where nothing says how they see."""
+        """The cameras without poses; InputError where their lenses are unknown."""
         from shapepose_fg.core.camera import choose
         from shapepose_fg.io.calibration import read_rig
         from shapepose_fg.io.lenses import lenses_of
@@ -179,7 +179,7 @@ _CAPTION = (
 
 
 def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """The cameras, and how surely they are known: heads, and each camera's figures."""
+    """The cameras with standard deviations: headings, and each camera's figures."""
     heads = ["people", "shared", "x y z, m", "turn ± °", "place ± mm", "halves, °"] + ["focal, px"] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
@@ -209,7 +209,7 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
 
 
 def _distances(given: list[str], names: Sequence[str]) -> tuple[tuple[int, int, float], ...]:
-    """Two cameras each, and metres between them."""
+    """Pairs of cameras, and their distances in metres."""
     found = []
     for text in given:
         pair, _, number = text.rpartition("=")

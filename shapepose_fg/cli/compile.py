@@ -1,4 +1,4 @@
-"""The command `compile`: everything that the first run would compile, ahead of it."""
+"""The command `compile`: compiles everything ahead of the first run."""
 
 import time
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""The demo: the built-in scene reconstructed and compared with the truth."""
+"""The demo: the built-in scene, reconstructed and compared with the truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from shapepose_fg.viz.report.writing import REPORT, write_report
 
 @dataclass(frozen=True)
 class Demo:
-    """The scene, and what was made of what the simulated detector saw of it."""
+    """The scene, and its reconstruction from simulated detections."""
 
     scene: Scene
     """People with known truth."""
     people: Reconstruction
-    """What it made of it."""
+    """The reconstruction."""
 
     def tables(self) -> RenderableType:
         """The comparison with the truth, for a terminal."""
@@ -66,7 +66,7 @@ class Demo:
         return Group(*(Padding(_table(title, rows), (1, 0, 0, 2)) for title, rows in tables.items()))
 
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
-        """Write people.npz, what belongs to it, and the report; returns what to tell the user."""
+        """Write people.npz with the other files of a result, and the report; returns notes for the user."""
         self.people.save(folder)
         told = [
             f"{folder / 'people.npz'}  joints, covariances and bodies",
@@ -91,7 +91,7 @@ def run_demo(progress: Callable[[int, int], None] | None = None) -> Demo:
 
 
 def _table(title: str, rows: dict[str, tuple[str, str]]) -> Table:
-    """Names, figures, and what they mean."""
+    """Names, figures, and their meanings."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
     table.show_header = False
     table.add_column()

@@ -1,4 +1,4 @@
-"""The command `detect`: videos or pictures of cameras, calibrated or not yet, to 2D detections."""
+"""The command `detect`: 2D detections in videos or pictures of cameras, calibrated or not."""
 
 import shlex
 import time
@@ -35,7 +35,7 @@ _NETWORK = "Network"
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
-    """The network that detects, and how it is run."""
+    """The network that detects, and how it is executed."""
 
     network: str | None = option(_NETWORK, "ONNX file, TOML file of a network, or a name.", metavar="FILE|NAME")
     download: str | None = option(_NETWORK, "The same by name, fetched once: rtmpose-s -m -x.", metavar="NAME")
@@ -46,7 +46,7 @@ class NetworkOptions:
     device: str = option(RUN, "Where onnxruntime runs: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
 
     def load(self) -> "Network":
-        """The network, fetched if that is asked for; InputError where options contradict each other."""
+        """The network, downloaded if requested; InputError where options contradict each other."""
         from shapepose_fg.detection2d.download import named_file
         from shapepose_fg.detection2d.opening import open_network
 
@@ -71,7 +71,7 @@ class NetworkOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockOptions:
-    """When pictures were taken."""
+    """Times of the pictures."""
 
     fps: list[str] | None = option(TIME, "Frames a second, where files do not say.", metavar="RATE|CAMERA=RATE")
     start: list[str] | None = option(TIME, "When its first frame was taken: 0.2s, or 12f.", metavar="CAMERA=TIME")
@@ -141,7 +141,7 @@ def detect(
 
 
 def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "RenderableType":
-    """What was detected in each camera's pictures, and how long it took."""
+    """Number of detections in each camera's pictures, and time that it took."""
     rows = []
     for view, each in enumerate(run.cameras):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - unreadable[view]
@@ -156,7 +156,7 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
 
 
 def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network") -> str:
-    """How to go on, as a line to copy, wherever it is pasted."""
+    """The next command, as a line to copy into any shell."""
     output = run.output
     if cameras.calibration is None:
         folder, sizes = output.resolve(), {each.camera.name: each.footage.size for each in run.cameras}

@@ -1,4 +1,4 @@
-"""The command `explain`: why a joint of a result is where it is."""
+"""The command `explain`: explains why a joint of a result is where it is."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The command `export`: a result as files of other programs."""
+"""The command `export`: writes a result in the formats of other programs."""
 
 from pathlib import Path
 

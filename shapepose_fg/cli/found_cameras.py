@@ -1,4 +1,4 @@
-"""What `calibrate`, `refine-calibration` and `synchronise` say alike: clocks that were found."""
+"""Options and output that `calibrate`, `refine-calibration` and `synchronise` share: estimated time offsets."""
 
 import math
 import tempfile
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from shapepose_fg.io.detections.people import DeclaredJoints
 
 MOST_S = 60.0
-"""Cameras that were started by hand began so far apart, at most, where nobody says more."""
+"""Largest offset between cameras that were started by hand, where the user gives none, s."""
 
 
 def report_option() -> Any:
-    """A page with pictures."""
+    """The option for a page with pictures."""
     return option(RESULT, "Page with the cameras in 3D and people over them, for the browser: FILE.html.")
 
 
@@ -32,10 +32,10 @@ def found_clocks(
     most: float,
     frames: str | None = None,
 ) -> "tuple[Synchronised, Array]":
-    """When cameras at known poses began, up to `most` seconds apart, and (T, V) when each took its frames, seconds
-    on a common clock; NaN for frames that it does not have.
+    """Offsets of cameras with known poses, up to `most` seconds apart, and (T, V) times of the frames, seconds on
+    a common clock; NaN for frames that a camera lacks.
 
-    Their rate is `fps`, without it that of times.csv beside; InputError where nothing says it.
+    Their rate is `fps`, without it that of times.csv beside; InputError where there is none.
     """
     from shapepose_fg.calibration.synchronisation import synchronise
     from shapepose_fg.core.frame_times import rate_of
@@ -53,13 +53,13 @@ def found_clocks(
 
 
 def check_most(most: float) -> None:
-    """Refuse a largest offset that makes no sense."""
+    """Refuse an invalid largest offset."""
     if not 0 < most <= 600:
         raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
 
 
 def show_clocks(found: "Synchronised", rig: "Rig") -> None:
-    """The offsets."""
+    """Print the offsets."""
     rows = []
     for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
         known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"

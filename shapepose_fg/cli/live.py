@@ -1,4 +1,4 @@
-"""The command `live`: people as they are, from detections as they come in."""
+"""The command `live`: online reconstruction from detections as they come in."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -75,7 +75,7 @@ def live(
 
 
 def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]) -> "Said | None":
-    """Tell what was noticed of cameras since the `last` that was told; returns the last one now."""
+    """Print changes of cameras' statuses since the `last` printed one; returns the last one now."""
     events = people.said()
     if len(events) == 0 or events[-1] is last:
         return last

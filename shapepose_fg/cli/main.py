@@ -1,4 +1,4 @@
-"""The command line: reconstruct a recording, evaluate a reconstruction, see a demo."""
+"""The command line: registers all commands, and reports errors."""
 
 import json
 import os
@@ -65,9 +65,9 @@ app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
 _MOVED = {"--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
-"""Options that there were, and what took their place."""
+"""Removed options, and their replacements."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
-"""What typer raises for a wrong command line; older and newer versions keep the class in different places."""
+"""The exception of typer for a wrong command line; versions keep the class in different places."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -167,7 +167,7 @@ def version() -> None:
 
 
 def _fail(message: str) -> int:
-    """Say what went wrong, in one line on stderr."""
+    """Print an error, in one line on stderr."""
     say("error", " ".join(message.split()), "bold red")
     return 2
 

@@ -1,4 +1,4 @@
-"""What several commands take: options in groups, and what is given as text, a range of frames or a size."""
+"""Options that several commands share, in groups, and the parsing of ranges of frames and sizes."""
 
 import inspect
 import re
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
 """Headings under which `--help` lists options."""
 REQUIRED: Any = MISSING
-"""In place of a default."""
+"""Placeholder for the default of a required option."""
 
 
 def option(group: str, text: str, default: Any = None, *names: str, **more: Any) -> Any:
@@ -43,14 +43,14 @@ def argument(metavar: str, text: str) -> Any:
 
 
 class Preset(StrEnum):
-    """Settings that hang together."""
+    """Named sets of settings."""
 
     ACCURATE = "accurate"
     FAST = "fast"
     PAPER = "paper"
 
     def settings(self) -> "PipelineConfig":
-        """All of them."""
+        """All settings of the preset."""
         from shapepose_fg.pipeline.config import PipelineConfig
 
         made = {
@@ -62,7 +62,7 @@ class Preset(StrEnum):
 
 
 def preset_option(default: Preset | None) -> Any:
-    """Which of them."""
+    """The option for a preset."""
     return option(
         RESULT,
         "accurate (default); fast: in every third frame or so, and motion between; paper: as the paper has it.",
@@ -71,7 +71,7 @@ def preset_option(default: Preset | None) -> Any:
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`command` as typer takes it: a dataclass among its parameters becomes an option for each of its fields."""
+    """`command` for typer: each field of a dataclass among its parameters becomes an option."""
     hints, parameters = get_type_hints(command), list[inspect.Parameter]()
     taken: dict[str, list[str]] = {}
 
@@ -103,23 +103,23 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def frames_option() -> Any:
-    """Which frames of a recording, or of a result."""
+    """The option for frames of a recording, or of a result."""
     return option(TIME, "Frames A to B-1; either may be left out.", metavar="A:B")
 
 
 def workers_option() -> Any:
-    """How many processes take part."""
+    """The option for the number of processes."""
     return option(RUN, "Processes of this machine; by default as many as pay. They change no byte.")
 
 
 def json_option() -> Any:
-    """Numbers instead of words."""
+    """The option for output as JSON."""
     return option(RESULT, "Print everything as JSON.", False, "--json")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """What runs the work, and what becomes of work that was stopped."""
+    """Options of execution, and of interrupted runs."""
 
     workers: int | None = workers_option()
     cluster: str | None = option(RUN, "Dask scheduler (tcp://host:8786) to solve, or `local`.", metavar="ADDRESS")
@@ -127,7 +127,7 @@ class RunOptions:
     restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")
 
     def check(self) -> None:
-        """Refuse what contradicts itself."""
+        """Refuse options that contradict each other."""
         check_workers(self.workers)
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
@@ -163,21 +163,21 @@ class CameraOptions:
         return found
 
     def chosen(self, names: Sequence[str]) -> list[str]:
-        """The names of cameras that are wanted among those of videos, which no calibration names."""
+        """The wanted cameras among those of videos, which no calibration names."""
         from shapepose_fg.core.camera import choose
 
         with naming("--cameras, --without"):
             return choose(names, names_of(self.cameras), names_of(self.without) or ())
 
     def said(self) -> dict[str, object]:
-        """What is said of the calibration, as options of the next command."""
+        """The options about the calibration, for the next command."""
         names = ("up", "unit", "image_size", "cameras", "without")
         return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionOptions(CameraOptions):
-    """Cameras, and what a 2D detector saw with them."""
+    """Cameras, and their 2D detections."""
 
     detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
     skeleton: str | None = option(
@@ -185,14 +185,14 @@ class DetectionOptions(CameraOptions):
     )
 
     def rig(self) -> "Rig":
-        """The cameras; InputError where they cannot be used, or do not see depth."""
+        """The cameras; InputError where they cannot be used, or are fewer than two."""
         found = super().rig()
         if len(found) < 2:
             raise InputError(f"{self.calibration}: at least 2 cameras are needed to see depth, got {len(found)}")
         return found
 
     def still_rig(self, what: str) -> "Rig":
-        """The cameras, for `what` is for cameras that stand still only; InputError where one moves."""
+        """The cameras, for `what` requires fixed cameras; InputError where one moves."""
         found = self.rig()
         moving = next((camera.name for camera in found.cameras if camera.carrier), None)
         if moving is not None:
@@ -203,18 +203,18 @@ class DetectionOptions(CameraOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Located(DetectionOptions):
-    """Cameras and detections whose places are known."""
+    """Cameras and detections whose paths are known."""
 
     source: "Pose2SimProject | None" = None
-    """The project that they are of."""
+    """The project that they belong to; None where there is none."""
 
     @property
     def joints(self) -> "str | DeclaredJoints | None":
-        """The detector's joints as the user says, else as the project does."""
+        """The detector's joints as the user states, else as the project does."""
         return self.skeleton or (None if self.source is None else self.source.joints)
 
     def rate(self, given: "RateOptions") -> "RateOptions":
-        """When frames were taken as the user says, else as the project does."""
+        """Times of frames as the user states, else as the project does."""
         if self.source is None or given.fps is not None or given.timestamps is not None:
             return given
         return replace(given, fps=self.source.fps)
@@ -228,13 +228,13 @@ class Located(DetectionOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectOptions(DetectionOptions):
-    """Cameras and what a 2D detector saw with them, each given or that of a Pose2Sim project."""
+    """Cameras and their 2D detections, each given or from a Pose2Sim project."""
 
     detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
 
     def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
-        """The options with the places that a project says, and the project; `tell` is given its notes."""
+        """The options with the paths of a project, and the project; `tell` receives its notes."""
         if self.project is None:
             return self, None
         from shapepose_fg.io.pose2sim_project import read_pose2sim_project
@@ -245,7 +245,7 @@ class ProjectOptions(DetectionOptions):
         return replace(self, calibration=calibration, detections=detections), source
 
     def located(self) -> Located:
-        """Where they are; InputError where that is not said."""
+        """The options with known paths; InputError where one is missing."""
         whole, source = self.completed()
         refuse_missing({"--calibration": whole.calibration, "--detections": whole.detections})
         given = {each.name: getattr(whole, each.name) for each in fields(DetectionOptions)}
@@ -254,7 +254,7 @@ class ProjectOptions(DetectionOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeOptions:
-    """When frames were taken."""
+    """Options about the times of frames."""
 
     fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
     timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
@@ -267,8 +267,8 @@ class TimeOptions:
         kept: Path,
         own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes | None]":
-        """The recording, and the times of its frames where something says them (`read_recording`); what is odd is
-        said.
+        """The recording, and the times of its frames where they are known (`read_recording`); notes are
+        printed.
         """
         from shapepose_fg.io.recording import read_recording
 
@@ -282,7 +282,7 @@ class TimeOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RateOptions(TimeOptions):
-    """When frames were taken, and which are used."""
+    """Options about the times of frames, and about which frames are used."""
 
     frames: str | None = frames_option()
 
@@ -294,7 +294,7 @@ class RateOptions(TimeOptions):
         kept: Path,
         own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes, range]":
-        """The recording, its times, 30 frames a second where nothing says them, and the frames that are used."""
+        """The recording, its times, 30 frames a second where they are unknown, and the frames to use."""
         from shapepose_fg.core.frame_times import FrameTimes
 
         recording, times = self.read(detections, skeleton, rig, kept, own_frames)
@@ -317,7 +317,7 @@ class ResultOptions:
     body: Path | None = option(INPUT, "The body model of the result, where its file has moved.")
 
     def how(self) -> dict[str, Any]:
-        """How it is read, as keywords."""
+        """Arguments of the functions that read it."""
         check_fps(self.fps)
         return {"fps": self.fps, "up": self.up}
 
@@ -331,19 +331,19 @@ class TakeOptions(ResultOptions):
     seen_only: bool = option(RESULT, "Leave out joints that no view saw in that frame.", False, "--seen-only")
 
     def how(self) -> dict[str, Any]:
-        """How it is read, as keywords."""
+        """Arguments of the functions that read it."""
         persons, frames = tuple(self.person) if self.person else None, result_frames(self.frames)
         return super().how() | {"seen_only": self.seen_only, "frames": frames, "persons": persons}
 
 
 def next_reconstruct(options: Mapping[str, object]) -> str:
-    """How to go on, as a line to copy: `reconstruct` with those options that are given."""
+    """A line to copy: `reconstruct` with the options that have values."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 
 
 def refuse_missing(places: Mapping[str, Path | None]) -> None:
-    """InputError where one of the options, by their names, is not given, and no project says it."""
+    """InputError where one of the options, by their names, has no value, and no project has it."""
     missing = [name for name, place in places.items() if place is None]
     if missing:
         listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
@@ -351,7 +351,7 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
 
 
 def names_of(text: str | None) -> list[str] | None:
-    """Names of cameras, apart by commas; None where no text is given."""
+    """Names of cameras, separated by commas; None where no text is given."""
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
@@ -366,19 +366,19 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 
 
 def check_fps(fps: float | None) -> None:
-    """Refuse frames a second that make no sense."""
+    """Refuse an invalid frame rate."""
     if fps is not None and not 0.01 <= fps <= 1e5:
         raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
 
 
 def check_workers(workers: int | None) -> None:
-    """Refuse a number of processes that makes no sense."""
+    """Refuse an invalid number of processes."""
     if workers is not None and not 1 <= workers <= 64:
         raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")
 
 
 def result_frames(text: str | None) -> range | None:
-    """Frames that `A:B` selects of a saved result, whose last is not known yet; None where all are."""
+    """Frames that `A:B` selects of a saved result, whose last is not known yet; None for all."""
     if text is None:
         return None
     start, stop = ends(text)

@@ -1,4 +1,4 @@
-"""The command `overlay`: a result drawn over the videos or pictures that it was made from."""
+"""The command `overlay`: draws a result over the videos or pictures that it was made from."""
 
 import re
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn:
-    """What is drawn, and how large."""
+    """What is drawn, and its size."""
 
     cameras: str | None = option(DRAW, "Only these cameras.", metavar="A,B")
     without: str | None = option(DRAW, "All cameras but these.", metavar="A,B")
@@ -98,7 +98,7 @@ def overlay(
 
 
 def _cameras(text: str, rig: "Rig") -> list[str]:
-    """The cameras that are asked for."""
+    """The wanted cameras."""
     names = names_of(text) or []
     for name in names:
         if name not in rig.names:
@@ -109,13 +109,13 @@ def _cameras(text: str, rig: "Rig") -> list[str]:
 
 
 def _fps(run: Mapping[str, Any]) -> float:
-    """Frames a second of the video that is made."""
+    """Frame rate of the new video, Hz."""
     rate = run.get("time", {}).get("fps")  # a number where it is said (`check_run`)
     return float(rate) if rate is not None and 0.1 <= rate <= 1000 else ASSUMED_FPS
 
 
 def _stills(text: str, length: int) -> list[int]:
-    """The frames of which still pictures are asked for."""
+    """The frames of which still pictures are wanted."""
     words = re.split(r"[,\s]+", text.strip())
     if not all(re.fullmatch(r"\d{1,9}", word) and int(word) < length for word in words):
         raise InputError(f"--stills {text}: must be frames 0 to {length - 1}, such as 0,50")

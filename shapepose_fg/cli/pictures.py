@@ -1,4 +1,4 @@
-"""The options by which a user says where the cameras' videos or pictures are, and what is made of them."""
+"""Options for the cameras' videos or pictures, and the footage behind them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,13 +37,13 @@ class PictureOptions:
         return [name for name in rig.names if name in names] or list(rig.names)
 
     def names(self) -> list[str]:
-        """The names of the cameras whose videos or pictures are there."""
+        """The names of the cameras with videos or pictures."""
         from shapepose_fg.io.footage.places import names_of_footage
 
         return list(names_of_footage(self.videos or []))
 
     def opened(self, names: Sequence[str]) -> "dict[str, Footage]":
-        """The videos or pictures of every camera, looked through."""
+        """The videos or pictures of every camera, decoded once."""
         from shapepose_fg.io.footage.places import find_footage
 
         given = self.videos or []
@@ -59,7 +59,9 @@ class PictureOptions:
         drawn: Sequence[str],
         detections: Path | None = None,
     ) -> "list[tuple[CameraFootage, Footage]]":
-        """Those of the result in `results`, whose run.json says `run`, for the cameras `drawn` (`pictures_of`)."""
+        """The pictures of the result in `results`, whose run.json is `run`, for the cameras `drawn`
+        (`pictures_of`).
+        """
         from shapepose_fg.io.footage.placement import FOOTAGE
         from shapepose_fg.io.recording import read_moments
         from shapepose_fg.viz.overlay.result_pictures import pictures_of
@@ -74,7 +76,7 @@ class PictureOptions:
 
 
 def opened(name: str, path: Path) -> "Footage":
-    """A camera's video or pictures, looked through with a progress bar; what is odd is said."""
+    """A camera's video or pictures, decoded once with a progress bar; notes are printed."""
     from shapepose_fg.io.footage.footage import open_footage
 
     with progress(f"looking through {name}") as done:

@@ -29,7 +29,7 @@ _CAMERAS = "What may change"
 
 @dataclass(frozen=True, kw_only=True)
 class FreedomOptions:
-    """How far cameras may be from what the file says."""
+    """Prior standard deviations of the cameras from the values in the file."""
 
     off_degrees: float = option(_CAMERAS, "How far cameras may be turned, about, in degrees.", 1.0)
     off_cm: float = option(_CAMERAS, "How far they may be moved, about, in centimetres.", 2.0)
@@ -122,7 +122,7 @@ def refine_calibration(
 
 
 def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """What changed, by camera: heads, and each camera's figures."""
+    """Changes by camera: headings, and each camera's figures."""
     change, sigma = found.change(), found.sigma()
     parts = {"turn": "turn, °", "move": "move, mm"} | ({"focal": "focal, %"} if may.focal else {})
     parts |= {"centre": "centre, px"} if may.centre else {}

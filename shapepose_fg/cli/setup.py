@@ -1,4 +1,4 @@
-"""The command `check-calibration`: whether cameras and detections fit each other, in words."""
+"""The command `check-calibration`: checks whether cameras and detections fit each other."""
 
 import json
 import tempfile

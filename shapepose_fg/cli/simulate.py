@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """What is simulated."""
+    """Options of the simulated scene."""
 
     name: str = argument("NAME", "demo, or an interaction sequence: salsa, crossing or crowd.")
     split: str = option(INPUT, "Takes of a sequence: tune, to choose settings by; report.", "tune")

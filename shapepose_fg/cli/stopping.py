@@ -1,4 +1,4 @@
-"""Ctrl-C and a request to end: the program stops where it is, says so in a sentence, and keeps what is done."""
+"""Ctrl-C and requests to end: the program stops, prints a sentence, and keeps what is done."""
 
 import signal
 import threading
@@ -10,26 +10,26 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(BaseException):
-    """The user, or the system, wants the program to end; no `Exception`, so that nothing catches it."""
+    """The user, or the system, asks the program to end; no `Exception`, so that nothing catches it."""
 
     def __init__(self, number: int, message: str = "") -> None:
         super().__init__(message)
         self.number = number
         """Number of the signal."""
         self.message = message
-        """Where the work stands, and how to go on."""
+        """The state of the work, and how to resume it."""
 
     @property
     def exit_code(self) -> int:
-        """What a shell shows for a program that ended by this signal."""
+        """The exit code that shells use for a program that was ended by this signal."""
         return 128 + self.number
 
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Inside the block a signal raises `Stopped`, once: the second is not to disturb the tidying up.
+    """Inside the block a signal raises `Stopped`, once: a second one does not disturb the clean-up.
 
-    What the parent process wants to be ignored stays ignored; in another thread than the main one nothing changes.
+    Signals that the parent process ignores stay ignored; in other threads than the main one nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""The command `synchronise`: when each camera began, from the people; and detections of the same moments."""
+"""The command `synchronise`: start times of cameras from people, and synchronised detections."""
 
 import json
 import shlex

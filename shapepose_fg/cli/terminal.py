@@ -1,4 +1,4 @@
-"""What the commands say on a terminal: results, notes, a bar while something runs."""
+"""Output of the commands on a terminal: results, notes, and progress bars."""
 
 import logging
 import os
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def use_any_streams() -> None:
-    """Make stdout and stderr take whatever is said: closed ones swallow it, foreign letters are escaped.
+    """Make stdout and stderr accept any text: closed ones discard it, unsupported letters are escaped.
 
-    A descriptor that is closed is opened on nothing: or the next file that is opened would have its number, and
-    what libraries say would be written into it.
+    A closed descriptor is opened on nothing; otherwise the next opened file would get its number, and messages of
+    libraries would be written into it.
     """
     for descriptor in range(3):
         try:
@@ -36,10 +36,10 @@ def use_any_streams() -> None:
 
 
 class _Stripped:
-    """A stream that takes whatever is said, without what a terminal would obey: names of files and keys are in it.
+    """A stream without control sequences, which names of files and keys may contain.
 
-    Only plain text goes through it. Rich's consoles strip what they are given and write colours and bars to the
-    stream beneath, which is not ours to look at: they ask for it by this attribute, `console` below hands it over.
+    Only plain text goes through it. Rich's consoles strip their text themselves and write colours and bars to the
+    stream beneath: they ask for it by this attribute, and `console` below hands it over.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -54,7 +54,7 @@ class _Stripped:
 
 
 def _beneath(stream: Any) -> Any:
-    """The stream that streams of ours and of Rich's write to."""
+    """The stream beneath our own streams and those of Rich."""
     while hasattr(stream, "rich_proxied_file"):
         stream = stream.rich_proxied_file
     return stream
@@ -64,7 +64,7 @@ _OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u206
 
 
 def printable(text: str) -> str:
-    """The text without control characters, but for ends of lines and tabs, and without changes of direction."""
+    """The text without control characters, except for ends of lines and tabs, and without changes of direction."""
     return _OBEYED.sub("", text)
 
 
@@ -103,7 +103,7 @@ def table(
 
 
 def say(what: str, message: str, style: str) -> None:
-    """Say on stderr, in one paragraph that begins with `what`."""
+    """Print on stderr, in one paragraph that begins with `what`."""
     from rich.text import Text
 
     on = console(stderr=True) if _shown is None else _shown.console  # above the bars
@@ -111,25 +111,25 @@ def say(what: str, message: str, style: str) -> None:
 
 
 def note(*messages: str) -> None:
-    """Say on stderr, each in one line, what was made of the input."""
+    """Print notes on stderr, each in one line."""
     for message in messages:
         say("note", message, "bold")
 
 
 def warn(message: str) -> None:
-    """Say on stderr, in one paragraph, what looks wrong."""
+    """Print a warning on stderr, in one paragraph."""
     say("warning", message, "bold yellow")
 
 
 class _Noted(logging.Handler):
-    """Says what is logged as notes."""
+    """Prints log records as notes."""
 
     def emit(self, record: logging.LogRecord) -> None:
         note(record.getMessage())
 
 
 def note_log() -> None:
-    """Say what the package logs: what takes long once."""
+    """Print what the package logs as notes: work that takes long once."""
     logger = logging.getLogger("shapepose_fg")
     if len(logger.handlers) == 0:
         logger.addHandler(_Noted(logging.INFO))
@@ -137,7 +137,7 @@ def note_log() -> None:
 
 
 _shown: "Progress | None" = None
-"""Bars that are on the terminal."""
+"""Bars that are shown at present."""
 
 
 @contextmanager
@@ -183,7 +183,9 @@ _EVERY_S = 15.0
 
 @contextmanager
 def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """A function of how many are done, and how many there are: a bar on a terminal, else a line now and then."""
+    """A function that is called with the number of finished items and of all: a bar on a terminal, else lines
+    of text.
+    """
     begin = last = time.monotonic()
 
     def line(done: int, total: int) -> None:

@@ -1,4 +1,4 @@
-"""The command `tracks`: who is in a result over time, and who is who, corrected by hand."""
+"""The command `tracks`: lists the people of a result over time, and corrects identities by hand."""
 
 import json
 from dataclasses import asdict
@@ -106,7 +106,7 @@ def undo_correction(context: typer.Context) -> None:
 
 
 def _tracks_table(results: Path) -> "RenderableType":
-    """Everybody of a result, and what was corrected."""
+    """All people of a result, and the corrections."""
     from rich.console import Group
     from rich.padding import Padding
 
@@ -149,7 +149,7 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
-    """The body model that a result was made with; None where its file is not there any more."""
+    """The body model of a result; None where its file is missing."""
     from shapepose_fg.io.solved_setup import body_of
 
     try:
@@ -159,7 +159,7 @@ def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
 
 
 def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
-    """Make one correction, and say what came of it."""
+    """Make one correction, and print its effect."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.corrections import correct
     from shapepose_fg.tracking.edits import Action, Edit, free_number
@@ -181,8 +181,8 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
 
 
 def _renew_report(folder: Path) -> None:
-    """The page of a result that was corrected, where there is one, and what was made of it before: it would say
-    what is no longer true.
+    """Write the page of a corrected result again, if there is one, and set its exports aside, which are out of
+    date.
     """
     from shapepose_fg.viz.report.writing import REPORT, report_of
 
@@ -198,9 +198,9 @@ def _renew_report(folder: Path) -> None:
 
 
 def _solver(folder: Path) -> "Solve | None":
-    """What solves rows of the result in `folder` anew; None where the result does not hold what that takes.
+    """Function that solves rows of the result in `folder` again; None where the result lacks what it needs.
 
-    Without time, too: then every row is solved by itself, whoever it is.
+    Without identities every row is solved separately.
     """
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.solved_setup import CAMERAS

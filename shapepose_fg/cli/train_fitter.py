@@ -1,4 +1,4 @@
-"""The command `train-fitter`: weights of the learned fitter for a body model of one's own."""
+"""The command `train-fitter`: weights of the learned fitter for the user's own body model."""
 
 import time
 from pathlib import Path
@@ -9,9 +9,9 @@ from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.output_folder import prepare_output
 
 _DRAWN = 30_000
-"""Poses that are drawn where no recorded ones are given."""
+"""Number of random poses where no recorded ones are given."""
 _WORSE = 1.1
-"""Times the plain optimiser's error, from which on weights that take half its time are of no use."""
+"""Ratio of the error to the plain optimiser's above which weights, which take half its time, are useless."""
 
 
 @grouped

@@ -1,4 +1,4 @@
-"""The command `view`: a result in the rerun viewer."""
+"""The command `view`: shows a result in the rerun viewer."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

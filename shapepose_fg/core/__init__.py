@@ -1,1 +1,1 @@
-"""What all rooms speak of: cameras, skeletons, detections, observations, times, results."""
+"""Types that all folders share: cameras, skeletons, detections, observations, times, results."""

@@ -1,4 +1,4 @@
-"""Short names for the arrays of NumPy that most signatures speak of; shapes stand in the docstrings."""
+"""Short names of array types; shapes are given in docstrings."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 """Real numbers."""
 Index = NDArray[np.intp]
-"""Places in other arrays."""
+"""Indices into other arrays."""
 Mask = NDArray[np.bool_]
-"""Which entries are meant."""
+"""Boolean arrays."""
 Real = NDArray[np.floating]
 """Real numbers of any precision."""
 Whole = NDArray[np.integer]

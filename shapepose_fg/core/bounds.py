@@ -1,4 +1,4 @@
-"""Settings with bounds: said once, in the type of a field, and checked wherever a setting is made."""
+"""Settings with bounds, which are declared in the type of a field and checked whenever a setting is created."""
 
 from functools import cache
 from typing import Annotated, Any, get_type_hints
@@ -10,23 +10,23 @@ Metres = Annotated[float, Interval(gt=0, le=10)]
 MetresOrNone = Annotated[float, Interval(ge=0, le=10)]
 """A distance, m, at least 0; the setting's docstring states what 0 means."""
 Seconds = Annotated[float, Interval(gt=0, le=60)]
-"""A time in which people move."""
+"""A duration, s; above 0."""
 Speed = Annotated[float, Interval(gt=0, le=100)]
-"""Metres a second."""
+"""A speed, m/s; above 0."""
 Share = Annotated[float, Interval(ge=0, le=1)]
-"""A part of a whole, or a score."""
+"""A share, or a score, 0 to 1."""
 Factor = Annotated[float, Interval(gt=0, le=1e6)]
-"""Something else that is multiplied or compared with."""
+"""A factor or a threshold without unit; above 0."""
 Count = Annotated[int, Interval(ge=1, le=1000)]
-"""How many there must be."""
+"""A minimum count, 1 or more."""
 Repeats = Annotated[int, Interval(ge=1, le=100)]
-"""How often something is done."""
+"""A number of repetitions, 1 or more."""
 RepeatsOrNone = Annotated[int, Interval(ge=0, le=100)]
-"""How often something is done, which need not be done."""
+"""A number of repetitions, 0 or more."""
 
 
 class Settings:
-    """Base of dataclasses whose fields have bounds; ValueError that names the field outside of its own."""
+    """Base of dataclasses whose fields have bounds. ValueError names a field whose value is out of bounds."""
 
     def __post_init__(self) -> None:
         for name, interval in _intervals(type(self)).items():
@@ -36,7 +36,7 @@ class Settings:
 
 
 def range_of(kind: type, name: str) -> str | None:
-    """The bounds of a field in words, None where it has none: "above 0, at most 10"."""
+    """The bounds of a field in words, such as "above 0, at most 10"; None where it has none."""
     interval = _intervals(kind).get(name) if issubclass(kind, Settings) else None
     if interval is None:
         return None
@@ -56,7 +56,7 @@ def _intervals(kind: type) -> dict[str, Interval]:
 
 
 def _problem(interval: Interval, value: Any) -> str | None:
-    """What a value must be and is not; NaN is nowhere inside."""
+    """The bound that a value violates, in words; None where it is within. NaN is within no bounds."""
     low, high = interval.gt if interval.ge is None else interval.ge, interval.le
     inside = low < value <= high if interval.ge is None else low <= value <= high
     if inside:

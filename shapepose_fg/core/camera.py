@@ -1,4 +1,4 @@
-"""Where cameras stand and what they see: pinhole cameras in the world, a rig of them, their views over time."""
+"""Pinhole cameras in the world, rigs of them, and their views over time."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,9 +21,9 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST_PIXELS, _MOST_METRES, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 1e6, 200
 """No picture, room, lens or name is as large; what is computed of larger numbers overflows."""
 _ROTATION_TOLERANCE = 1e-3
-"""How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
+"""Largest deviation of R Rᵀ from the identity: calibrations are printed with four to six digits."""
 LONGEST_READOUT_S = 0.1
-"""Rolling shutters take 5 to 30 ms."""
+"""Longest readout time that is accepted, s: rolling shutters take 5 to 30 ms."""
 
 
 @dataclass(frozen=True)
@@ -31,25 +31,25 @@ class Camera:
     """A calibrated pinhole camera: OpenCV's convention, x right, y down, z forward."""
 
     name: str
-    """What the calibration and the detection files call it."""
+    """The camera's name in the calibration and in the detection files."""
     K: Array
     """(3, 3) intrinsic matrix, pixels."""
     wTc: Array
     """(4, 4) world-from-camera pose, metres."""
     image_size: tuple[int, int]
-    """(width, height), pixels."""
+    """Width and height of the picture, pixels."""
     distortion: Array = field(default_factory=lambda: np.zeros(5))
     """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2 p1 p2 k3,
     or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
     lens: Lens = "perspective"
     """Which of OpenCV's families the coefficients belong to."""
     readout_s: float = 0.0
-    """How long a rolling shutter takes from the first row of a picture to the last, seconds; times of pictures are
-    of their middle row."""
+    """Time that a rolling shutter takes from the first row of a picture to the last, s; a picture's time is
+    that of its middle row."""
     carrier: str = ""
-    """The name of the trajectory that it goes along; empty of a camera that stands still."""
+    """The name of the trajectory that carries the camera; empty for a camera that stands still."""
     bTc: Array = field(default_factory=lambda: np.eye(4))
-    """(4, 4) carrier-from-camera pose, metres; `wTc` is where that puts the camera at first."""
+    """(4, 4) carrier-from-camera pose, metres; `wTc` is the pose at the start of the trajectory."""
 
     def __post_init__(self) -> None:
         def refuse(problem: str) -> ValueError:
@@ -155,15 +155,15 @@ class Rig:
     up: Axis
     """Which axis of the world points up."""
     dark: tuple[int, ...] = ()
-    """Views without a picture, at the moment that the rig is of: nobody is expected to be seen there."""
+    """Views without a picture in the frame for which the rig was made; nobody is expected to be seen there."""
     doubted: tuple[int, ...] = ()
-    """Views that contradict each other then, and nothing says which is wrong."""
+    """Views that contradict each other in the frame for which the rig was made; it is unknown which is wrong."""
     trajectories: tuple[Trajectory, ...] = ()
-    """Where the carriers of cameras that move go; two cameras on one robot share its trajectory."""
+    """Trajectories of the carriers of moving cameras; two cameras on one robot share its trajectory."""
     notes: tuple[str, ...] = field(default=(), compare=False)
-    """What a reader left out of the calibration file or took for granted, a sentence each."""
+    """Notes, a sentence each, on what a reader left out of the calibration file or assumed."""
     unwanted: tuple[str, ...] = field(default=(), compare=False)
-    """Names of cameras that `only` left out: what they saw is passed over, while an unknown camera is an error."""
+    """Names of cameras that `only` left out: their detections are skipped, while an unknown camera is an error."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
@@ -210,17 +210,19 @@ class Rig:
 
     @property
     def moves(self) -> bool:
-        """Whether any camera moves: then `at` says where they are."""
+        """Whether any camera moves, so that poses depend on time (`at`)."""
         return any(camera.carrier for camera in self.cameras)
 
     @cached_property
     def carrier(self) -> Index:
-        """(V,) which trajectory each view goes along; -1 of a camera that stands still."""
+        """(V,) index of the trajectory of each view; -1 for a camera that stands still."""
         known = [each.name for each in self.trajectories]
         return np.array([known.index(each.carrier) if each.carrier else -1 for each in self.cameras], np.intp)
 
     def poses(self, time_s: Array) -> Array:
-        """(..., V, 4, 4) world from camera at times (..., V), seconds; the nearest where a trajectory has none."""
+        """(..., V, 4, 4) world from camera at times (..., V), seconds; the nearest pose where a trajectory has
+        none.
+        """
         wTc = np.empty((*time_s.shape, 4, 4))
         for view, (camera, number) in enumerate(zip(self.cameras, self.carrier.tolist(), strict=True)):
             still = number < 0
@@ -230,7 +232,7 @@ class Rig:
         return wTc
 
     def at(self, time_s: Array) -> "Rig":
-        """The cameras as they stand at one moment, `time_s` (V,); a rig whose cameras stand still is the same."""
+        """The rig at times `time_s` (V,), seconds; a rig whose cameras stand still is returned as it is."""
         if not self.moves:
             return self
         cameras = [
@@ -272,7 +274,7 @@ class Rig:
 
     @cached_property
     def image_sizes(self) -> Array:
-        """(V, 2) width and height, pixels; 0 of a view without a picture."""
+        """(V, 2) width and height, pixels; 0 for a view without a picture."""
         sizes = np.array([camera.image_size for camera in self.cameras], dtype=np.float64)
         sizes[list(self.dark)] = 0.0
         return sizes
@@ -322,7 +324,7 @@ def choose(known: Sequence[str], only: Sequence[str] | None = None, without: Seq
 
 @dataclass(frozen=True)
 class Views:
-    """The cameras of N rows (people, frames or both), each row with cameras of its own if they move."""
+    """The cameras of N rows (people, frames or both); moving cameras have a pose for each row."""
 
     K: Array
     """(V, 3, 3) intrinsic matrices of cameras that are the same for all rows, or (N, V, 3, 3), pixels."""
@@ -331,9 +333,9 @@ class Views:
     image_sizes: Array | float = np.inf
     """(V, 2) width and height, pixels; infinite where they are not known."""
     readout_s: Array | float = 0.0
-    """(V,) from the first row of a picture to the last, seconds."""
+    """(V,) time from the first row of a picture to the last, seconds."""
     carried: Carried | None = None
-    """What carries cameras, row by row; None where all stand still."""
+    """Poses of the carriers of moving cameras, row by row; None where all cameras stand still."""
 
     def __post_init__(self) -> None:
         K, cTw = self.K, self.cTw
@@ -346,7 +348,7 @@ class Views:
 
     @classmethod
     def of(cls, rig: Rig, time_s: Array | None = None) -> "Views":
-        """The cameras of a rig; of one that moves at `time_s` (N, V), seconds, the times of each row's views.
+        """The cameras of a rig; for moving cameras at `time_s` (N, V), seconds, the times of each row's views.
 
         ValueError where cameras move and no times are given.
         """
@@ -376,7 +378,9 @@ class Views:
 
     @cached_property
     def projection(self) -> Array:
-        """(1, V, 3, 4) or (N, V, 3, 4) K [R | t]: gives pixels times depth, and depth, of points."""
+        """(1, V, 3, 4) or (N, V, 3, 4) projection matrices K [R | t]: from points to pixels times depth, and
+        depth.
+        """
         both = self.K @ self.cTw
         return np.ascontiguousarray(both.reshape(-1, *both.shape[-3:]))
 
@@ -392,7 +396,7 @@ class Views:
         return Views(K, cTw, self.image_sizes, self.readout_s, carried)
 
     def pixels(self, points: Array) -> tuple[Array, Array]:
-        """The first two of `project`."""
+        """Pixels (N, J, V, 2) and depths (N, J, V) of `points` (N, J, 3), as in `project`."""
         P = self.projection.reshape(-1, 3 * len(self), 4)
         ends = (points @ P[..., :3].mT + P[:, None, :, 3]).reshape(*points.shape[:2], len(self), 3)
         depth = ends[..., 2]
@@ -412,7 +416,8 @@ class Views:
 
 
 def beside_segment(x: Real, y: Real, first: Sequence[Real], second: Sequence[Real]) -> tuple[Real, Real]:
-    """How far pixels (...) are from segments (...), squared pixels, and how deep a segment is where it is nearest.
+    """Squared distances of pixels (...) from segments (...), squared pixels, and depths of the segments' nearest
+    points.
 
     `first` and `second` are x, y and depth of the segments' ends; all shapes broadcast.
     """

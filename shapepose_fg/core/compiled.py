@@ -1,8 +1,9 @@
-"""Functions over rows, joints and frames, compiled by Numba once for a machine, and kept (`core/kept_kernels.py`).
+"""Functions over rows, joints and frames, compiled by Numba once per machine and cached (`core/kept_kernels.py`).
 
-A kernel takes whole arrays of the types that it names (C-contiguous; for others it is compiled anew) and writes
-into arrays that it is given, so that Python is entered once for many rows. Kernels and parts of any file may call
-each other; what else a kernel has from another file, a number say, must not change (or changes its name).
+A kernel takes whole arrays of the types that it names (C-contiguous; for others it is compiled again) and writes
+into arrays that it is given, so that one call from Python serves many rows. Kernels and parts of any file may call
+each other. Anything else that a kernel uses from another file, such as a number, must not change (or must change
+its name).
 """
 
 import logging
@@ -24,7 +25,7 @@ _NUMBERS = {"f": numba.float64, "i": numba.intp, "b": numba.boolean}
 _NUMBERS |= {"s": numba.float32, "w": numba.int32, "u": numba.uint8}
 
 KERNELS: dict[str, "Kernel"] = {}
-"""All kernels of what is imported, by `module:name`."""
+"""All kernels of the imported modules, by `module:name`."""
 
 _lock = RLock()
 
@@ -46,19 +47,19 @@ def kernel(*kinds: str | type) -> Callable[[F], F]:
 
 
 def part(function: F) -> F:
-    """A piece of kernels, which Python cannot call: compiled with them, sooner than a kernel is."""
+    """A function that kernels call and Python cannot; it is compiled with them, in less time than a kernel."""
     return cast(F, _njit(no_cpython_wrapper=True, forceinline=True)(function))
 
 
 class Kernel:
-    """A function that is read from where compiled ones are kept, or compiled, when it is first called."""
+    """A function that is read from the cache, or compiled, at its first call."""
 
     def __init__(self, function: Any, kinds: Sequence[str | type]) -> None:
         update_wrapper(self, function)
         self.py_func, self.kinds = function, kinds
         self.name = f"{function.__module__}:{function.__qualname__}"
         self.loaded: Any = None
-        """Numba's function, once this was called."""
+        """Numba's function, once the kernel was called."""
 
     def __call__(self, *arguments: Any) -> Any:
         return (self.loaded or self.load())(*arguments)
@@ -67,7 +68,9 @@ class Kernel:
         return self.py_func.__qualname__
 
     def load(self) -> Any:
-        """Read or compile it for the types that it names, with all others that are missing; `loaded`."""
+        """Read or compile the kernel for the types that it names, with all others that are missing; returns
+        `loaded`.
+        """
         with _lock:
             if NUMBA.DISABLE_JIT:
                 return self.py_func
@@ -79,12 +82,12 @@ class Kernel:
 
     @property
     def is_kept(self) -> bool:
-        """Whether it has been compiled and kept."""
+        """Whether the compiled kernel is in the cache."""
         folder = module_folder(self.py_func.__module__)
         return folder is not None and (folder / self.py_func.__qualname__).exists()
 
     def _read_or_compile(self) -> Any:
-        """Numba's function with its cache; None where nothing can be kept. A damaged cache is removed."""
+        """Numba's function with its cache; None where nothing can be cached. A damaged cache is removed."""
         for _ in range(2):
             folder = module_folder(self.py_func.__module__)
             if folder is None:

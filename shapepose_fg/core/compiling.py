@@ -1,4 +1,4 @@
-"""Kernels compiled side by side by several processes, and what is said meanwhile."""
+"""Compiles kernels in several processes, and logs that it does."""
 
 import gc
 import logging
@@ -15,20 +15,20 @@ from typing import Any
 from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
 _BYTES_S = 1300
-"""Bytes of Python's code that are compiled in a second, on a machine that is neither fast nor slow."""
+"""Bytes of Python code that an average machine compiles in a second."""
 _WORTH_S = 3.0
-"""Less than this is compiled here, one after the other: a process takes a second to start."""
+"""Compile time below which kernels are compiled in this process, s: starting a process takes a second."""
 _MOST = 8
-"""Number of processes: the longest kernel takes an eighth of all."""
+"""Maximum number of processes: the longest kernel takes an eighth of the whole time."""
 
 _tried = False
-"""Whether this process has compiled what was missing; what is missing then is compiled where it is called."""
+"""Whether this process has compiled the missing kernels; any that are missing later are compiled when called."""
 
 
 def compile_beside(kernels: Sequence[Any]) -> None:
-    """Compile these kernels, those that are not kept, by as many processes as there are cores; once a process.
+    """Compile those of the kernels that are not cached, in as many processes as there are cores; once per process.
 
-    Another process that does so is waited for.
+    Waits for another process that compiles.
     """
     global _tried
     if _tried:
@@ -129,7 +129,7 @@ def _alone() -> Iterator[None]:
 
 
 def _work(kernels: Sequence[Any]) -> int:
-    """Bytes of Python's code that are compiled for kernels: how long that takes."""
+    """Bytes of Python code to compile for kernels: a measure of the time that it takes."""
     return sum(len(each.__code__.co_code) for kernel in kernels for each in _pieces(kernel.py_func))
 
 

@@ -1,4 +1,4 @@
-"""What is unique in decompositions of matrices: the same numbers on every processor, up to rounding.
+"""Decompositions of matrices without arbitrary signs: the same numbers on every processor, up to rounding.
 
 LAPACK returns eigenvectors and singular vectors with signs, and bases of repeated values, that depend on the
 processor's kernels. They must not reach a result or a random draw, so that only this module and `factors` call
@@ -10,7 +10,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 
 _SIDE = np.sqrt([2.0, 3.0, 5.0])
-"""Axes point to the side of this vector: no axis of a symmetrical arrangement is at right angles to it."""
+"""Reference direction: axes point to its side, and no axis of a symmetrical arrangement is at right angles to
+it."""
 
 
 def symmetric_root(matrix: Array) -> Array:

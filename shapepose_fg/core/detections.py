@@ -1,4 +1,4 @@
-"""What the detector saw: 2D joint candidates of all views of one frame, and the affinities between them."""
+"""2D joint candidates of all views of one frame, and the affinities between them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ class Detections:
     affinity: Array
     """(E,) how well the image supports that the two belong to one person; a pair not listed has 0."""
     place: Index = None  # type: ignore[assignment]
-    """(D,) the place of each among those of its view in the recording, whatever was left out since; counted here
-    where it is not given."""
+    """(D,) index of each candidate among those of its view in the recording, independent of later filtering;
+    counted here where it is not given."""
     mirrored: Array = None  # type: ignore[assignment]
     """(D,) how probably each is of the other side of the body (`tracking/sides.py`); 0 where it is not given."""
 
@@ -52,7 +52,7 @@ class Detections:
 
     @cached_property
     def columns(self) -> tuple[Index, Index, Array, Index, Array]:
-        """View, joint, xy, pairs and affinity as kernels take them."""
+        """View, joint, xy, pairs and affinity in the order that kernels expect."""
         whole = (np.require(each, np.intp, ["C", "W"]) for each in (self.view, self.joint, self.pairs))
         view, joint, pairs = whole
         return (
@@ -65,19 +65,21 @@ class Detections:
 
     @cached_property
     def rank(self) -> Array:
-        """(D,) from 0 to 1, an order by what they are: equals are told apart by it, and not by their place."""
+        """(D,) rank by content, 0 to 1, which breaks ties independently of the order of the candidates."""
         rank = np.empty(len(self))
         rank[np.lexsort((*self.xy.T, self.confidence))] = np.arange(len(self)) / max(len(self), 1)
         return rank
 
     @cached_property
     def order(self) -> Index:
-        """(D,) the candidates by joint, then by view, then from left to right."""
+        """(D,) indices of the candidates sorted by joint, then by view, then from left to right."""
         return np.lexsort((self.xy[:, 0], self.view, self.joint))
 
     @cached_property
     def ties(self) -> tuple[Index, Index, Array]:
-        """Where the pairs of each candidate begin (D + 1,), their other ends (2 E,) and affinities (2 E,)."""
+        """(D + 1,) where the pairs of each candidate begin, (2 E,) their other ends and (2 E,) their
+        affinities.
+        """
         ends = self.pairs.ravel()
         by_end = np.argsort(ends, kind="stable")
         begin = np.searchsorted(ends[by_end], np.arange(len(self) + 1))
@@ -107,7 +109,7 @@ class Detections:
 
     @classmethod
     def joined(cls, parts: Sequence["Detections"]) -> "Detections":
-        """The candidates of several parts (one at least), one after the other, with the affinities of each."""
+        """The candidates of one or more parts, one part after the other, with the affinities of each."""
         names = ("view", "joint", "xy", "confidence", "affinity", "place", "mirrored")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         starts = np.cumsum([0, *(len(part) for part in parts)])
@@ -131,18 +133,18 @@ def _place_in_view(view: Index) -> Index:
 
 @dataclass(frozen=True)
 class Input:
-    """What the cameras give of one frame."""
+    """The input from all cameras for one frame."""
 
     frame: int
-    """Its number in the recording."""
+    """Number of the frame in the recording."""
     time_s: Array
-    """(V,) when each view was exposed, seconds."""
+    """(V,) times of exposure of the views, seconds."""
     detections: Detections
-    """What the detector saw."""
+    """The detections in all views."""
     rig: Rig
-    """Where the cameras were."""
+    """The cameras at the times of the views."""
     key: bool = True
-    """Whether people are sought in it. Detections of frames between keyframes are not thinned."""
+    """Whether new people are searched for in the frame. Detections of frames between keyframes are not thinned."""
 
 
 class DetectionSequence(Protocol):
@@ -182,10 +184,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class DerivedFrames:
-    """A recording that is made of another, frame by frame: the base of those that leave something out."""
+    """A recording that is derived from another, frame by frame: the base of those that leave something out."""
 
     frames: DetectionSequence
-    """The recording as it is."""
+    """The original recording."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -194,7 +196,7 @@ class DerivedFrames:
 
     @property
     def first(self) -> int:
-        """The first frame that the recording says anything of."""
+        """Number of the first frame in the recording."""
         return getattr(self.frames, "first", 0)
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""What all pictures of people share: a colour for each, lines between joints, and light surfaces."""
+"""What all visualisations share: a colour per person, bones between joints, and simplified surfaces."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,9 +7,9 @@ from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.skeleton import BODY_25
 
 PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
-"""After Okabe and Ito's: apart for every kind of colour vision."""
+"""Colours after Okabe and Ito, distinguishable with every kind of colour vision."""
 CELL_M = 0.02
-"""Edge of the cells of which `thinned` keeps one vertex each: a finger's width, too little to be seen across a
+"""Edge of the grid cells of which `thinned` keeps one vertex each, m: a finger's width, invisible across a
 room."""
 
 
@@ -20,7 +20,9 @@ def colour_of(person: int) -> tuple[float, float, float]:
 
 
 def bones_of(joint_names: tuple[str, ...]) -> Index:
-    """(B, 2) joints that a line joins: each of BODY_25 and the nearest joint towards the hip that is there."""
+    """(B, 2) pairs of joints to connect with lines: each joint of BODY_25 and the nearest existing one towards
+    the hip.
+    """
     rows = zip(BODY_25.joints, BODY_25.parents, strict=True)
     parents = {name: BODY_25.joints[parent] for name, parent in rows if parent >= 0} | {"Head": "Neck"}
     pairs = []
@@ -47,10 +49,12 @@ def vertex_normals(vertices: Real, faces: Whole) -> Array:
 def thinned(
     vertices: Array, faces: Whole, cell_m: float = CELL_M, corner: Array | float = 0.0
 ) -> tuple[Index, NDArray[np.int32], Index]:
-    """Which vertices (M,) of a mesh stay, its triangles (G, 3) among these, and which stands for each vertex (N,).
+    """Simplify a mesh: indices (M,) of the vertices that stay, triangles (G, 3) of these, and the one for each
+    vertex (N,).
 
-    Of the vertices in a cell of a grid, from its `corner` on, the one nearest to their middle stands for all of
-    them, and triangles that become lines or occur twice go (Rossignac and Borrel 1993). All stay if `cell_m` is 0.
+    Of the vertices in a cell of a grid, from its `corner` on, the one nearest to their mean stands for all of
+    them; triangles that become lines or occur twice are removed (Rossignac and Borrel 1993). All stay if `cell_m`
+    is 0.
     """
     if cell_m <= 0:
         every = np.arange(len(vertices))

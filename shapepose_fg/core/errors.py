@@ -1,4 +1,6 @@
-"""The one exception that a user is meant to read: what is wrong with the input, where, and the cure."""
+"""The exception whose message is written for the user: what is wrong with the input, where, and how to correct
+it.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,7 +8,7 @@ from importlib import import_module
 from types import ModuleType
 
 _LONGEST = 1000
-"""Characters of a message: what a file holds in place of a number can be of any length."""
+"""Maximum number of characters in a message: a file may hold a text of any length in place of a number."""
 
 
 class InputError(ValueError):
@@ -20,7 +22,7 @@ class InputError(ValueError):
 
 
 class NotDetermined(ValueError):
-    """A joint, or a body, has no place: who, which, when, and what is missing."""
+    """A joint, or a body, cannot be determined; the message names person, frame, joint and what is missing."""
 
     def __init__(self, person: int, joint: str, frame: int, time_s: float, missing: str):
         when = f" ({time_s:.3f} s)" if time_s == time_s else ""

@@ -1,4 +1,4 @@
-"""When each frame of a recording was taken, and where the recording is cut."""
+"""Times of the frames of a recording, and its cuts."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 
 _LEAST_FPS, _MOST_FPS = 1e-3, 1e6
-"""No recording of people is slower, or faster."""
+"""Lowest and highest accepted frame rate, Hz."""
 ASSUMED_FPS = 30.0
-"""Frames a second where nothing says how many."""
+"""Frame rate that is assumed where none is given, Hz."""
 
 
 def exact_rate(rate: float, apart: float) -> float:
-    """The rate that cameras have at most `apart` from `rate`; `rate` where there is none.
+    """The exact frame rate that cameras have within `apart` of `rate`; `rate` itself where there is none.
 
-    That is the nearest whole number or 1000 / 1001 of one (NTSC), else a fraction with up to 10 below the line.
+    The nearest whole number or 1000 / 1001 of one (NTSC), else a fraction with a denominator of up to 10.
     """
     whole, ntsc = Fraction(round(rate)), Fraction(1000 * round(1.001 * rate), 1001)
     nearest = min(whole, ntsc, key=lambda each: abs(each - Fraction(rate)))
@@ -28,15 +28,16 @@ def exact_rate(rate: float, apart: float) -> float:
 
 
 def typed_rate(fps: float) -> float:
-    """What a rate means that somebody, or a file, wrote in a few digits: 29.97 is 30000 / 1001."""
+    """The exact rate for one that a user or a file gives with a few digits: 29.97 is 30000 / 1001."""
     return exact_rate(fps, 2e-6 * fps)
 
 
 def rate_of(time_s: Array) -> float:
-    """Frames a second of frames at rising times (T,), T at least 2; exact where times are rounded, or jitter.
+    """Frame rate of frames at rising times (T,), T at least 2; exact where times are rounded, or jitter.
 
-    A step that is twice the median is a frame that was dropped, and so on. The rate is as uncertain as the times
-    are off the line through them; where they are off by more than a quarter of a step, the median says it.
+    A step that is twice the median is counted as a dropped frame, and so on. The rate is as uncertain as the times
+    are off the line through them; where they are off by more than a quarter of a step, the median step gives the
+    rate.
     """
     time_s = time_s - time_s[0]
     steps, lasts = np.diff(time_s), float(time_s[-1])
@@ -60,7 +61,7 @@ class FrameTimes:
     time_s: Array
     """(T,) seconds; or (T, V), a column for each camera, where they are not synchronised."""
     source: str = "given"
-    """Where the times come from: "assumed", "fps", "given", or the name of a file."""
+    """Source of the times: "assumed", "fps", "given", or the name of a file."""
 
     def __post_init__(self) -> None:
         """Check that times are finite and rise; ValueError naming the first frame that does not."""
@@ -92,7 +93,9 @@ class FrameTimes:
 
     @classmethod
     def assumed(cls, frames: int) -> "FrameTimes":
-        """`frames` frames at 30 a second, because nothing says how many; run.json says so."""
+        """Times of `frames` frames at 30 Hz, for recordings that state no rate; run.json says that it was
+        assumed.
+        """
         return cls(np.arange(frames) / ASSUMED_FPS, source="assumed")
 
     @property
@@ -112,13 +115,13 @@ class FrameTimes:
             raise ValueError(f"times need a column for each of the {views} cameras, got {self.time_s.shape[1]}")
 
     def as_dict(self) -> dict[str, Any]:
-        """What run.json says of the times: where they come from, and the rate."""
+        """The entry of run.json about times: their source, and the rate."""
         rate = rate_of(self.frame_s) if len(self) > 1 else None
         return {"source": self.source, "fps": rate, "per_camera": self.time_s.ndim == 2}
 
 
 def rate_words(run: Mapping[str, Any]) -> str:
-    """The rate that a result's `run` tells of, and whether it was assumed; empty where it tells of none."""
+    """The rate in a result's `run` in words, and whether it was assumed; empty where there is none."""
     told = run.get("time") or {}
     if told.get("fps") is None:
         return ""
@@ -146,7 +149,7 @@ def segments(frames: range, cuts: Sequence[int]) -> list[range]:
 
 
 def spans_of(frames: Iterable[int]) -> list[range]:
-    """Frames as ranges of those that follow each other."""
+    """Group frames into ranges of consecutive ones."""
     ordered = sorted(set(frames))
     edges = [0, *(at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1), len(ordered)]
     return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges) if b > a]

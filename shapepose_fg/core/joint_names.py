@@ -1,4 +1,4 @@
-"""What other programs call joints, and orders of joints: which point of the body a name means."""
+"""Names of joints in other programs, and the points of the body that they mean."""
 
 import re
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ _ALIASES = {
     "LSP_14": "lsp lsp14 lspet",
     "BLAZEPOSE_33": "blazepose mediapipe mediapipepose blazepose33",
 }
-"""What programs call each layout, without case and separators. OpenPose's and Pose2Sim's COCO and MPII are not
-COCO's and MMPose's: the number of keypoints tells them apart."""
+"""Names of each layout in other programs, without case and separators. OpenPose's and Pose2Sim's COCO and MPII
+are not COCO's and MMPose's: the number of keypoints distinguishes them."""
 
 
 def layouts_called(name: str) -> list[Skeleton]:
@@ -42,7 +42,7 @@ def layouts_called(name: str) -> list[Skeleton]:
 
 
 _LONGEST = 64
-"""Characters of a name that are looked at; no joint has a longer one."""
+"""Maximum number of characters of a name that are read; no joint has a longer one."""
 _SIDED = {
     "Shoulder": "shoulder sho",
     "Elbow": "elbow elb",
@@ -59,7 +59,7 @@ _SIDED = {
     "foot": "foot forefoot",
     "hand": "hand",
 }
-"""Joints on both sides: the body's name without its side, and what others call it."""
+"""Joints on both sides: the body's name without its side, and its names in other programs."""
 _MIDDLE = {
     "Nose": "nose",
     "Neck": "neck neckbase baseneck shoulder shoulders thorax sternum spineshoulder",
@@ -70,7 +70,7 @@ _MIDDLE = {
     "spine2": "spine2 spine torso spinemid",
     "spine3": "spine3 chest spinechest",
 }
-"""Joints in the middle, the same way."""
+"""Joints in the middle: the body's name, and its names in other programs."""
 _PART_OF_SIDE = {word: part for part, words in _SIDED.items() for word in words.split()}
 _BONES = {
     **dict.fromkeys(("upleg", "thigh", "upperleg"), "Hip"),
@@ -78,9 +78,9 @@ _BONES = {
     **dict.fromkeys(("arm", "upperarm"), "Shoulder"),
     **dict.fromkeys(("forearm", "lowerarm"), "Elbow"),
 }
-"""Where joints are called after the bones that begin there: Apple's, Mixamo's."""
+"""Joints by the bones that begin there, after which Apple and Mixamo name them."""
 _LEFT_OUT = {"mid", "middle", "center", "centre", "joint", "jc", "c", "of", "the", "keypoint", "landmark"}
-"""Words that say nothing: in the middle is what has no side."""
+"""Words that are ignored: a joint without a side is in the middle."""
 _SIDES = {"l": "L", "left": "L", "r": "R", "right": "R"}
 
 
@@ -106,9 +106,9 @@ def _side_and_part(words: Sequence[str]) -> tuple[str, str]:
 def body_points(names: Sequence[str]) -> list[str]:
     """The point of the body that each of a file's joint `names` means, "" for those that mean none.
 
-    Case, separators and where the side is written do not count. Where a name means one thing beside some others
-    and another alone, the others tell: a foot is the ankle where no ankle is named, and a head the top of the head
-    where no top is. Bones mean the joint at which they begin where a thigh is named.
+    Case, separators and the position of the side do not count. An ambiguous name depends on the others: a foot is
+    the ankle where no ankle is named, and a head the top of the head where no top is. Bones mean the joint at
+    which they begin where a thigh is named.
     """
     short = (name[:_LONGEST] for name in names)
     every = [_words(re.sub(r"\(.*?\)", "", name) or name) for name in short]

@@ -1,8 +1,8 @@
-"""Where compiled functions are kept between runs.
+"""The cache of compiled functions between runs.
 
-Numba keeps compiled functions beside their source, as long as that file is the same. Here each module with kernels
-has a folder, named by a digest of its source and of all sources that its kernels call into, and Numba is shown the
-copy of the source in there. What is kept is therefore never stale, and all installations of a user share it.
+Numba caches compiled functions beside their source, as long as that file is the same. Here each module with
+kernels has a folder, named by a digest of its source and of all sources that its kernels call, which has a copy of
+the source that Numba uses. The cache is therefore never stale, and all installations of a user share it.
 """
 
 import atexit
@@ -27,19 +27,19 @@ OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "reassoc"},
     "no_cfunc_wrapper": True,
 }
-"""Numba's options of everything that is compiled."""
+"""Options of Numba for all compiled functions."""
 NUMBA: Any = cast(Any, numba).config
 """Numba's own settings, from its environment variables."""
 _GIVEN = "SHAPEPOSE_FG_KERNELS"
 """Environment variable that names a process's temporary folder to the processes that it starts."""
 _SPACE = 50_000_000
-"""Free bytes that are needed: ten times what all kernels take."""
+"""Minimum free space on the disk, bytes: ten times the size of all kernels."""
 _VERSIONS = 16
-"""Number of folders that are kept of a module: for several checkouts, Python versions, processors."""
+"""Maximum number of cached folders per module: for several checkouts, Python versions, processors."""
 
 
 def wanted_folder() -> Path:
-    """Where compiled functions belong: below NUMBA_CACHE_DIR, or in the user's cache."""
+    """The folder for compiled functions: below NUMBA_CACHE_DIR, or in the user's cache."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(given).absolute() / "shapepose-fg"
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
@@ -48,8 +48,8 @@ def wanted_folder() -> Path:
 
 @cache
 def kept_folder() -> Path | None:
-    """Where compiled functions are kept: where they belong; where that cannot be written, in a temporary folder of
-    this process and of those that it starts; None where nothing can be written.
+    """The folder that is used for compiled functions: the wanted one; where it cannot be written, a temporary
+    folder of this process and its children; None where nothing can be written.
     """
     wanted = wanted_folder()
     if given := os.environ.get(_GIVEN):

@@ -1,4 +1,4 @@
-"""What a lens does to pixels, and how that is undone: OpenCV's models, for intrinsics that may be skewed."""
+"""Lens distortion and its inverse: OpenCV's models, also for intrinsics with skew."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -11,12 +11,13 @@ from shapepose_fg.core.arrays import Array
 Lens = Literal["perspective", "fisheye"]
 """OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant fisheye."""
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
-"""How many coefficients OpenCV's functions take for each kind of lens."""
+"""Numbers of coefficients that OpenCV's functions accept, for each kind of lens."""
 _UNDONE_PX = 0.5
-"""A point that comes back farther than this from where it was has no place without distortion: the polynomial of
-the lens does not reach it. Where there is one, OpenCV's iteration ends within 1e-6 px of it."""
+"""Maximum error of distorting an undistorted point again, pixels. Beyond it, the lens's polynomial does not
+reach the point and it has no undistorted place. Where there is one, OpenCV's iteration ends within 1e-6 px of
+it."""
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-"""Steps and accuracy, in normalised coordinates, of undoing a distortion."""
+"""Steps and accuracy, in normalised coordinates, of the iteration that inverts a distortion."""
 
 
 def undistorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:

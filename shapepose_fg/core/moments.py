@@ -1,4 +1,4 @@
-"""Which pictures of several cameras belong to one moment: the nearest, at most half a frame away."""
+"""Synchronised frame sets: groups the pictures of several cameras by time, at most half a frame apart."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,50 +9,50 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 
 _SAME_RATE = 0.01
-"""Rates that differ by less than this share are the same."""
+"""Relative difference below which two frame rates are the same."""
 _MISFIT_S = 1e-4
-"""Cameras whose pictures of one moment are no farther apart than this are synchronised."""
+"""Largest spread of the times of a frame set, s, up to which cameras count as synchronised."""
 
 
 @dataclass(frozen=True)
 class CameraClock:
-    """When one camera took its frames."""
+    """The times of one camera's frames."""
 
     name: str
-    """The camera."""
+    """The camera's name."""
     time: Array
     """(N,) times of its frames on the common clock, rising; seconds, or frames where there is no clock."""
     period: float
-    """From one frame to the next, in the same unit."""
+    """Time from one frame to the next, in the same unit."""
 
 
 @dataclass(frozen=True)
 class Moments:
-    """The moments of a recording, and each camera's picture of each."""
+    """The synchronised frame sets of a recording: one picture of each camera per set."""
 
     picture: Index
-    """(T, V) place of each camera's frame; -1 where it has none within half a frame."""
+    """(T, V) index of each camera's picture; -1 where it has none within half a frame."""
     time_s: Array | None
-    """(T, V) when those frames were taken, seconds; where there is none, the moment, or NaN where it is not known
-    when cameras began. None without a clock."""
+    """(T, V) times of these pictures, seconds; the time of the set where there is no picture, or NaN where it
+    is not known when cameras began. None without a clock."""
     notes: tuple[str, ...]
-    """What was left out, and how far pictures of one moment are apart."""
+    """Notes on what was left out, and on how far the pictures of a set are apart in time."""
 
     def __len__(self) -> int:
         return len(self.picture)
 
     @property
     def synchronised(self) -> bool:
-        """Whether all cameras took each moment's pictures at one time."""
+        """Whether all cameras took the pictures of a set at the same time."""
         return self.time_s is None or bool(np.ptp(self.time_s, axis=1).max(initial=0.0) <= _MISFIT_S)
 
 
 def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --start") -> Moments:
-    """The moments that all cameras saw.
+    """Group the pictures of all cameras into synchronised frame sets.
 
-    They are those of the slowest camera (of several the one with most frames), from where the last camera starts
-    to where the first one ends. A picture stands for one moment. InputError, which ends with the `cure`, where
-    there are none.
+    The sets follow the slowest camera (of several the one with most frames), from where the last camera starts to
+    where the first one ends. A picture belongs to one set. InputError, which ends with the `cure`, where there are
+    none.
     """
     first = max(each.time[0] - each.period / 2 for each in clocks)
     last = min(each.time[-1] + each.period / 2 for each in clocks)
@@ -95,7 +95,7 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
 
 
 def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
-    """Every camera's pictures under numbers of its own, because it is not known when cameras began.
+    """Group pictures by number, each camera's counted from its own first, because start times are not known.
 
     Only pictures between those of the slowest camera are left out: frame t of a camera is the picture nearest to t
     of its periods after the camera's own first.
@@ -123,7 +123,9 @@ def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
 
 
 def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:
-    """(T,) place of the frame nearest to each moment, -1 where it is more than half a frame away; and how far."""
+    """(T,) index of the frame nearest to each time, -1 where it is more than half a frame away; and the
+    distance in time.
+    """
     after = np.clip(np.searchsorted(clock.time, moment), 0, len(clock.time) - 1)
     before = np.maximum(after - 1, 0)
     nearer = np.abs(clock.time[before] - moment) <= np.abs(clock.time[after] - moment)
@@ -138,7 +140,7 @@ def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:
 
 
 def _left_out(clock: CameraClock, place: Index, moment: float) -> str:
-    """How many frames a camera took before and after the moments, which follow each other after `moment`."""
+    """The number of frames that a camera took before and after the sets, in words; sets are `moment` apart."""
     used = place[place >= 0]
     ends = [(int(used[0]), "start"), (int(len(clock.time) - 1 - used[-1]), "end")] if len(used) > 0 else []
     # A faster camera always has frames between the moments.

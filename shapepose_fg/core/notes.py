@@ -1,4 +1,4 @@
-"""What a run notes down for run.json, window by window: times, who is how probable, dropped, or not solved."""
+"""Notes of a run for run.json, window by window: times, evidence, dropped people, joints that were not solved."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,16 +13,16 @@ from shapepose_fg.core.detections import Input
 
 @dataclass(frozen=True)
 class Problem:
-    """What went wrong with one joint of one person in one frame."""
+    """A problem with one joint of one person in one frame."""
 
     row: int
     """Row of the solution."""
     track: int
-    """Who."""
+    """The track."""
     frame: int
-    """When."""
+    """The frame."""
     joint: int
-    """Which joint, an index into the skeleton."""
+    """Index of the joint in the skeleton."""
     reason: str
     """What happened, in words."""
 
@@ -41,24 +41,25 @@ class Notes:
     frames: _Count = 0
     """Number of frames that the notes are about."""
     seconds: dict[str, _Number] = field(default_factory=dict)
-    """Time per stage, over all processes."""
+    """Time per stage, s, summed over all processes."""
     evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
     """Sum of the evidence (`Observations.evidence`) of each track's rows, and the number of these rows."""
     probable: dict[str, _Count] = field(default_factory=dict)
     """Number of rows of single frames by their probability, in tenths rounded down."""
     dropped: _Frames = field(default_factory=dict)
-    """The frames in which people were none, or too little is seen of, for each reason; a person, a frame."""
+    """Frames in which people were dropped, by reason; one entry per person and frame."""
     thinned_frames: _Frames = field(default_factory=dict)
-    """The frames of which something was left out, because it was too much."""
+    """Frames in which detections, points or candidates were left out because there were too many, by what was
+    left out."""
     repeated_pictures: _Frames = field(default_factory=dict)
-    """The frames in which a camera, by its name, showed the picture before once more."""
+    """Frames in which a camera, by its name, repeated the previous picture."""
     problems: list[Problem] = field(default_factory=list)
-    """What could not be solved."""
+    """Problems that were met."""
     factors: dict[str, tuple[_Count, _Count]] = field(default_factory=dict)
-    """How many factors each function of the user's made, and how many of them were inactive."""
+    """Number of factors that each of the user's functions made, and number of them that were inactive."""
 
     def add(self, other: "Notes") -> None:
-        """Take in the notes of what comes next."""
+        """Add the notes of the frames that follow."""
         self.frames += other.frames
         both: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
         for mine, more in both:
@@ -81,7 +82,7 @@ class Notes:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
-        """What `as_dict` gave; ValueError where `values` are something else."""
+        """The notes from the result of `as_dict`; ValueError where `values` are something else."""
         try:
             return TypeAdapter(cls).validate_python(values)
         except ValidationError as error:
@@ -90,7 +91,7 @@ class Notes:
 
 
 class Notebook:
-    """Notes that are being taken."""
+    """Collects notes while the pipeline runs."""
 
     def __init__(self) -> None:
         self._notes = Notes()
@@ -99,7 +100,7 @@ class Notebook:
         self._searched: int | None = None
 
     def search(self, frame: int) -> None:
-        """New people are sought in a frame, one of many that are looked at: what is thinned now is of this one."""
+        """Set the frame to which notes on thinning belong: the one in which new people are searched for."""
         self._searched = frame
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
@@ -110,20 +111,20 @@ class Notebook:
             noted += [frame] if frame not in noted[-1:] else []
 
     def repeat(self, cameras: Sequence[str], frame: int) -> None:
-        """Note down the cameras whose picture of a frame is the one before."""
+        """Note the cameras whose picture of a frame repeats the previous one."""
         for camera in cameras:
             self._notes.repeated_pictures.setdefault(camera, []).append(frame)
 
     def drop(self, reason: str, count: int) -> None:
-        """Note down people of the present frame who were none, or too little is seen of.
+        """Note people of the present frame who were dropped: false positives, or seen by too little.
 
-        Over time there is no present frame: blocks of frames are looked at, each many times.
+        Over time there is no present frame: blocks of frames are read, each many times.
         """
         if self._frame is not None:
             self.drop_in(reason, [self._frame] * count)
 
     def drop_in(self, reason: str, frames: Sequence[int]) -> None:
-        """Note down somebody who was not kept, in all of these frames."""
+        """Note that a person was dropped in all of these frames."""
         self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
@@ -134,7 +135,7 @@ class Notebook:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a block to a stage, but for that of stages inside it."""
+        """Add the time of a block to a stage, without that of stages inside it."""
         start, outside, self._inner = time.perf_counter(), self._inner, 0.0
         yield
         whole = time.perf_counter() - start
@@ -142,6 +143,6 @@ class Notebook:
         self._inner = outside + whole
 
     def flush(self) -> Notes:
-        """What was noted since the last time, which is forgotten here."""
+        """Return the notes since the last call, and start new ones."""
         notes, self._notes = self._notes, Notes()
         return notes

@@ -1,4 +1,4 @@
-"""What each row of a result was solved from: per joint and view the detection, its residual, and its gate."""
+"""What each row of a result was solved from: detections, residuals and gates per joint and view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from shapepose_fg.core.storage.schema import Column, Table, code_names
 
 
 class Gate(IntEnum):
-    """Whether a detection was used for a joint, and why not."""
+    """Whether a detection was used for a joint, and the reason if not."""
 
     NOT_SEEN = 0
     """The view has no detection for this joint."""
@@ -30,7 +30,7 @@ class Gate(IntEnum):
     TOO_FAR = 2
     """Farther than rho_2D from the projected joint (delta_ij = 0 in Eq. 2)."""
     CONTRADICTS_BODY = 3
-    """Views agree on a place where the rest of the body cannot have the joint: they saw somebody else's."""
+    """Views agree on a place that contradicts the rest of the body: their detections belong to another person."""
     BEHIND_CAMERA = 4
     """The joint is behind this camera, or nearer than 0.2 m."""
     NOT_PLACED = 5
@@ -50,7 +50,8 @@ class ObservationTable(Table):
     view_names: Annotated[NDArray[np.str_], Column("V", np.str_)]
     """(V,) names of the cameras."""
     candidate: Annotated[NDArray[np.int32], Column("N J V", np.int32)]
-    """(N, J, V) which detection: its place among all those of its view in this frame; -1 for none, or not said."""
+    """(N, J, V) index of the detection among those of its view in this frame; -1 for none, or where not
+    recorded."""
     xy: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
     """(N, J, V, 2) where the detection lies, undistorted pixels; NaN where there is none."""
     confidence: Annotated[NDArray[np.float32], Column("N J V", np.float32)]
@@ -60,10 +61,10 @@ class ObservationTable(Table):
     gate: Annotated[NDArray[np.uint8], Column("N J V", np.uint8, codes=Gate)]
     """(N, J, V) codes of `Gate`."""
     probability: Annotated[NDArray[np.float32], Column("N J V", np.float32, missing=1.0)] = None  # type: ignore[assignment]
-    """(N, J, V) how probable it is that the detection is this person's; 0 where there is none.
-    1 where it is not said, as in files of before."""
+    """(N, J, V) probability that the detection is this person's; 0 where there is none, 1 in files without this
+    column."""
     lead_s: Annotated[NDArray[np.float32], Column("N V", np.float32, "s", missing=0.0)] = None  # type: ignore[assignment]
-    """(N, V) how long after the row's time each view was exposed, seconds; 0 in older files."""
+    """(N, V) time of exposure of each view after the row's time, seconds; 0 in older files."""
 
     ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability lead_s".split()
 
@@ -112,12 +113,12 @@ class ObservationTable(Table):
         joint_names: Sequence[str],
         carried: Observations | None = None,
     ) -> "ObservationTable":
-        """The table of N solved rows: what they observed, and where their `joints` (N, J, 3) came to lie.
+        """The table of N solved rows: what they observed, and their `joints` (N, J, 3) as solved.
 
-        The rows are of the observations' `frame`, and of the person `track`. `place` (N, J, V) is each one's
-        `Detections.place`, `gate` (N, J, V) the codes of `Gate`; what was not seen is recorded as that, whatever
-        is there, and what was not used because the joint is not placed, or behind the camera, as that. `carried`
-        are the same observations as they would be at the frames' time, where views are out of step.
+        The rows have the observations' `frame` and `track` (as the person). `place` (N, J, V) is each detection's
+        `Detections.place`, `gate` (N, J, V) are the codes of `Gate`; missing detections, joints without a place
+        and points behind a camera get their own codes, whatever `gate` holds. `carried` are the observations moved
+        to the frames' time, where views are asynchronous.
         """
         here = observations if carried is None else carried
         seen = observations.seen
@@ -155,10 +156,10 @@ class ObservationTable(Table):
         return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
 
     def observations(self, initial: Array, time_s: Array) -> Observations:
-        """The rows as they were given to be solved, dropped detections too: to solve them anew.
+        """The rows as observations, dropped detections included, from which they can be solved again.
 
-        `initial` (N, J, 3) is where to begin, `time_s` (N,) when the rows' frames were taken. Which detection each
-        observation was is not told: there a view's detections are counted over all views, here in their own.
+        `initial` (N, J, 3) are the initial joints, `time_s` (N,) the times of the rows' frames. The index of each
+        detection is not recovered: `Detections` count over all views, and this table in each view.
         """
         seen = self.gate != Gate.NOT_SEEN
         return Observations(
@@ -172,7 +173,7 @@ class ObservationTable(Table):
         )
 
     def unseen(self, frame: Whole) -> "ObservationTable":
-        """Rows of the same people in other frames, `frame` (N,), in which no view saw anything."""
+        """Rows of the same people in other frames, `frame` (N,), without detections."""
         nothing = {name: np.full_like(getattr(self, name), np.nan) for name in ("xy", "residual_px")}
         nothing |= {
             name: np.zeros_like(getattr(self, name)) for name in "confidence gate probability lead_s".split()
@@ -185,7 +186,7 @@ class ObservationTable(Table):
         return self.gate == Gate.USED
 
     def reasons(self) -> dict[str, int]:
-        """How many detections have each gate, in words; those that were not seen are left out."""
+        """Number of detections per gate, by the gate's name; missing detections are left out."""
         count = np.bincount(self.gate.ravel(), minlength=len(Gate))
         names = code_names(Gate).tolist()
         return {names[gate]: int(count[gate]) for gate in Gate if gate != Gate.NOT_SEEN}
@@ -205,7 +206,7 @@ class ObservationTable(Table):
 
     @classmethod
     def open(cls, file: Path, run_id: object = None) -> "SavedTable[ObservationTable]":
-        """What `load` reads, of which rows come into memory when they are asked for."""
+        """Open the file that `load` reads; its rows come into memory when they are read."""
         opened = SavedTable(file, ObservationTable, "give the observations.npz of a reconstruction")
         try:
             check_id(run_id, opened.run_id, file)

@@ -1,4 +1,4 @@
-"""Whose 2D detections are whose: what stage I and the tracker give, and stage II is solved from."""
+"""Detections assigned to people: the output of stage I and of the tracker, and the input of stage II."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.storage.schema import Column, Table
 
 _LATER: Any = None
-"""In place of a column that is not given."""
+"""Default of a column that is not given."""
 
 
 @dataclass(frozen=True)
@@ -19,27 +19,29 @@ class Observations(Table):
     """The 2D observations of N rows: a row is one person (track) in one frame."""
 
     xy: Annotated[Array, Column("N J V 2", unit="px")]
-    """(N, J, V, 2) where view v saw joint j of the person, undistorted pixels; 0 where it did not."""
+    """(N, J, V, 2) detections of joint j in view v, undistorted pixels; 0 where there is none."""
     confidence: Annotated[Array, Column("N J V")]
-    """(N, J, V) w_ij of Eq. 1, the detector's score; 0 where the view did not see the joint."""
+    """(N, J, V) w_ij of Eq. 1, the detector's score; 0 where there is no detection."""
     initial: Annotated[Array, Column("N J 3", unit="m")]
-    """(N, J, 3) X_0: where stage I, or a track, puts the joints, metres; NaN where it does not know."""
+    """(N, J, 3) X_0: initial joints from stage I, or from a track, metres; NaN where unknown."""
     track: Annotated[Index, Column("N", np.intp)] = _LATER
-    """(N,) who it is, over time; 0 to N - 1 where it is not said."""
+    """(N,) number of the track; 0 to N - 1 where it is not given."""
     frame: Annotated[Index, Column("N", np.intp, missing=0)] = _LATER
-    """(N,) frame of the row; 0 where it is not said."""
+    """(N,) frame of the row; 0 where it is not given."""
     time_s: Annotated[Array, Column("N V", unit="s", missing=0.0)] = _LATER
     """(N, V) when each view was exposed, seconds, the middle of its picture: equal in a row if
     cameras are synchronised. 0 by default."""
     candidate: Annotated[Index, Column("N J V", np.intp, missing=-1)] = _LATER
-    """(N, J, V) which detection of the row's frame each observation is; -1 for none, or not said."""
+    """(N, J, V) index of the observation among the detections of the row's frame; -1 for none, or where not
+    given."""
     probability: Annotated[Array, Column("N J V", missing=1.0)] = _LATER
-    """(N, J, V) how probable it is that the observation is this person's; 1 where it is not said."""
+    """(N, J, V) probability that the observation is this person's; 1 where it is not given."""
     mirrored: Annotated[Array, Column("N J V", missing=0.0)] = _LATER
-    """(N, J, V) how probably the observation is of the other side of the body; 0 where it is not said."""
+    """(N, J, V) probability that the observation belongs to the other side of the body; 0 where it is not
+    given."""
     evidence: Annotated[Array, Column("N", missing=np.nan)] = _LATER
-    """(N,) what speaks for the person being there at all: over time `tracking/presence.py`, `own_evidence`, frame
-    by frame a probability; NaN where it is not said."""
+    """(N,) evidence for the existence of the person: over time that of `tracking/presence.py`, `own_evidence`;
+    frame by frame a probability; NaN where it is not given."""
 
     def __post_init__(self) -> None:
         if self.track is None:
@@ -67,7 +69,7 @@ class Observations(Table):
 
 
 def rows_in(before: Observations, now: Observations) -> Index:
-    """(N,) where the rows of `now` stand among those `before`: the same people, fewer or in another order."""
+    """(N,) indices of the rows of `now` among those `before`: the same people, fewer or in another order."""
     most = 1 + max(before.track.max(initial=0), now.track.max(initial=0))
     was, key = (each.frame * most + each.track for each in (before, now))
     order = np.argsort(was, kind="stable")

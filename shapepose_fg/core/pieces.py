@@ -1,4 +1,4 @@
-"""Pieces of kernels that several files share: a camera's view of a point, and what views say of the point.
+"""Parts of kernels that several files share: projection into a camera, and triangulation.
 
 A `camera` (3, 4) is K [R | t]; a point is (3,) in the world; pixels are undistorted.
 """
@@ -10,7 +10,7 @@ from shapepose_fg.core.compiled import part
 ROBUST = {None: 0, "none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 """Robust kernels by their number in compiled functions."""
 _STEPS = 3
-"""How often a point is triangulated with weights made anew."""
+"""Number of times that a point is triangulated with new robust weights."""
 
 
 @part
@@ -49,9 +49,10 @@ def add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
 
 @part
 def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight, x):
-    """Put the point that pixels `uv` (V, 2) are of into `x` (3,), and return how many views agree, whose rays
-    pass within `reach_m`. It is linear, with weights by confidence `sure` (V,), 0 for none, under a Cauchy kernel
-    of `scale_m`, made anew in turn; `weight` (V,) is room for these.
+    """Triangulate pixels `uv` (V, 2) into `x` (3,), and return how many views have rays within `reach_m` of it.
+
+    Linear least squares with weights by confidence `sure` (V,), 0 for none, under a Cauchy kernel of `scale_m`,
+    reweighted in each step; `weight` (V,) is scratch space.
     """
     for v in range(len(sure)):
         weight[v] = sure[v]

@@ -1,4 +1,4 @@
-"""Where a result comes from: versions of what ran, and checksums of what was read."""
+"""The origin of a result: versions of the software, and checksums of the inputs."""
 
 import hashlib
 import platform
@@ -18,11 +18,11 @@ _PACKAGES = {
     "numba": ("numba",),
     "opencv": ("opencv-python-headless", "opencv-python", "opencv-contrib-python"),
 }
-"""Name in run.json, and the distributions that provide it."""
+"""Distributions that provide each entry of run.json's versions."""
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide about numbers; nothing is imported for it."""
+    """Versions of Python and of the packages that affect the numbers; nothing is imported to find them."""
     found = {"python": platform.python_version()} | dict.fromkeys(_PACKAGES, "not installed")
     for name, distributions in _PACKAGES.items():
         for distribution in reversed(distributions):
@@ -32,11 +32,11 @@ def versions() -> dict[str, str]:
 
 
 _INPUTS = (".txt", ".json", ".toml", ".yml", ".yaml", ".xml")
-"""Files of a folder that may be read: calibrations and detections."""
+"""Suffixes of the files in a folder that count as inputs: calibrations and detections."""
 
 
 def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
-    """sha256 of every input file; of a folder, of its files of numbers by name and content.
+    """SHA-256 of every input file; for a folder, one of the names and contents of its data files.
 
     A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
     """
@@ -44,9 +44,9 @@ def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
 
 
 class ReadInputs:
-    """Input files while they are read: their checksums are those of what was read, or it is said.
+    """Input files while they are read; detects files that change meanwhile.
 
-    Made before anything is read; `checksums` comes when all has been.
+    Create it before anything is read, and call `checksums` when everything has been.
     """
 
     def __init__(self, paths: Iterable[str | Path | None]) -> None:
@@ -66,7 +66,7 @@ class ReadInputs:
 
 
 def program_digest() -> str:
-    """sha256 of this program itself, its data included: whether two runs are by the same version."""
+    """SHA-256 of this program and its data: equal for two runs of the same version."""
     here, data = Path(__file__).parents[1], (".py", ".npz", ".json", ".safetensors")
     parts = (_digest(package, data) for package in (here, here.with_name("factors")))
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()
@@ -77,7 +77,7 @@ def _files(folder: Path, endings: tuple[str, ...]) -> Iterator[Path]:
 
 
 def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
-    """Size and time of last change, as one number, of files, and of the files of numbers in folders.
+    """Size and modification time, as one number, of files, and of the data files in folders.
 
     Plain values: hours of footage are half a million files.
     """
@@ -89,7 +89,7 @@ def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
 
 
 def _digest(path: Path, endings: tuple[str, ...]) -> str:
-    """sha256 in hexadecimal of a file, or of those of a folder with these endings."""
+    """SHA-256 in hexadecimal of a file, or of those of a folder with these suffixes."""
     try:
         if path.is_dir():
             whole = hashlib.sha256()

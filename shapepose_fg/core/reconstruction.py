@@ -1,4 +1,4 @@
-"""What comes out: the people of every frame, as arrays with one row per person and frame."""
+"""The result: the people of every frame, as arrays with one row per person and frame."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -25,18 +25,18 @@ from shapepose_fg.core.storage.schema import Column, Table
 
 
 class Status(StrEnum):
-    """How far the reconstruction of one person in one frame came."""
+    """Status of the reconstruction of one person in one frame."""
 
     OK = "ok"
     """Joints and body are determined."""
     TOO_FEW_VIEWS = "too few views"
-    """No joint is seen by two views, or too few are: nothing fixes the person in space."""
+    """No joint is seen by two views, or too few are: the person's place is not determined."""
     BODY_UNDETERMINED = "body undetermined"
-    """Joints are there, but too few of them to fit a body; what no view saw stays NaN."""
+    """Joints are determined, but too few of them to fit a body; joints that no view saw are NaN."""
     CONTRADICTED = "views contradict"
-    """Too few views are left without those that contradict each other, of which nothing says who is wrong."""
+    """Some views contradict each other, it is unknown which is wrong, and too few are left without them."""
     NOT_SOLVED = "not solved"
-    """A joint ran away from what was seen of it, or nothing determines it: `run` names person, frame and joint."""
+    """A joint diverged from its detections, or nothing determines it: `run` names person, frame and joint."""
 
 
 class Known(IntEnum):
@@ -52,8 +52,8 @@ class Known(IntEnum):
     MOTION = 3
     """Neither: carried by motion from the frames before and after."""
     WEAK = 4
-    """Less than two such views: a joint that one view saw, or whose detections are hardly sure. Body and motion
-    have as much to say."""
+    """Fewer than two such views: a joint that one view saw, or whose detections have a low probability. Body
+    and motion contribute as much."""
 
     @classmethod
     def observed(cls, known: Whole) -> Mask:
@@ -66,7 +66,7 @@ BODY = ("betas", "global_orient", "body_pose", "transl")
 MOST_NUMBER = 2**53 - 1
 """The highest number of a frame or a person: the last whole number that all real ones below it are."""
 _LATER: Any = None
-"""In place of a column that is not given: nothing is known of it."""
+"""Default of a column that is not given: unknown values."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Reconstruction(Table):
     known: Annotated[NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)] = _LATER
     """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
     run: dict[str, Any] = field(default_factory=dict)
-    """How this came about: configuration, versions, checksums, times (goes to run.json)."""
+    """Origin of the result: configuration, versions, checksums, times (stored in run.json)."""
     observations: ObservationTable | None = None
-    """What each row was solved from, row by row (goes to observations.npz); None where that is not recorded."""
+    """Detections that each row was solved from (stored in observations.npz); None where they are not recorded."""
     shapes: SubjectShapes | None = None
     """The shape of each identity with its covariance, named by its number; `save` leaves them out."""
     rig: Rig | None = None
@@ -185,7 +185,7 @@ class Reconstruction(Table):
         return replace(self, person=person, observations=table)
 
     def counts(self) -> dict[str, Any]:
-        """What run.json says of the rows: how many, with which status, and how their joints are known."""
+        """The entry of run.json about the rows: their number, statuses, and how their joints are known."""
         return count_rows([(self.status, self.known)])
 
     def save(self, folder: str | Path, rig: Rig | None = None) -> None:
@@ -223,15 +223,15 @@ class Reconstruction(Table):
 
     @classmethod
     def open(cls, path: str | Path) -> "OpenedReconstruction":
-        """What `load` reads, of which rows come into memory when they are asked for."""
+        """Open the result that `load` reads; its rows come into memory when they are read."""
         return OpenedReconstruction(Path(path))
 
 
 class OpenedReconstruction(ExitStack):
-    """A saved result, open: who is where is in memory, rows are read when they are asked for.
+    """A saved result, open: frames and people are in memory, other columns are read by rows.
 
-    A context, at whose end the files are closed. Who asks for frames in rising order unpacks the files once. What
-    is read is checked as `Reconstruction.load` does; the files' own checksums are, where all rows are read.
+    A context manager that closes the files. Reading frames in rising order decompresses the files once. Rows are
+    checked as `Reconstruction.load` does; checksums of the files where all rows are read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -247,7 +247,7 @@ class OpenedReconstruction(ExitStack):
             self.frame, self.person = (self._people.column(name) for name in ("frame", "person"))
             """(N,) frame of each row, and identity of each row's person."""
             self.run = _read_run(file.with_name(RUN), self._people.run_id)
-            """What run.json says."""
+            """Content of run.json."""
             if table.is_file():
                 self._observed = self.enter_context(ObservationTable.open(table, self._people.run_id))
         except InputError:
@@ -259,7 +259,7 @@ class OpenedReconstruction(ExitStack):
 
     @property
     def observed(self) -> bool:
-        """Whether it is known what the rows were solved from."""
+        """Whether the result has the detections that its rows were solved from."""
         return self._observed is not None
 
     def at(self, frame: int) -> Reconstruction:
@@ -270,7 +270,7 @@ class OpenedReconstruction(ExitStack):
         return self._block[1].at(frame)
 
     def frames(self, start: int, stop: int) -> Reconstruction:
-        """Everybody in the frames from `start` to before `stop`."""
+        """All people in the frames from `start` to before `stop`."""
         return self.rows(np.flatnonzero((self.frame >= start) & (self.frame < stop)))
 
     def people(self, numbers: Iterable[int], *, observations: bool = True) -> Reconstruction:
@@ -278,12 +278,12 @@ class OpenedReconstruction(ExitStack):
         return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations)
 
     def thinned(self, most_rows: int) -> tuple[Reconstruction, int]:
-        """Every so many frames, at most so many rows; and how many: 1 where all are given."""
+        """Every n-th frame, so that there are at most `most_rows` rows; and n."""
         every = max(1, -(-len(self) // most_rows))
         return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
 
     def __getattr__(self, name: str) -> Any:
-        """A whole column, as `Reconstruction` has it, read when it is asked for."""
+        """A whole column, as `Reconstruction` has it; it is read when it is accessed."""
         if name not in (*Reconstruction.ROWS, "joint_names"):
             raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
         return self._people.column(name)
@@ -316,11 +316,11 @@ def check_files(people: Path, observations: Path | None) -> None:
 
 _UNREADABLE = "the result was not written, and what was there before is as it was"
 _CHECKED_ROWS = 4096
-"""Rows that are read at a time to see whether they can be."""
+"""Number of rows that are read at a time to check that a file is readable."""
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
-    """What run.json says, if it is of the run with that id; empty where there is none."""
+    """Content of run.json, if it is of the run with that id; empty where there is none."""
     run = read_json(file) if file.is_file() else {}
     with naming(file, "restore it or delete it"):
         if not isinstance(run, dict):

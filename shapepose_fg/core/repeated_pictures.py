@@ -1,4 +1,4 @@
-"""Pictures that a camera gives twice: it has stopped, or fills dropped frames with the picture before."""
+"""Detects pictures that a camera delivers twice because it has stopped, or fills dropped frames."""
 
 from dataclasses import dataclass, field
 
@@ -9,25 +9,26 @@ from shapepose_fg.core.detections import DerivedFrames, Detections
 from shapepose_fg.core.trust import Trust, trust_in
 
 _LEAST = 4
-"""Detections that two pictures must have in common: the odd one may be of something that stands still."""
+"""Minimum number of detections that two pictures have in common: a few may be of something that stands still."""
 
 
 @dataclass(frozen=True)
 class WithoutRepeats(DerivedFrames):
-    """A recording without the detections of pictures that say nothing new: of another time, they contradict.
+    """A recording without the detections of repeated pictures, which are of another time and would contradict
+    others.
 
-    A detector finds the same again, to the last digit, in the same picture only. Where all cameras that see
-    anything repeat themselves, everything may stand still, as in a made-up scene: nothing is left out.
+    A detector gives the same numbers, to the last digit, for the same picture only. Where all cameras that see
+    anything repeat themselves, everything may stand still, as in a simulated scene: nothing is left out.
     """
 
     views: int
-    """V, its cameras."""
+    """V, the number of cameras."""
     _read: dict[int, tuple[Detections, Mask]] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What was read last, by its number: all detections, and which views (V,) repeat themselves."""
+    """The frames that were read last, by number: all detections, and which views (V,) repeat themselves."""
 
     @property
     def trust(self) -> Trust:
-        """Which cameras are left out besides, and when."""
+        """The cameras that are left out for other reasons, and when."""
         return trust_in(self.frames)
 
     def __getitem__(self, frame: int, /) -> Detections:
@@ -37,7 +38,7 @@ class WithoutRepeats(DerivedFrames):
         return every.only(~gone[every.view]) if gone.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
-        """The views that show in a frame what they showed in the frame before."""
+        """The views whose detections in a frame repeat those of the frame before."""
         return tuple(np.flatnonzero(self._frame(frame)[1]).tolist())
 
     def _frame(self, frame: int) -> tuple[Detections, Mask]:

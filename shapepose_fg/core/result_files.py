@@ -1,4 +1,6 @@
-"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, opened."""
+"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, and
+opened.
+"""
 
 import hashlib
 import json
@@ -22,11 +24,11 @@ from shapepose_fg.core.storage.schema import Table, columns_of
 
 PEOPLE, RUN, OBSERVATIONS = "people.npz", "run.json", "observations.npz"
 MOMENTS = "moments.csv"
-"""Which picture of each camera a frame is, where cameras differ."""
+"""File that lists the picture of each camera in each frame, where cameras differ."""
 CLOCKS = "synchronised.csv"
-"""When each camera took its frames, where the people have told it."""
+"""File that lists when each camera took its frames, where this was estimated from people."""
 RUN_ID = "run_id"
-"""What ties them: a digest of all columns of people.npz."""
+"""Key of the id that ties the files of a result: a digest of all columns of people.npz."""
 T = TypeVar("T", bound=Table)
 _DIGITS = 32
 """Number of digits of the run's id. The id depends on the people alone, so that an interrupted run that was
@@ -39,8 +41,10 @@ def results_folder(results: Path) -> Path:
 
 
 def set_aside(folder: Path) -> list[str]:
-    """Rename exports and overlays of the result in `folder`, which a new one takes the place of: nobody is to take
-    them for the new one's. What is to be said of it.
+    """Rename exports and overlays of an earlier result in `folder`, so that they are not taken for those of the
+    new one.
+
+    Returns a sentence for each.
     """
     told = []
     for made in (folder / name for name in ("export", "overlay")):
@@ -60,10 +64,10 @@ def write_result(
 ) -> None:
     """Write the files of a result into `folder`, none before all are complete on the disk.
 
-    A process killed on the way leaves each file as it was or as it shall be; `check_id` tells where they are of
-    two runs. Without `observations`, those of an earlier result are removed. Nothing is replaced where `check`
-    raises, which is given people.npz and observations.npz as they shall be. ValueError where `run` holds what JSON
-    cannot, OSError that names the file where one cannot be written.
+    If the process is killed, each file is the old or the new one; `check_id` notices files of two runs. Without
+    `observations`, those of an earlier result are removed. Nothing is replaced where `check` raises, which is
+    called with the new people.npz and observations.npz. ValueError where JSON cannot hold `run`, OSError that
+    names the file where one cannot be written.
     """
     digest = hashlib.sha256()
 
@@ -155,7 +159,7 @@ class SavedTable(ExitStack, Generic[T]):
             self.run_id = self._npz.array(RUN_ID) if RUN_ID in there else None
             self._rows = [name for name in kind.ROWS if name in there]
             self.count = (self._npz.shape(self._rows[0]) or (0,))[0]
-            """How many rows there are."""
+            """Number of rows."""
             for name in self._rows:
                 if self._npz.shape(name)[:1] != (self.count,):
                     raise InputError(
@@ -168,7 +172,7 @@ class SavedTable(ExitStack, Generic[T]):
             raise
 
     def column(self, name: str) -> NDArray[Any]:
-        """All of a column, checked: rows are chosen by it before the others are read."""
+        """A whole column, checked; rows are selected by it before the others are read."""
         if name not in self._rows:  # a shared one, or files of earlier versions lack it
             return self._shared[name] if name in self._shared else getattr(self.read(None), name)
         with naming(self.file, self.cure):
@@ -186,7 +190,7 @@ class SavedTable(ExitStack, Generic[T]):
             return replace(cast(Any, table), **others) if others else table
 
     def _check_memory(self, count: int) -> None:
-        """InputError where so many rows, and as much again to work with them, are more than there is room for."""
+        """InputError where this many rows, and as much again to work with them, do not fit in memory."""
         needed, free = 2 * count * sum(map(self._npz.row_bytes, self._rows)), free_memory()
         if free is not None and needed > free:
             raise InputError(
@@ -196,7 +200,7 @@ class SavedTable(ExitStack, Generic[T]):
 
 
 def free_memory() -> int | None:
-    """Bytes of memory that programs could have now; None where the system does not say."""
+    """Available memory in bytes; None where the system does not state it."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

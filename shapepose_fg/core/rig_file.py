@@ -1,4 +1,6 @@
-"""Our own rig file, which `io.calibration` reads back: the cameras of a result, and the trajectories beside it."""
+"""The project's own rig file, which `io.calibration` reads: cameras of a result, and their trajectories beside
+it.
+"""
 
 import json
 from pathlib import Path

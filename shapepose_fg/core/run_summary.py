@@ -1,4 +1,4 @@
-"""What run.json says: checked when it is read, and of several results when their rows are put together."""
+"""The content of run.json: checks it when it is read, and merges that of several results."""
 
 import json
 import math
@@ -81,7 +81,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def plain(value: object) -> object:
-    """What JSON can hold of `value`: arrays as lists, paths as text. TypeError where there is no such thing."""
+    """`value` as plain values for JSON: arrays as lists, paths as text. TypeError where that is impossible."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Path):
@@ -132,7 +132,7 @@ def check_run(run: Mapping[str, Any]) -> None:
 
 
 def _leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
-    """What is no list and no object in plain values, each with the dotted keys and indices that lead to it."""
+    """Values in nested lists and objects, each with the dotted keys and indices that lead to it."""
     items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else None
     if items is None:
         yield way, value

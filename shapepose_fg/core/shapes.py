@@ -1,4 +1,4 @@
-"""People's body shapes, as far as they are known: means and how sure they are, on which body."""
+"""Body shapes of people: means and covariances, for one body model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ class SubjectShapes(Table):
     """The shapes of G people: a Gaussian each over the betas of one body model."""
 
     names: Annotated[NDArray[np.str_], Column("N", np.str_)]
-    """(G,) who they are, each once: identities of a recording as text, or names of your own."""
+    """(G,) unique names: identities of a recording as text, or names that the user gave."""
     betas: Annotated[Array, Column("N 10")]
     """(G, 10) mean shape, standard deviations."""
     information: Annotated[Array, Column("N 10 10")]
@@ -58,7 +58,7 @@ class SubjectShapes(Table):
 
     @property
     def covariance(self) -> Array:
-        """(G, 10, 10) how uncertain each shape is."""
+        """(G, 10, 10) covariance of each shape."""
         return np.linalg.inv(self.information).astype(np.float64, copy=False)
 
     def named(self, names: Sequence[str]) -> "SubjectShapes":
@@ -66,10 +66,10 @@ class SubjectShapes(Table):
         return replace(self, names=np.array(list(names), dtype=str))
 
     def updated(self, other: "SubjectShapes") -> "SubjectShapes":
-        """These people and those of `other`, whose shapes take the place of older ones of the same name.
+        """These people and those of `other`, whose shapes replace older ones of the same name.
 
-        A shape that was estimated with an older one as its prior holds that already: the two are not added up.
-        ValueError where `other` is of another body.
+        A shape that was estimated with an older one as its prior includes it already, so that the two are not
+        combined. ValueError where `other` is of another body.
         """
         if other.body != self.body:
             raise ValueError("shapes must be of the same body model")

@@ -1,4 +1,4 @@
-"""What a detector's joints are called, how limbs join them, and which are left and right of each other."""
+"""Joints of a detector: their names, limbs and mirror pairs."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,7 +27,7 @@ class Skeleton:
     """The joints of one detector, in its own order."""
 
     name: str
-    """For messages and files."""
+    """Name of the skeleton, for messages and files."""
     joints: tuple[str, ...]
     """The J joint names, as OpenPose writes them."""
     limbs: tuple[tuple[int, int], ...]
@@ -38,12 +38,12 @@ class Skeleton:
     """(J,) index of the corresponding joint on the other side of the body; a joint in the middle has its own
     index."""
     core: tuple[int, ...]
-    """The body parts by which a person is recognised: trunk, arms and legs, without face and toes."""
+    """The joints by which a person is recognised: trunk, arms and legs, without face and toes."""
     middles: tuple[tuple[int, int, int], ...] = ()
-    """Joints that the detector does not give: (joint, first, second), the middle of two that it gives."""
+    """Joints that the detector does not give: (joint, first, second), the midpoint of two that it gives."""
     keypoints: tuple[int, ...] | None = None
-    """The joint of each keypoint that the detector writes, in its order, -1 where it is passed over (hands and
-    face, say); None where they are the joints, in this order."""
+    """(K,) index of the joint of each keypoint that the detector writes, -1 for one that is skipped (hands and
+    face, say); None where keypoints are the joints, in this order."""
 
     @classmethod
     def of(
@@ -131,12 +131,12 @@ class Skeleton:
 
     @property
     def anchor(self) -> tuple[int, ...]:
-        """What places a person: the root joint, or the two of which it is made."""
+        """The joints that place a person: the root joint, or the two of which it is the midpoint."""
         return next(((first, second) for joint, first, second in self.middles if joint == self.root), (self.root,))
 
     @property
     def keypoint_count(self) -> int:
-        """K, the keypoints of a person in the detector's files."""
+        """K, the number of keypoints of a person in the detector's files."""
         return len(self) if self.keypoints is None else len(self.keypoints)
 
     @property
@@ -208,13 +208,13 @@ BODY_25 = Skeleton(
 """OpenPose's BODY_25: the skeleton in which everything else here is described."""
 
 _MIDDLES = {"Neck": ("RShoulder", "LShoulder"), MID_HIP: ("RHip", "LHip")}
-"""How BODY_25's own middle joints were labelled: a skeleton without them has them made so."""
+"""BODY_25's own middle joints as midpoints of two others: a skeleton without them gets them this way."""
 _GROWN_FROM = dict(zip(BODY_25.joints, (BODY_25.joints[parent] for parent in BODY_25.parents), strict=True)) | {
     "Head": "Neck", "head": "Neck", "neck": "Neck", "left_collar": "Neck", "right_collar": "Neck",
     "spine1": MID_HIP, "spine2": MID_HIP, "spine3": MID_HIP,
     "left_hand": "LWrist", "right_hand": "RWrist", "left_foot": "LAnkle", "right_foot": "RAnkle",
 }  # fmt: skip
-"""The joint that each point of the body hangs on, where the skeleton has it; else what that one hangs on."""
+"""Parent joint of each point of the body; where a skeleton lacks it, the parent's parent takes its place."""
 
 
 def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> Skeleton:
@@ -330,8 +330,7 @@ SKELETONS = {
         ),
     )
 }
-"""The skeletons that files of detections are known to have; of several with one number of keypoints the most usual
-first."""
+"""Known skeletons of detection files; of several with the same number of keypoints the most usual comes first."""
 
 SMPL_24 = tuple(
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot "

@@ -1,4 +1,4 @@
-"""Where what carries cameras goes: a robot, a person, a crane; poses over time, from odometry or SLAM."""
+"""Trajectories of what carries cameras, a robot, a person or a crane: poses over time from odometry or SLAM."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,14 +10,15 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 DRIFT = 0.01
 """Drift of an odometry that states no errors, per metre: wheels and cameras drift by about 1 % of the distance."""
 LONGEST_GAP_S = 0.5
-"""Between poses that are farther apart nothing is interpolated: at a walk that is 0.7 m, at a turn 45 degrees."""
+"""Longest gap between poses that is interpolated, s: at a walk 0.7 m, at a turn 45 degrees."""
 _MOST_DRIFT = 1.0
 _START_M, _START_RAD = 0.05, 0.02
-"""How surely it is known where an odometry starts in the world of the cameras that stand still, per axis."""
+"""Standard deviation per axis of an odometry's start in the world of the fixed cameras: metres, rad."""
 _M_A_RAD, _M_A_S = 0.5, 0.05
-"""A turn by a radian, and a second of standing still, count as so much way, metres."""
+"""Path length that a turn by one radian, and a second at rest, count as, m."""
 _RAD_A_M = 0.5
-"""An odometry errs by so many radians where it errs by a metre: after 10 m of a straight way both count alike."""
+"""Error of rotation, rad, per metre of translational error of an odometry: equal effect after a straight path
+of 10 m."""
 _ROTATION_TOLERANCE = 1e-3
 MOST_VARIANCE = 1e18
 """Largest entry of a pose's covariance, rad² or m²: what is known this badly is not known at all."""
@@ -27,21 +28,22 @@ _MOST_METRES = 1e6
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of what carries cameras, over time."""
+    """Poses over time of something that carries cameras."""
 
     name: str
-    """What it is called; cameras name their carrier so."""
+    """Name of the carrier; cameras refer to it."""
     time_s: Array
-    """(F,) seconds, rising, of the clock that the pictures' times are of."""
+    """(F,) rising times, seconds, on the clock of the pictures' times."""
     wTb: Array
     """(F, 4, 4) world from carrier, metres."""
     covariance: Array | None = None
     """(F, 6, 6) covariance of each pose in the world, rotation before translation along the carrier's own axes,
     rad² and m² (GTSAM's order); None for an odometry, whose start is known and which drifts."""
     drift: float = DRIFT
-    """How far an odometry errs after a metre, as a part of it; errors add up like steps of a random walk."""
+    """Drift of an odometry per metre, as a share of the path; errors add up like steps of a random walk."""
     refined: bool = False
-    """Whether the people of a recording have corrected it (`pipeline.trajectories`): it is taken as it is."""
+    """Whether the trajectory was refined with the people of a recording (`pipeline.trajectories`); it is then
+    used as it is."""
 
     def __post_init__(self) -> None:
         def refuse(problem: str) -> ValueError:
@@ -79,13 +81,15 @@ class Trajectory:
         return len(self.time_s)
 
     def covers(self, time_s: Array) -> Mask:
-        """(...,) which times lie between two poses that are near enough to each other."""
+        """(...,) mask of the times that lie between two poses which are near enough to each other."""
         after = np.clip(np.searchsorted(self.time_s, time_s), 1, len(self) - 1)
         near = (np.diff(self.time_s)[after - 1] <= LONGEST_GAP_S) | (self.time_s[after] == time_s)
         return np.asarray((time_s >= self.time_s[0]) & (time_s <= self.time_s[-1]) & near)
 
     def at(self, time_s: Array) -> Array:
-        """(..., 4, 4) poses at times (...,): places on straight lines, turns about one axis; ends stay."""
+        """(..., 4, 4) poses at times (...,): translations interpolated linearly, rotations about one axis;
+        constant beyond the ends.
+        """
         from scipy.spatial.transform import Rotation
 
         flat, pose = np.ravel(time_s), np.tile(np.eye(4), (np.size(time_s), 1, 1))
@@ -97,13 +101,13 @@ class Trajectory:
         return pose.reshape(*np.shape(time_s), 4, 4)
 
     def covariance_at(self, time_s: Array) -> Array:
-        """(..., 6, 6) how surely the poses are known at times (...,); 0 where nothing is said of it."""
+        """(..., 6, 6) covariances of the poses at times (...,); 0 where none are given."""
         if self.covariance is None:
             return np.zeros((*np.shape(time_s), 6, 6))
         return self._between(self.covariance, np.ravel(time_s)).reshape(*np.shape(time_s), 6, 6)
 
     def start_covariance(self) -> Array:
-        """(6, 6) how surely the first pose is known."""
+        """(6, 6) covariance of the first pose."""
         if self.covariance is not None:
             return self.covariance[0]
         return np.diag([_START_RAD**2] * 3 + [_START_M**2] * 3)
@@ -125,7 +129,9 @@ class Trajectory:
         return (1 - part) * values[before] + part * values[before + 1]
 
     def _place(self, time_s: Array) -> tuple[Index, Array]:
-        """(M,) the pose before each of the times (M,), and how far each is on the way to the next, 0 to 1."""
+        """(M,) index of the pose before each of the times (M,), and the time's relative position before the
+        next, 0 to 1.
+        """
         before = np.clip(np.searchsorted(self.time_s, time_s) - 1, 0, len(self) - 2)
         first, last = self.time_s[before], self.time_s[before + 1]
         return before, np.clip((time_s - first) / (last - first), 0.0, 1.0)
@@ -133,10 +139,10 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Carried:
-    """Where carriers of cameras are at N moments, and how surely."""
+    """Poses of the carriers of cameras at N times, with covariances."""
 
     carrier: Index
-    """(V,) which of the B carriers each view is on; -1 of a camera that stands still."""
+    """(V,) index of the carrier of each view among B; -1 for a camera that stands still."""
     wTb: Array
     """(N, B, 4, 4) world from carrier."""
     covariance: Array
@@ -144,11 +150,11 @@ class Carried:
 
     @classmethod
     def of(cls, trajectories: Iterable[Trajectory], carrier: Index, time_s: Array) -> "Carried":
-        """Those of N moments, at `time_s` (N,)."""
+        """The poses at N times `time_s` (N,)."""
         every = tuple(trajectories)
         poses = np.stack([each.at(time_s) for each in every], axis=1)
         return cls(carrier, poses, np.stack([each.covariance_at(time_s) for each in every], axis=1))
 
     def rows(self, index: Index) -> "Carried":
-        """Some of the moments."""
+        """The carriers in some of the rows."""
         return Carried(self.carrier, self.wTb[index], self.covariance[index])

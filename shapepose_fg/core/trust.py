@@ -1,4 +1,4 @@
-"""Which cameras a recording is reconstructed without, and which contradict each other."""
+"""Cameras that are left out of a reconstruction, and cameras that contradict each other."""
 
 from dataclasses import dataclass, replace
 
@@ -9,17 +9,17 @@ from shapepose_fg.core.detections import DerivedFrames, DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, spans_of
 
 Spell = tuple[int, int, int]
-"""A view, the first frame of which something is said, and the one after the last."""
+"""A view, the first frame of an interval, and the frame after its last."""
 
 
 @dataclass(frozen=True)
 class Trust:
-    """What is believed of each camera, in frames of the recording; everything by default."""
+    """Which cameras are used, in which frames of the recording; all by default."""
 
     left_out: tuple[Spell, ...] = ()
-    """Cameras that are taken for dark: they contradict others who agree."""
+    """Cameras that are treated as dark: they contradict others that agree."""
     doubted: tuple[Spell, ...] = ()
-    """Cameras of which some are wrong, and nothing says which: rows that need them are not `ok`."""
+    """Cameras of which some are wrong, but it is unknown which: rows that need them are not `ok`."""
 
     def dark(self, frame: int) -> tuple[int, ...]:
         """The views that are left out of a frame."""
@@ -35,24 +35,24 @@ def _there(spells: tuple[Spell, ...], frame: int) -> tuple[int, ...]:
 
 
 BELIEVED = Trust()
-"""Every camera is believed."""
+"""All cameras are used."""
 
 
 @dataclass(frozen=True)
 class Trusted(DerivedFrames):
-    """A recording for `reconstruct`, with what is believed of its cameras."""
+    """A recording for `reconstruct` with the cameras that are left out or doubted."""
 
     trust: Trust
     """`setup_check.report.check_setup(detections, rig).trust`, for example."""
 
 
 def trust_in(detections: DetectionSequence) -> Trust:
-    """What is believed of a recording's cameras: all, unless it is `Trusted`."""
+    """The `Trust` of a recording: all cameras are used unless it is `Trusted`."""
     return detections.trust if isinstance(detections, Trusted) else BELIEVED
 
 
 def without_poses(rig: Rig, times: FrameTimes) -> tuple[Spell, ...]:
-    """When cameras that move have no pose: before, behind and in gaps of their trajectories."""
+    """Intervals in which moving cameras have no pose: before, after and in gaps of their trajectories."""
     time_s, spells = times.of_views(len(rig)), list[Spell]()
     for view, number in enumerate(rig.carrier.tolist()):
         if number >= 0:
@@ -62,7 +62,9 @@ def without_poses(rig: Rig, times: FrameTimes) -> tuple[Spell, ...]:
 
 
 def with_poses(detections: DetectionSequence, rig: Rig, times: FrameTimes) -> DetectionSequence:
-    """The recording without the pictures of cameras that have no pose then; ValueError where one never has."""
+    """The recording without the pictures of cameras that have no pose at the time; ValueError where one never
+    has.
+    """
     spells, trust = without_poses(rig, times), trust_in(detections)
     for view, first, last in spells:
         if last - first == len(times):

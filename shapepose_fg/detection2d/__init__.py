@@ -1,1 +1,1 @@
-"""People's joints in pictures: a heat-map network, and its output as candidates with part affinities."""
+"""Detects people's joints in pictures: networks, and their outputs as candidates with part affinities."""

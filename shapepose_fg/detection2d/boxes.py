@@ -14,28 +14,28 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.onnx_network import Blob, OnnxNetwork, words
 
 Side = Annotated[int, Field(ge=16, le=4096)]
-"""Pixels of a network's input along one axis."""
+"""Side of a network's input, pixels."""
 _Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 _GREY = 114
-"""The colour beside pictures of another shape than the network's."""
+"""Grey value beside pictures of another shape than the network's."""
 _STRIDES = (8, 16, 32)
 """Pixels per cell of the grids on which boxes are proposed."""
 _PERSON = 0
-"""The number of people among COCO's classes."""
+"""Index of people among COCO's classes."""
 _MOST_PEOPLE = 200
 """Maximum number of people in a picture; the boxes with the highest scores are kept."""
 _FARTHEST = 1e6
-"""Pixels of the input: no box lies beyond."""
+"""Largest coordinate of a box, pixels of the input."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
-"""Scores over which a box counts, as in rtmlib; the second where suppression is in the network."""
+"""Minimum scores of a box, as in rtmlib; the second where suppression is in the network."""
 
 
 class BoxForm(BaseModel, extra="forbid"):
-    """How a box network is to be read: the table `boxes` of a network's TOML file."""
+    """Description of a box network: the table `boxes` of a network's TOML file."""
 
     network: str = ""
-    """Its ONNX file."""
+    """ONNX file of the box network."""
     size: tuple[Side, Side] = (640, 640)
     """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     min_score: _Share | None = None
@@ -49,9 +49,9 @@ class BoxNetwork:
     """YOLOX, with non-maximum suppression inside of the network or without."""
 
     network: OnnxNetwork
-    """What proposes boxes."""
+    """The network that proposes boxes."""
     form: BoxForm
-    """How it is to be read."""
+    """Description of the network."""
 
     def find(self, picture: NDArray[np.uint8]) -> Real:
         """(P, 4) left, top, right, bottom in pixels of a `picture` (H, W, 3), the surest first."""
@@ -75,7 +75,7 @@ class BoxNetwork:
         return boxes[:_MOST_PEOPLE]
 
     def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
-        """(N, 4) boxes in pixels of the input, (N,) how sure each is of a person, and the least that counts."""
+        """(N, 4) boxes in pixels of the input, (N,) their scores for people, and the minimum score."""
         # Column and row of all cells of the grids, one grid after the other.
         grids = [np.indices((self.form.size[1] // step, self.form.size[0] // step))[::-1] for step in _STRIDES]
         cells = np.concatenate([grid.reshape(2, -1).T for grid in grids])

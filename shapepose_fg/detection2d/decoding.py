@@ -1,4 +1,4 @@
-"""A network's heat maps and part affinity fields as joint candidates with affinities.
+"""Converts a network's heat maps and part affinity fields to joint candidates with affinities.
 
 Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affinity Fields", PAMI 2021, section 3.
 """
@@ -13,13 +13,13 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.io.detections.association_text import TextSkeleton
 
 _MIN_SCORE = 0.1
-"""Heights of peaks below this are noise."""
+"""Minimum height of a peak; lower ones are noise."""
 _LINE_SAMPLES = 10
-"""Places along a limb at which the affinity field is read, as in OpenPose."""
+"""Number of points along a limb at which the affinity field is sampled, as in OpenPose."""
 _MIN_ALONG = 0.05
-"""A place supports a limb where the field has at least this component along it, as in OpenPose."""
+"""Minimum component of the field along the limb at a point that supports it, as in OpenPose."""
 _MIN_SUPPORTED = 0.7
-"""The share of places that must support a limb for it to have an affinity."""
+"""Minimum share of supporting points of a limb with an affinity."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Candidates:
 def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
-    That is a map for each of the `skeleton`'s J joints, one of the background, and two (x, y) for each limb.
-    Positions are in cells; (0, 0) is the centre of the first. What is not finite in the output is taken for 0.
+    The output has a map for each of the `skeleton`'s J joints, one of the background, and two (x, y) for each
+    limb. Positions are in cells; (0, 0) is the centre of the first. Values that are not finite count as 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
     joint, xy, score = peaks(output[: len(skeleton.joints)])
@@ -71,7 +71,7 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
 def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
     """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H, W).
 
-    A maximum is no lower than its eight neighbours. Between cells its place and height are those of a Gaussian
+    A maximum is no lower than its eight neighbours. Its position and height between cells are those of a Gaussian
     through it and its neighbours, along each axis.
     """
     padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
@@ -95,7 +95,8 @@ def between_cells(maps: Real, which: Index, row: Index, column: Index) -> tuple[
 
 
 def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
-    """Where a Gaussian through three neighbours is highest, -0.5 to 0.5 cells, and the logarithm of its rise.
+    """Position of the maximum of a Gaussian through three neighbours, -0.5 to 0.5 cells, and the logarithm of its
+    rise.
 
     0 and 0 at the edge of the map.
     """
@@ -109,9 +110,9 @@ def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
 
 
 def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: Index) -> Array:
-    """(E,) the mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
+    """(E,) mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
-    `limb` (E,) says whose field each line is read from. 0 where too few places along the line support it.
+    `limb` (E,) is the field of each line. 0 where too few points along the line support it.
     """
     height, width = fields.shape[1:]
     along = end - start

@@ -1,4 +1,4 @@
-"""Named networks, fetched when asked for, and the same ever after: their checksums are pinned at first use."""
+"""Named networks, downloaded on request; their checksums are pinned at first use."""
 
 import hashlib
 import http.client
@@ -23,20 +23,20 @@ BASES = (
     "https://download.openmmlab.com/mmpose/v1/projects/rtmposev1/onnx_sdk",
     "https://huggingface.co/Tau-J/RTMPose/resolve/main/rtmposev1/onnx_sdk",
 )
-"""Addresses of the folders that hold the named networks, as rtmlib publishes them: OpenMMLab's, its mirror."""
+"""Addresses of the folders with the named networks, as rtmlib publishes them: OpenMMLab's, its mirror."""
 
 _TIMEOUT_S = 30.0
 _INSIDE = "end2end.onnx"
-"""What the network is called in its archive."""
+"""Name of the network in its archive."""
 _BROKEN = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
 @dataclass(frozen=True)
 class NamedNetwork:
-    """A network that can be asked for by name."""
+    """A network with a name."""
 
     file: str
-    """The archive that holds it, at each of `BASES`."""
+    """Archive of the network, at each of `BASES`."""
     size: tuple[int, int]
     """Width and height of the network's input, pixels."""
     boxes: str | None = None
@@ -57,9 +57,9 @@ def named_file(
     say: Callable[[str], object] = print,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Path:
-    """The file of the named network `name`, fetched first where it is not there and `fetch` says so.
+    """The file of the named network `name`, downloaded first where it is missing and `fetch` is set.
 
-    The sha256 of the ONNX file is told to `say` and pinned at first use. InputError where it is another later.
+    The SHA-256 of the ONNX file is passed to `say` and pinned at first use. InputError where it differs later.
     """
     kept, pin = (user_cache("networks") / f"{name}.{ending}" for ending in ("onnx", "sha256"))
     there = kept.is_file()
@@ -82,7 +82,7 @@ def named_file(
 
 
 class _OnlyHttps(urllib.request.HTTPRedirectHandler):
-    """Follows no redirection to where others may listen and change what comes."""
+    """Follows no redirection to unencrypted addresses, where content could be changed."""
 
     def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
         if not newurl.startswith("https://"):
@@ -115,7 +115,7 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
 
 
 def _inside(archive: IO[bytes]) -> bytes:
-    """The one network in an archive. Nothing is unpacked to where the archive says."""
+    """The one network in an archive. Paths in the archive are ignored."""
     with zipfile.ZipFile(archive) as opened:
         found = [each for each in opened.infolist() if PurePosixPath(each.filename).name == _INSIDE]
         if len(found) != 1:

@@ -18,7 +18,8 @@ from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkel
 from shapepose_fg.io.write_detections import association_lines
 
 _STRIDE, _MULTIPLE = 8, 16
-"""Pixels of the input per cell of the output, along each axis; what both sides of the input are multiples of."""
+"""Pixels of the input per cell of the output, along each axis; and the multiple of which both sides of the
+input are."""
 _TRIAL = (64, 64)
 """Width and height of the empty picture that a new network is tried on, pixels."""
 _LONG_SIDE = 656
@@ -26,22 +27,22 @@ _LONG_SIDE = 656
 
 @dataclass(frozen=True)
 class NetworkLayout:
-    """What a network takes, and which joints and limbs its output has, one after the other (`decode`)."""
+    """Input of a network, and the joints and limbs of its output, one after the other (`decode`)."""
 
     name: str
-    """What it is called."""
+    """Name of the layout."""
     text: TextSkeleton
     """The joints and limbs, in order."""
     scale: float
-    """The input is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
+    """Scale of the input, which is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
     offset: float
-    """See `scale`."""
+    """Offset of the input; see `scale`."""
     sha256: str = ""
-    """Checksum of a known network that has it."""
+    """Checksum of a known network with this layout; empty for none."""
 
     @property
     def channels(self) -> int:
-        """How many channels the output has."""
+        """Number of channels of the output."""
         return len(self.text.joints) + 1 + 2 * len(self.text.limbs)
 
 
@@ -56,14 +57,16 @@ def layouts() -> dict[str, NetworkLayout]:
 
 @dataclass(frozen=True)
 class HeatMapNetwork:
-    """A network that makes heat maps and part affinity fields of a picture; they are made people later, in 3D."""
+    """A network that gives heat maps and part affinity fields of a picture; candidates are grouped to people
+    later, in 3D.
+    """
 
     network: OnnxNetwork
-    """What is run."""
+    """The network."""
     layout: NetworkLayout
-    """How its output is to be read."""
+    """The layout of its output."""
     long_side: int = _LONG_SIDE
-    """The longer side of its input, pixels: more finds smaller people, and takes longer."""
+    """Longer side of its input, pixels: a larger one finds smaller people, and takes longer."""
     suffix, tail = ".txt", ""
 
     @classmethod
@@ -75,10 +78,11 @@ class HeatMapNetwork:
         device: str = "cpu",
         long_side: int | None = None,
     ) -> "HeatMapNetwork":
-        """The network in the ONNX `file`. `layout` names one of `layouts()`; without it the file must tell.
+        """Load the network in the ONNX `file`. `layout` names one of `layouts()`; without it the file must
+        identify it.
 
-        On the CPU OpenCV runs it, at any size, unless `backend` says otherwise. InputError where the file is
-        missing, is no ONNX network, or does not fit the layout.
+        OpenCV runs it on the CPU, at any size, unless `backend` is another. InputError where the file is missing,
+        is no ONNX network, or does not fit the layout.
         """
         every = layouts()
         if layout not in (None, *every):
@@ -101,7 +105,7 @@ class HeatMapNetwork:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What its detections depend on."""
+        """Everything that its detections depend on."""
         network = {"sha256": self.network.sha256, "layout": self.layout.name}
         return {"network": network, "detection": {"long_side": self.long_side}}
 
@@ -110,7 +114,9 @@ class HeatMapNetwork:
         return f"{self.layout.text.number} {frames}\n"
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """A frame in it: `Candidates` in a picture of the calibrated `size`, None where there was no picture."""
+        """A frame of the text: `Candidates` in a picture of the calibrated `size`, None where there was no
+        picture.
+        """
         if found is None:
             return "0\n" * len(self.layout.text.joints)
         fractions = found.xy / (np.array(size) - 1.0)
@@ -120,7 +126,7 @@ class HeatMapNetwork:
         return "".join(f"{line}\n" for line in lines)
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
-        """What it is shown of pictures with such a region and roll."""
+        """The input for pictures with such a region and roll."""
         return UprightView.of(region, roll_deg, self.long_side, _MULTIPLE, self.network.size)
 
     def run(self, picture: NDArray[np.uint8]) -> Blob:

@@ -1,7 +1,7 @@
-"""Read an ONNX file that holds all of its weights itself.
+"""Reads an ONNX file that holds all of its weights itself.
 
-What runs a network looks up the files that a tensor names wherever this program runs. Every tensor of the file is
-therefore visited, by the wire format of protobuf and the messages of onnx.proto, before the bytes go to a library.
+Runtimes open the files that a tensor names, relative to where this program runs. Every tensor of the file is
+therefore visited, by the wire format of protobuf and the messages of onnx.proto, before a library gets the bytes.
 """
 
 from pathlib import Path
@@ -12,11 +12,11 @@ from shapepose_fg.core.storage.files import read_bytes
 MOST_BYTES = 2**29
 """Largest file, bytes; networks of people's joints have 2 to 400 MB."""
 _MOST_DEPTH = 100
-"""Messages in messages; protobuf's own bound."""
+"""Maximum depth of nested messages; protobuf's own limit."""
 _MOST_FIELDS = 2**20
-"""Fields of the messages visited; networks have ten thousand to a hundred thousand."""
+"""Maximum number of fields of the visited messages; networks have ten thousand to a hundred thousand."""
 _LONGEST = 2**31
-"""Bytes of a field, exclusive; protobuf's own bound."""
+"""Size of a field, bytes, exclusive; protobuf's own limit."""
 _FIXED_BYTES = {1: 8, 5: 4}
 """Lengths of the wire types that have a fixed one."""
 
@@ -30,21 +30,20 @@ _MESSAGES: dict[str, dict[int, str]] = {
     "function": {7: "node", 11: "attribute"},
     "tensor": {},
 }
-"""The messages of onnx.proto that lead to tensors: which fields hold which messages."""
+"""The messages of onnx.proto that lead to tensors, with the fields that hold messages."""
 _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
-"""Fields of a tensor: where its numbers are in another file, and whether they are."""
+"""Fields of a tensor: the place of external data, and whether there is any."""
 
 
 class _Broken(Exception):
-    """These bytes are no message that a writer of protobuf makes."""
+    """The bytes are no message that a writer of protobuf makes."""
 
 
 def read_onnx(file: Path) -> bytes:
     """Content of the ONNX file at `file`, at most `MOST_BYTES`, in which no tensor names another file.
 
-    InputError where the file cannot be read, is no ONNX network, or keeps weights in other files. Spellings on
-    which two parsers may disagree (tags of more bytes than needed, groups) are not an ONNX network: no program
-    writes them.
+    InputError where the file cannot be read, is no ONNX network, or has weights in other files. Encodings on which
+    two parsers may disagree (tags of more bytes than needed, groups) are refused: no program writes them.
     """
     content = read_bytes(file, MOST_BYTES)
     try:
@@ -60,7 +59,7 @@ def read_onnx(file: Path) -> bytes:
 
 
 def _is_whole(content: memoryview) -> bool:
-    """Whether no tensor of a ModelProto says that its numbers are elsewhere."""
+    """Whether no tensor of a ModelProto has external data."""
     waiting, fields = [("model", 0, len(content), 0)], 0
     while len(waiting) > 0:
         message, at, end, depth = waiting.pop()
@@ -97,7 +96,7 @@ def _is_whole(content: memoryview) -> bool:
 
 
 def _varint(content: memoryview, at: int, end: int) -> tuple[int, int]:
-    """A whole number at byte `at`, and where the next thing begins."""
+    """An integer at byte `at`, and the position after it."""
     value = shift = 0
     while at < end and shift < 70:
         byte = content[at]

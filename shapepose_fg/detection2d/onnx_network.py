@@ -1,4 +1,4 @@
-"""A network in an ONNX file from outside, read within bounds and run by OpenCV or by onnxruntime."""
+"""A network in an untrusted ONNX file, read within bounds and run by OpenCV or by onnxruntime."""
 
 import hashlib
 import os
@@ -18,9 +18,9 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.detection2d.onnx_file import read_onnx
 
 Backend = Literal["opencv", "onnxruntime"]
-"""What runs the network."""
+"""The library that runs the network."""
 Blob = NDArray[np.float32]
-"""What it takes and gives."""
+"""Inputs and outputs of a network."""
 PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
 """onnxruntime's names of devices."""
 _TRY = """
@@ -28,29 +28,29 @@ import sys, cv2, numpy
 cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), dtype=numpy.uint8))
 """
 _LOADS_S = 120
-"""Longest time to read a network, seconds; 400 MB take a few."""
+"""Longest time to load a network, s; 400 MB take a few seconds."""
 _BATCH = 32
-"""Pictures at once: a crowd fills no memory."""
+"""Maximum number of pictures in a batch, which bounds the memory for a crowd."""
 
 
 @dataclass(frozen=True)
 class OnnxNetwork:
-    """A network that takes pictures and gives arrays."""
+    """A network from pictures to arrays."""
 
     file: Path
-    """Where it lies, for messages."""
+    """Path of the file, for messages."""
     sha256: str
     """Checksum of its file."""
     forward: Callable[[Blob], list[Blob]]
-    """All its outputs for pictures (B, 3, height, width)."""
+    """Function from pictures (B, 3, height, width) to all outputs."""
     size: tuple[int, int] | None = None
-    """(width, height) that the file fixes; None where it takes pictures of any."""
+    """Width and height that the file fixes; None where any size is possible."""
     inputs: tuple[str, ...] = ()
     """The inputs' names, where they are known."""
     outputs: tuple[str, ...] = ()
     """The outputs' names, where they are known."""
     at_once: int = 1
-    """Pictures that it takes at once, at most."""
+    """Maximum number of pictures in a batch."""
 
     @classmethod
     def open(cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu") -> "OnnxNetwork":
@@ -94,8 +94,8 @@ def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
 
 
 def _try_elsewhere(file: Path, content: bytes) -> None:
-    """InputError where OpenCV, in a process of its own, dies of a network or does not come back: of damaged files,
-    it may do either.
+    """InputError where OpenCV, in another process, crashes or hangs with a network, as it may with damaged
+    files.
     """
     if not sys.executable:
         return
@@ -117,7 +117,9 @@ def _try_elsewhere(file: Path, content: bytes) -> None:
 
 
 def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
-    """`forward` and what follows in `OnnxNetwork`, by onnxruntime; on the CPU on as many threads as OpenCV has."""
+    """`forward` and the fields after it in `OnnxNetwork`, with onnxruntime; on the CPU with as many threads as
+    OpenCV has.
+    """
     try:
         onnxruntime: Any = import_module("onnxruntime")
     except ImportError:

@@ -1,4 +1,4 @@
-"""A network by its name, its ONNX file or its TOML file, ready to detect."""
+"""Opens a network by its name, its ONNX file or its TOML file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,17 +18,18 @@ from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.io.validation import validated
 
 Network = HeatMapNetwork | TopDownNetwork
-"""What finds joints in upright pictures. Each says what it is shown of a picture (`view`), what it finds in that
-(`detect`), how a file says it (`suffix`, `head`, `text`, `tail`), and what it depends on (`settings`)."""
+"""A network that finds joints in upright pictures. Each has its input (`view`), detections (`detect`), their
+format (`suffix`, `head`, `text`, `tail`), and everything that they depend on (`settings`)."""
 
 
 def open_network(
     network: str, boxes: str | None, named_file: Callable[[str], Path], device: str = "cpu", **openpose: Any
 ) -> Network:
-    """What `network` is: an ONNX file, a network's TOML file, or a name that `named_file` finds.
+    """The network of an ONNX file, a network's TOML file, or a name that `named_file` finds.
 
-    `boxes` is an ONNX file or a name of what finds people, in place of the network's own; an ONNX file without is
-    of OpenPose's kind, and `openpose` what else `HeatMapNetwork.load` takes. InputError, one sentence.
+    `boxes` is an ONNX file or a name of a network that finds people, in place of the network's own; an ONNX file
+    without is of OpenPose's kind, and `openpose` has further arguments of `HeatMapNetwork.load`. InputError, one
+    sentence.
     """
     named = _named("--network", network)
     if network.endswith(".toml"):
@@ -72,7 +73,7 @@ def _named(option: str, name: str) -> NamedNetwork | None:
 
 
 def read_form(path: Path) -> KeypointForm:
-    """What a network's TOML file says, with paths that are found from its folder.
+    """Content of a network's TOML file, with paths relative to its folder.
 
     InputError, one sentence that names the file, the key and the cure.
     """

@@ -1,4 +1,4 @@
-"""All pictures of a recording through the detector, in blocks that are kept: a run that stops can go on."""
+"""Runs the detector on all pictures of a recording, in blocks that are kept, so that a run can be resumed."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement,
 from shapepose_fg.io.timestamps import nameable, write_timestamps
 
 BLOCK = 16
-"""Moments that are kept together: what a run that is killed loses at most."""
+"""Number of frame sets in a block, which an interrupted run loses at most."""
 _UNFINISHED = "unfinished"
 _SETTINGS = "settings.json"
 
@@ -36,13 +36,13 @@ class CameraDetector:
     camera: Camera
     """The camera."""
     footage: Footage
-    """Its pictures."""
+    """Pictures of the camera."""
     placement: Placement
-    """Where calibrated pixels lie in them."""
+    """Place of calibrated pixels in them."""
     network: Network
-    """What detects."""
+    """The network."""
     view: UprightView
-    """What the network is shown."""
+    """The network's input."""
 
     @classmethod
     def of(cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network) -> Self:
@@ -51,7 +51,7 @@ class CameraDetector:
         return cls(camera, footage, placement, network, view)
 
     def detect(self, picture: NDArray[np.uint8]) -> Candidates | People:
-        """What is in a `picture` (H, W, 3), blue green red, in calibrated pixels, as the lens gives them."""
+        """Detections in a `picture` (H, W, 3), blue green red, in calibrated pixels, with distortion."""
         found = self.network.detect(self.view.input_of(picture))
         xy = self.view.picture_from_input(found.xy)
         # In the corners beside a turned picture there is nothing to see.
@@ -60,18 +60,18 @@ class CameraDetector:
 
 @dataclass(frozen=True)
 class DetectionRun:
-    """What is to be detected."""
+    """The work of a detection run."""
 
     cameras: Sequence[CameraDetector]
-    """(V,) how each camera's pictures are read, by one network."""
+    """(V,) detector of each camera, with one network."""
     moments: Moments
-    """Which pictures belong together."""
+    """Synchronised frame sets."""
     output: Path
     """The folder for the detections."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the detections depend on: equal for a run that goes on."""
+        """Everything that the detections depend on: equal for a resumed run."""
         cameras = [
             {
                 "name": each.camera.name,
@@ -89,9 +89,9 @@ class DetectionRun:
 def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> tuple[list[int], list[int]]:
     """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json into the output.
 
-    (V,) how many joints were found in each camera's pictures, and (V,) how many of these could not be read. Blocks
-    that an earlier run of the same settings left are not done again; the files come out the same. InputError where
-    the folder holds detections, or a run of other settings.
+    Returns (V,) the number of joints in each camera's pictures, and (V,) the number of unreadable pictures. Blocks
+    that an earlier run of the same settings left are reused; the files are the same. InputError where the folder
+    holds detections, or a run of other settings.
     """
     unfinished = inside(run.output, _UNFINISHED)
     _refuse_others(run, unfinished)
@@ -127,9 +127,9 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
 
 
 def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progress) -> None:
-    """Detect in the pictures of some moments, camera after camera of each moment, and keep what was found.
+    """Detect in the pictures of some frame sets, camera after camera of each set, and store the results.
 
-    For each camera that is its text, how many joints it has, and how many pictures could not be read.
+    For each camera these are its text, the number of joints, and the number of unreadable pictures.
     """
     views = len(run.cameras)
     text, found, failed = [""] * views, [0] * views, [0] * views
@@ -156,7 +156,7 @@ def _read_block(file: Path, views: int, name: str) -> list[Any]:
 
 
 def _write_times(run: DetectionRun) -> None:
-    """times.csv: when each frame was taken, for each camera where they are not synchronised."""
+    """Write times.csv: the times of the frames, for each camera where they are asynchronous."""
     time_s = run.moments.time_s
     file = run.output / "times.csv"
     if time_s is None:
@@ -188,7 +188,7 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
 
 
 def _state(path: Path) -> list[int]:
-    """Size and time of last change of a video, or of a folder's pictures: whether it is still the same."""
+    """Size and modification time of a video, or of a folder's pictures, by which changes are noticed."""
     files = [path] if path.is_file() else sorted(each for each in path.iterdir() if each.is_file())
     states = [each.stat() for each in files]
     return [sum(each.st_size for each in states), max((each.st_mtime_ns for each in states), default=0)]

@@ -1,4 +1,4 @@
-"""People one by one, as RTMPose and its like see them: boxes around people, and the joints of whoever is in each.
+"""Top-down networks such as RTMPose: boxes around people, and the joints of the person in each.
 
 Boxes and joints are those of `rtmlib` to a hundredth of a pixel (tests/detection2d/test_against_rtmlib.py).
 """
@@ -23,40 +23,40 @@ from shapepose_fg.detection2d.upright import UprightView
 _Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 _Above0 = Annotated[FiniteFloat, Field(gt=0)]
 _AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
-"""How many axes the outputs of each decoding have."""
+"""Numbers of axes of the outputs of each decoding."""
 
 
 class KeypointForm(BaseModel, extra="forbid"):
-    """How a network of keypoints is to be read: a TOML file, RTMPose's kind where it says nothing else."""
+    """Description of a network of keypoints: a TOML file; defaults are those of RTMPose."""
 
     network: str = ""
-    """Its ONNX file."""
+    """ONNX file of the network."""
     skeleton: str | None = None
-    """One of `SKELETONS`, or a skeleton's TOML file; None where the number of joints tells."""
+    """One of `SKELETONS`, or a skeleton's TOML file; None where the number of joints determines it."""
     joints: list[str] | None = None
-    """What each joint of the network is called in the skeleton, "" for none; None for its keypoints in order."""
+    """Name of each joint of the network in the skeleton, "" for none; None for its keypoints in order."""
     decoding: Literal["simcc", "heat map", "coordinates"] = "simcc"
-    """What it gives: for each joint two curves, along x and along y; a map; or x, y and score."""
+    """Output of the network: for each joint two curves, along x and along y; a map; or x, y and score."""
     input: str | None = None
-    """The name of its input; None for whichever it has."""
+    """Name of its input; None for the only one."""
     outputs: list[str] | None = None
-    """Names of its outputs that are read: x and y of SimCC, otherwise one; None for the first ones."""
+    """Names of its outputs: x and y of SimCC, otherwise one; None for the first ones."""
     size: tuple[Side, Side] = (192, 256)
     """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
     colours: Literal["bgr", "rgb"] = "bgr"
-    """Their order. RTMPose was trained on the other; so is it run by rtmlib, and by everybody since."""
+    """Order of the colours. RTMPose was trained on the other; rtmlib and others run it with this one."""
     mean: _Three = (123.675, 116.28, 103.53)
-    """Taken off colours from 0 to 255, in their order."""
+    """Subtracted from colours from 0 to 255, in their order."""
     std: tuple[_Above0, _Above0, _Above0] = (58.395, 57.12, 57.375)
-    """Colours are divided by this then."""
+    """Divisors of the colours after that."""
     cells: Literal["corners", "edges"] = "corners"
-    """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill it."""
+    """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill the input."""
     scale: tuple[FiniteFloat, FiniteFloat] = (1.0, 1.0)
     """Pixels of the input per unit of coordinates, x and y."""
     padding: Annotated[FiniteFloat, Field(ge=1, le=4)] = 1.25
-    """How much larger than its box the network is shown a person."""
+    """Ratio of the size of the network's input to that of the box."""
     boxes: BoxForm | None = None
-    """What finds people; None where it is shown whole pictures."""
+    """Network that finds people; None where the input is the whole picture."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class People:
     xy: Array
     """(P, K, 2) positions, in the order of the skeleton's keypoints."""
     score: Array
-    """(P, K) as the network gives them; 0 or less is a joint that was not seen."""
+    """(P, K) scores of the network; 0 or less is a joint that was not seen."""
 
     def __len__(self) -> int:
         return int((self.score > 0).sum())
@@ -81,22 +81,22 @@ class TopDownNetwork:
     """Boxes, and a network that finds the joints of the person in each."""
 
     network: OnnxNetwork
-    """What finds joints."""
+    """The network that finds joints."""
     form: KeypointForm
-    """How it is to be read."""
+    """Description of the network."""
     skeleton: Skeleton
-    """Whose joints it finds."""
+    """Skeleton of its joints."""
     place: Index
     """(N,) which of the skeleton's K keypoints each joint of the network is, -1 for none."""
     boxes: BoxNetwork | None
-    """What finds people; None where the network is shown whole pictures."""
+    """Network that finds people; None where the input is the whole picture."""
     suffix, tail = ".json", "\n]}\n"
 
     @classmethod
     def of(
         cls, network: OnnxNetwork, form: KeypointForm, skeleton: Skeleton | None, boxes: BoxNetwork | None
     ) -> "TopDownNetwork":
-        """Tried on an empty picture: InputError where the network does not fit its description."""
+        """Load the network and run it on an empty picture: InputError where it does not fit its description."""
         count = _decoded(network, form, np.zeros((1, 3, *form.size[::-1]), dtype=np.float32))[1].shape[1]
         skeleton = skeleton or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
         if skeleton is None:
@@ -121,7 +121,7 @@ class TopDownNetwork:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the detections depend on."""
+        """Everything that the detections depend on."""
         said = [
             part
             and {"sha256": part.network.sha256, **part.form.model_dump(mode="json", exclude={"network", "boxes"})}
@@ -130,14 +130,16 @@ class TopDownNetwork:
         return {"network": said[0], "detection": {"boxes": said[1]}}
 
     def head(self, frames: int) -> str:
-        """The beginning of MMPose's JSON of a video, with the joints' layout unless it was only guessed."""
+        """The beginning of MMPose's JSON of a video, with the joints' layout unless it was guessed."""
         alike = [each for each in SKELETONS.values() if each.keypoint_count == self.skeleton.keypoint_count]
         named = self.form.skeleton in SKELETONS or alike == [self.skeleton]
         meta = {"dataset_name": self.skeleton.name} if named else {}
         return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """Frame `number` in it: `People`, None where there was no picture. Joints that were not seen are 0 0 0."""
+        """Frame `number` of the JSON: `People`, None where there was no picture. Joints that were not seen are
+        0 0 0.
+        """
         people = []
         for xy, score in zip(found.xy, found.score, strict=True) if found else ():
             if (seen := score > 0).any():
@@ -146,7 +148,7 @@ class TopDownNetwork:
         return f"{',' if number else ''}\n{json.dumps({'frame_id': number, 'instances': people}, allow_nan=False)}"
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
-        """What it is shown of pictures with such a region and roll: as many pixels as there are."""
+        """The input for pictures with such a region and roll, at full resolution."""
         return UprightView.of(region, roll_deg)
 
     def detect(self, picture: NDArray[np.uint8]) -> People:
@@ -173,8 +175,8 @@ class TopDownNetwork:
     def _joints(self, crops: NDArray[np.uint8]) -> tuple[Array, Array]:
         """Positions (P, K, 2) in pixels of `crops` (B, H, W, 3), and scores (P, K).
 
-        P is B, or a multiple where the network finds several people in each. What was not found, or is no number,
-        has a score of 0.
+        P is B, or a multiple where the network finds several people in each. Missing joints, and values that are
+        not finite, have a score of 0.
         """
         ordered = crops if self.form.colours == "bgr" else crops[..., ::-1]
         blob = ((ordered - np.array(self.form.mean)) / np.array(self.form.std)).transpose(0, 3, 1, 2)
@@ -187,7 +189,7 @@ class TopDownNetwork:
 
 
 def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array) -> NDArray[np.uint8]:
-    """What is in a frame around `centre` (2,) with the sides `extent` (2,), at the `size` (2,) of the network.
+    """The part of a frame around `centre` (2,) with the sides `extent` (2,), at the `size` (2,) of the network.
 
     It is black outside of the picture.
     """
@@ -233,7 +235,7 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
 
 
 def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
-    """Pixels (B, N, 2) and heights (B, N) of the highest places of maps (B, N, H, W), between the cells."""
+    """Pixels (B, N, 2) and heights (B, N) of the maxima of maps (B, N, H, W), between the cells."""
     shape = np.array(maps.shape[:1:-1])
     flat = np.nan_to_num(maps, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, *maps.shape[2:])
     row, column = np.divmod(flat.reshape(len(flat), -1).argmax(axis=1), shape[0])

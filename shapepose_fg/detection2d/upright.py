@@ -1,6 +1,6 @@
-"""Pictures turned so that gravity points down, at the size of a network's input, and the way back.
+"""Rotates pictures so that gravity points down, at the size of a network's input, and back.
 
-Detectors are trained on people who stand upright in the picture: of others they find half as many.
+Detectors are trained on upright people: of others they find half as many.
 """
 
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Camera
 
 LEVEL_DEG = 5.0
-"""Pictures that are rolled by less stay as they are: people lean by as much, and turning costs corners."""
+"""Roll below which pictures are not rotated, degrees: people lean by as much, and rotation loses corners."""
 _LOOKS_DOWN = 0.17
-"""Where the picture of the vertical is shorter than this (the sine of 10 degrees), the camera looks along it, and
-no direction of the picture is up."""
+"""Length of the projected vertical, the sine of 10 degrees, below which the camera looks along it and no
+direction of the picture is up."""
 
 
 def roll_of(camera: Camera, up: Array) -> float:
-    """How far the picture of `camera` is to be turned for `up` (3,) to point up in its middle: degrees clockwise.
+    """Rotation of the picture of `camera` with which `up` (3,) points up in its middle: degrees clockwise.
 
     0 where the camera looks straight up or down.
     """
@@ -36,7 +36,7 @@ def roll_of(camera: Camera, up: Array) -> float:
 
 @dataclass(frozen=True)
 class UprightView:
-    """How a region of a picture becomes the input of a network, turned upright."""
+    """Maps a region of a picture to the input of a network, rotated upright."""
 
     size: tuple[int, int]
     """Width and height of the network's input, pixels."""
@@ -45,7 +45,7 @@ class UprightView:
     region: tuple[float, float, float, float]
     """Left, top, right, bottom edge of the region, pixels of the picture; the centre of the first pixel is 0."""
     turn_deg: float
-    """By how much the picture is turned clockwise, degrees."""
+    """Rotation of the picture, degrees clockwise."""
 
     @property
     def scale(self) -> float:
@@ -61,12 +61,12 @@ class UprightView:
         multiple: int = 1,
         only_size: tuple[int, int] | None = None,
     ) -> "UprightView":
-        """The view of a `region` turned clockwise by `roll_deg`, about `long_side` pixels along its longer side.
+        """The view of a `region` rotated clockwise by `roll_deg`, about `long_side` pixels along its longer side.
 
-        Without `long_side` it is as large as it is. Rolls under `LEVEL_DEG` from a multiple of 90 degrees are
-        turned by that multiple. Both sides are the nearest multiples of `multiple`, so the axes' scales differ by
-        a few per cent. A network that takes pictures of `only_size` (width, height) gets the region in the middle
-        of such a picture.
+        Without `long_side` it keeps its size. Rolls under `LEVEL_DEG` from a multiple of 90 degrees are rotated by
+        that multiple. Both sides are the nearest multiples of `multiple`, so that the axes' scales differ by a few
+        per cent. A network with inputs of `only_size` (width, height) gets the region in the middle of such a
+        picture.
         """
         quarter = 90.0 * round(roll_deg / 90.0)
         roll_deg = quarter if abs(roll_deg - quarter) < LEVEL_DEG else roll_deg

@@ -8,7 +8,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence
+from shapepose_fg.estimation.linearisation import ViewEvidence, squared_distance
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 MODEL_SIGMA_M = 0.02
@@ -66,7 +66,7 @@ class BodyStep:
         fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
-    def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> Message:
+    def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> JointTargets:
         """What the bodies say of the joints `pulled` (R, J): E_shape of Eq. 3."""
         xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
         ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
@@ -86,7 +86,7 @@ class BodyStep:
         information = np.zeros_like(covariance)
         sigma_m = self.config.graph.shape_sigma_m
         information[pulled] = np.eye(3) / sigma_m**2 if sigma_m > 0 else np.linalg.inv(covariance[pulled])
-        return Message(np.where(pulled[..., None], xyz, np.nan), information)
+        return JointTargets(np.where(pulled[..., None], xyz, np.nan), information)
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:
@@ -111,21 +111,9 @@ def disagreement(evidence: ViewEvidence, fit: BodyFit) -> Array:
     the joint of the body that was fitted with it, whose robust kernel stays away from what no pose reaches. Where
     the views leave a direction open, they cannot disagree in it. 0 for rows without a body.
     """
-    model = MODEL_SIGMA_M**2 * np.eye(3)
-    prior = _sigmas_apart(evidence, fit.prior_xyz, fit.prior_covariance)
-    fitted = _sigmas_apart(evidence, fit.joints, np.nan_to_num(fit.covariance) + model)
-    return np.where(fit.ok[:, None], np.fmin(prior, fitted), 0.0)
-
-
-def _sigmas_apart(evidence: ViewEvidence, xyz: Array, covariance: Array) -> Array:
-    """Distance (N, J) of what the views say from `xyz` (N, J, 3) +- `covariance`, standard deviations; NaN
-    unknown.
-    """
-    known = np.asarray(np.isfinite(xyz).all(axis=2))
-    apart = np.where(known[..., None], np.nan_to_num(evidence.target - xyz), 0.0)
-    other = np.where(known[..., None, None], covariance, np.eye(3))
-    # (L^-1 + C)^-1 = L (I + C L)^-1, which holds for information L that is singular, too.
-    information = evidence.information
-    weight = information @ np.linalg.inv(np.eye(3) + other @ information)
-    squared = np.einsum("...i,...ij,...j->...", apart, weight, apart)
-    return np.where(known, np.sqrt(np.maximum(squared, 0.0)), np.nan)
+    fitted = np.nan_to_num(fit.covariance) + MODEL_SIGMA_M**2 * np.eye(3)
+    squared = [
+        squared_distance(evidence.message, *body)
+        for body in ((fit.prior_xyz, fit.prior_covariance), (fit.joints, fitted))
+    ]
+    return np.where(fit.ok[:, None], np.sqrt(np.maximum(np.fmin(*squared), 0.0)), 0.0)

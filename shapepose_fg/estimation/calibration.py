@@ -5,7 +5,7 @@ from importlib.resources import as_file, files
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask, Whole
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
 
 LASTS_S = 0.25
@@ -26,7 +26,7 @@ WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
 class Clues:
     """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
 
-    The last four are means over the frames around (`lasting_mean`).
+    The last four are means over the frames around (`in_time.smoothed_in_time`).
     """
 
     frame: Whole
@@ -36,9 +36,9 @@ class Clues:
     views: Whole
     """(N, J) how many views see each."""
     covariance: Array
-    """(N, J, 3, 3) of the graph, errors that last in it, m²."""
+    """(N, J, 3, 3) covariance from the graph, with errors that last, m²."""
     disagreement: Array
-    """(N, J) squared Mahalanobis distance of the joint from where the body has it (`from_body`)."""
+    """(N, J) squared Mahalanobis distance of the joint from where the body has it."""
     association: Array
     """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
     draft: Array
@@ -70,20 +70,21 @@ class Calibration:
     """(J,) what the variances of each joint are multiplied with where nothing speaks against them: by the whole
     recording's errors a shoulder or a hip is known less well than the graph takes it, a nose or a knee better."""
     power: float
-    """And with one plus the disagreement, to this."""
+    """Exponent of one plus the disagreement, by which variances are multiplied, too."""
     unseen: float
-    """And, of a joint that no view sees, with its sigma over `SURE_M`, to this, where that is over 1: body and
+    """Exponent of the sigma over `SURE_M`, where over 1, of a joint that no view sees: body and
     motion, which carry it then, err rarely and by much."""
     association: float
     """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
     frames are one."""
     draft: float
-    """Likewise."""
+    """How many times the clue of this name is added."""
     exchange: float
-    """Likewise: how probable it is that two limbs that both bodies can have are exchanged."""
+    """How many times the clue of this name is added: how probable it is that two limbs that both bodies can have
+    are exchanged."""
     person: float
-    """And all by the exponential of this times how badly the person is known as a whole (`Clues.person`): where
-    that is badly, detections are somebody else's more often, and nothing tells which."""
+    """Covariances are multiplied by the exponential of this times how badly the person is known as a whole
+    (`Clues.person`): where that is badly, detections are somebody else's more often, and nothing tells which."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":
@@ -101,26 +102,3 @@ class Calibration:
         added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
         whole = times[..., None, None] * clues.covariance + added
         return np.exp(self.person * clues.person)[..., None, None] * whole
-
-
-def from_body(joints: Array, covariance: Array, prior_xyz: Array, information: Array) -> Array:
-    """(N, J) squared Mahalanobis distance of `joints` (N, J, 3), known to `covariance` (N, J, 3, 3), from where
-    the body has them, known by `information` (N, J, 3, 3): 0 where it says nothing, or they are not known.
-    """
-    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
-    away = np.where(known[..., None], joints - np.nan_to_num(prior_xyz), 0.0)[..., None]
-    both = np.eye(3) + information @ np.where(known[..., None, None], covariance, 0.0)
-    return np.asarray((away.mT @ np.linalg.solve(both, information @ away))[..., 0, 0], dtype=np.float64)
-
-
-def lasting_mean(values: Array, times_s: Array, where: Mask | None = None) -> Array:
-    """Values (T, J, ...) of one person's joints, averaged over the frames around in which they are `where` (T, J).
-
-    What leads a joint astray in one frame does so in the next; and a joint that is not seen is where doubtful
-    frames left it.
-    """
-    where = np.ones(values.shape[:2], dtype=bool) if where is None else where
-    near = np.exp(-0.5 * ((times_s[:, None] - times_s) / LASTS_S) ** 2) + 1e-9
-    total, flat = np.maximum(near @ where, 1e-9), values.reshape(*where.shape, -1) * where[..., None]
-    whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
-    return (whole / total[..., None]).reshape(values.shape)

@@ -1,11 +1,22 @@
 """What it means for joints that poses of cameras that move are not known exactly."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, ViewEvidence, inverses
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    ViewEvidence,
+    inverses,
+    linearise,
+    observation_sigmas,
+)
 
 _NOTHING = 1.0
 """What a joint of which nothing is known is known to, 1/m²: a metre."""
@@ -14,7 +25,7 @@ POSES_LAST_S = 3.0
 
 
 def carried_covariance(
-    evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
+    evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
     """(N, J, 3, 3) covariance of joints, m², that comes of their cameras' poses; zero where all stand still."""
     if views.carried is None or len(evidence.points) == 0:
@@ -23,8 +34,17 @@ def carried_covariance(
     return np.einsum("njbik,nbkl,njbml->njim", goes, views.carried.covariance, goes, optimize=True)
 
 
+def reported_with_poses(
+    rows: Observations, joints: Array, views: Views, config: ObservationConfig, names: Sequence[str]
+) -> Array:
+    """(N, J, B, 3, 6) how `joints` (N, J, 3), which are called `names`, go with the poses of carriers."""
+    sigmas = observation_sigmas(rows, joints, views, config, names)
+    nothing = JointTargets(joints, np.zeros((*joints.shape, 3)))
+    return goes_with_poses(linearise(rows, sigmas, joints, views, config), nothing, sigmas, views, config)
+
+
 def goes_with_poses(
-    evidence: ViewEvidence, body: Message, sigmas: Array, views: Views, config: ObservationConfig
+    evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
     """(N, J, B, 3, 6) how joints go with the poses of the B carriers of cameras, of which there is one.
 
@@ -54,13 +74,6 @@ def goes_with_poses(
         R, t = carried.wTb[:, number, :3, :3], carried.wTb[:, number, :3, 3]
         arm = points - t[:, None]
         # With a turn w and a way v along the carrier's axes a point goes by R w x arm + R v.
-        goes = np.concatenate([-_cross(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
+        goes = np.concatenate([-hat(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
         found[:, :, number] = gain @ goes
     return found
-
-
-def _cross(v: Array) -> Array:
-    """(..., 3, 3) the matrices of the cross products with vectors (..., 3)."""
-    x, y, z = (v[..., n] for n in range(3))
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)

@@ -29,7 +29,7 @@ LOOK_S = 0.05
 covariances are wider than they are. Of 0.03, 0.05 and 0.1 s this has the least error over all speeds in simulated
 recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
 UNSEEN_S = 0.5
-"""So long after a joint was seen, and before, its speed is taken from the body."""
+"""Time after and before a joint was seen for which its speed is taken from the body, seconds."""
 FREE_M2_S = 0.02
 """A step whose density is more than this is no step of a standing foot: at 30 frames a second it would be held to
 2.6 cm, and motion says more."""
@@ -41,7 +41,8 @@ def feet_of(joints: Sequence[str]) -> Index:
 
 
 def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) -> Problem:
-    """The same, in which those of the `feet` (F,) stand that do; arguments as those of `WindowGraph.solve`.
+    """Return the problem with those of the `feet` (F,) held that stand; arguments are those of
+    `WindowGraph.solve`.
 
     The feet are solved by themselves, without knowing of any standing.
     """

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.joint_names import mirrored as mirror_of
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
-from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, Message, ObservationConfig, ViewEvidence
+from shapepose_fg.estimation.limbs import ARMS_AND_LEGS, on_both_sides
+from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
 
 CERTAIN = 0.99
 """Observations that are more probably the person's make no alternatives: four in five."""
@@ -33,9 +34,7 @@ def limbs_to_exchange(joints: Sequence[str]) -> Index:
     A foot goes with its ankle.
     """
     named = [(far, near, far) for near, far in ARMS_AND_LEGS] + [(foot, "Knee", "Ankle") for foot in _FEET]
-    limbs = [tuple(f"{side}{name}" for name in limb) for side in "RL" for limb in named]
-    there = [[joints.index(name) for name in limb] for limb in limbs if {*limb} <= set(joints)]
-    return np.array(there, dtype=np.intp).reshape(-1, 3)
+    return np.array(on_both_sides(named, joints), dtype=np.intp).reshape(-1, 3)
 
 
 def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) -> Array:
@@ -77,7 +76,7 @@ def association_spread(
     observations: Observations,
     sigmas: Array,
     evidence: ViewEvidence,
-    body: Message,
+    body: JointTargets,
     views: Views,
     config: ObservationConfig,
 ) -> Array:

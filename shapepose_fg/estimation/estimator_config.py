@@ -46,8 +46,9 @@ class RefineConfig(Settings):
     alternations: Repeats = 3
     """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
     window_alternations: Repeats = 1
-    """The same for windows of several frames, which start from a draft of all joints (`draft`). Windows with
-    factors of the user's own take as many as frames alone: these may say what is far from what the views said."""
+    """N of Algorithm 1 for windows of several frames, which start from a draft of all joints (`draft`). Windows
+    with factors of the user's own take as many as frames alone: these may say what is far from what the views
+    said."""
     settled_m: MetresOrNone = 0.002
     """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
     max_sigma_m: Metres = 0.5

@@ -22,10 +22,10 @@ points are within 4 cm."""
 UNDER_M = 0.1
 """A foot this far below the floor stands on something else; nothing does below a floor."""
 UNDER_SHARE = 0.05
-"""So many looks may be: bodies that are fitted badly; before two cameras that face each other as many as 4 in 100
-are (simulated; of three and more cameras none). More are another floor, and then none is said."""
+"""Largest share of looks below the floor: bodies that are fitted badly; before two cameras that face each other as
+many as 4 in 100 are (simulated; of three and more cameras none). More are another floor, and then none is said."""
 SCALE_M = 0.015
-"""Of the kernel: how much soles of bodies differ from the floor that they stand on, metres, one sigma."""
+"""Width of the kernel: how much soles of bodies differ from the floor that they stand on, metres, one sigma."""
 TILT_RAD = np.deg2rad(0.5)
 """How far the floor may lean from the level of the cameras' file, one sigma on either axis."""
 SOLE_M = 0.01
@@ -40,7 +40,7 @@ class Floor:
     normal: Array
     """(3,) unit vector that points up."""
     height_m: float
-    """Of all points of the floor along the normal, metres."""
+    """Height of all points of the floor along the normal, metres."""
     sigma_m: float
     """How surely, under the middle of the feet that it was found from, metres."""
     looks: int

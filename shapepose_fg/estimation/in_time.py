@@ -110,8 +110,12 @@ def interpolated(points: Array, times_s: Array) -> Array:
     return result
 
 
-def smoothed_in_time(values: Array, times_s: Array, width_s: float) -> Array:
-    """Values (T, ...) averaged over time with a Gaussian of `width_s`, one sigma."""
-    weight = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2)
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.asarray(np.tensordot(weight, values, axes=1), dtype=np.float64)
+def smoothed_in_time(values: Array, times_s: Array, width_s: float, where: Mask | None = None) -> Array:
+    """Values (T, J, ...) averaged over time with a Gaussian of `width_s`, one sigma, from the frames in which they
+    are `where` (T, J); from frames however far off, where there are no others.
+    """
+    where = np.ones(values.shape[:2], dtype=bool) if where is None else where
+    near = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2) + 1e-9
+    total, flat = np.maximum(near @ where, 1e-9), values.reshape(*where.shape, -1) * where[..., None]
+    whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
+    return (whole / total[..., None]).reshape(values.shape)

@@ -20,12 +20,11 @@ from factors import (
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.carried_error import goes_with_poses
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.carried_error import reported_with_poses
+from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.trajectory_graph import dilution
+from shapepose_fg.estimation.trajectory_graph import Mounted, dilution
 
 _MAP_S = 15.0
 """Landmarks hold a map together for as long as a detector's errors last, and longer."""
@@ -79,12 +78,11 @@ class JoinedPeople:
         density = self._together * motion.density(np.linalg.norm(np.nan_to_num(people.velocity), axis=-1))
         rows = table.observations(people.joints, people.time_s)
         views = Views.of(self._rig, rows.time_s)
-        sigmas = np.sqrt(self._together) * observation_sigmas(
-            rows, people.joints, views, self._config, people.joint_names.tolist()
-        )
+        seen = rows, people.joints, views, self._config, people.joint_names.tolist()
+        sigmas = np.sqrt(self._together) * observation_sigmas(*seen)
         # Where a joint would have been seen at the row's time, by the camera where it was at its own.
         xy = np.where(table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan)
-        goes = self._goes_with_poses(people, rows, views) if views.carried is not None else None
+        goes = reported_with_poses(*seen) if views.carried is not None else None
         for frame in np.unique(people.frame).tolist():
             here = np.flatnonzero(people.frame == frame)
             cameras = self._cameras(frame, rows.time_s[here[0]])
@@ -98,13 +96,6 @@ class JoinedPeople:
             for n in here.tolist():
                 self._report(people, n, views, None if goes is None else goes[n], made)
             yield frame, made
-
-    def _goes_with_poses(self, people: Reconstruction, rows: Observations, views: Views) -> Array:
-        """(N, J, B, 3, 6) how the joints as they are reported go with the poses of carriers."""
-        sigmas = observation_sigmas(rows, people.joints, views, self._config, people.joint_names.tolist())
-        evidence = linearise(rows, sigmas, people.joints, views, self._config)
-        nothing = Message(people.joints, np.zeros((*people.joints.shape, 3)))
-        return goes_with_poses(evidence, nothing, sigmas, views, self._config)
 
     def _report(self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment) -> None:
         """Add the joints of a row as they are reported."""
@@ -128,11 +119,9 @@ class JoinedPeople:
 
     def _cameras(self, frame: int, time_s: Array) -> list[gtsam.PinholeCameraCal3_S2 | PosedCamera]:
         """The cameras of a frame whose views are of `time_s` (V,)."""
-        own, middle = self._rig.poses(time_s), np.full(1, time_s.mean())
+        sensors = Mounted(self._rig, np.array([frame]), time_s[None]).sensors[0]
         cameras: list[gtsam.PinholeCameraCal3_S2 | PosedCamera] = list(self._still)
-        for view, on in enumerate(self._rig.carrier.tolist()):
-            if on >= 0:
-                carrier = self._rig.trajectories[on]
-                sensor = gtsam.Pose3(np.linalg.inv(carrier.at(middle)[0]) @ own[view])
-                cameras[view] = PosedCamera(self._lenses[view], self._pose_key(carrier.name, frame), sensor)
+        for view in np.flatnonzero(self._rig.carrier >= 0).tolist():
+            key = self._pose_key(self._rig.trajectories[self._rig.carrier[view]].name, frame)
+            cameras[view] = PosedCamera(self._lenses[view], key, gtsam.Pose3(sensors[view]))
         return cameras

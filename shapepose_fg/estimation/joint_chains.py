@@ -11,19 +11,19 @@ from functools import cached_property
 import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA, KernelName, Motion, lasting_blocks
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.in_time import spanned
 from shapepose_fg.estimation.kernels import ready, solve_chains
-from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import Lasting
 
 _SETTLED_M = 5e-4
 """Chains are solved until no joint moves by more, metres."""
 _STEPS = 20
-"""Or for so many steps: under a robust kernel the last ones halve what is left."""
+"""Maximum number of steps: under a robust kernel the last ones halve what is left."""
 _HELD = 1e-6
 """Information that holds a joint of a frame by itself where it is, 1/m²: a kilometre."""
 UNDETERMINED_M = 10.0
@@ -40,7 +40,7 @@ class Projections:
     xy: Array
     """(T, J, V, 2) undistorted pixels."""
     sigmas_px: Array
-    """(T, J, V) of what is new in every frame, pixels."""
+    """(T, J, V) standard deviation of the error that is new in every frame, pixels."""
     used: Mask
     """(T, J, V) which observations count."""
     lead_s: Array
@@ -65,7 +65,7 @@ class Projections:
 class Said:
     """A message about a window's joints whose error lasts."""
 
-    message: Message
+    message: JointTargets
     """What is said, T rows."""
     scale: float
     """Covariances are multiplied with this."""
@@ -86,7 +86,7 @@ class Chains:
     diagonal: Array
     """(C, T, d, d) information of what is linear, of each state with itself."""
     below: Array
-    """(C, T - 1, d, d) of each state, rows, with the one before it, columns."""
+    """(C, T - 1, d, d) information of each state, rows, with the one before it, columns."""
     right: Array
     """(C, T, d) information times what is expected."""
     there: Mask
@@ -133,7 +133,7 @@ class Chains:
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
 
 
-def solved_apart(seen: Projections, pulls: Message, initial: Array, steps: int, settled_m: float) -> Array:
+def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: int, settled_m: float) -> Array:
     """(R, J, 3) joints of least cost, metres, in R frames that have nothing to do with each other; NaN where
     `initial` (R, J, 3) is. One that is led farther away than `UNDETERMINED_M` stays there. There are at the most
     so many `steps`, until one is shorter than `settled_m`.
@@ -182,14 +182,14 @@ class Problem:
     """All that is known of a window's joints, each by itself."""
 
     times_s: Array
-    """(T,) of the frames, rising, seconds."""
+    """(T,) times of the frames, rising, seconds."""
     law: Motion
     """How joints move."""
     density: Array
-    """(T - 1, J) of the noise in it."""
+    """(T - 1, J) density of the noise in the motion."""
     seen: Projections
     """Observations that count."""
-    pulls: Message
+    pulls: JointTargets
     """What pulls joints and is new in every frame, T rows."""
     said: tuple[Said, Said]
     """What views and body say with errors that last: an offset each."""
@@ -253,7 +253,7 @@ class Problem:
 
 
 def determined(covariance: Array) -> Array:
-    """The same (..., 3, 3), NaN where it is more than `UNDETERMINED_M` in some direction."""
+    """Return covariances (..., 3, 3), NaN where one is more than `UNDETERMINED_M` in some direction."""
     largest = np.trace(covariance, axis1=-2, axis2=-1)  # at the most
     doubtful = np.isfinite(largest) & (largest >= UNDETERMINED_M**2)
     largest[doubtful] = np.linalg.eigvalsh(covariance[doubtful])[..., -1]

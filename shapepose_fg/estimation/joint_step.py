@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -11,12 +12,12 @@ from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import interpolated
 from shapepose_fg.estimation.joint_chains import Projections, solved_apart
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence
+from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 _SIGMA_M = 0.02
-"""Of a joint that several views see, about, metres."""
+"""Usual standard deviation of a joint that several views see, metres."""
 
 
 def solve_between(
@@ -24,7 +25,7 @@ def solve_between(
     sigmas_px: Array,
     cameras: Views,
     evidence: ViewEvidence,
-    of_body: Message,
+    of_body: JointTargets,
     config: EstimatorConfig,
 ) -> Array:
     """X (R, J, 3) of people in frames by themselves, metres, without a graph: what goes from round to round.
@@ -44,7 +45,7 @@ def solve_between(
 def solve_joints(
     parts: Sequence[tuple[WindowGraph, slice]],
     evidence: ViewEvidence,
-    of_body: Message,
+    of_body: JointTargets,
     config: EstimatorConfig,
     near: Array | None = None,
 ) -> None:
@@ -63,7 +64,7 @@ def solve_joints(
 def _prepare(
     person: WindowGraph,
     evidence: ViewEvidence,
-    of_body: Message,
+    of_body: JointTargets,
     part: slice,
     config: EstimatorConfig,
     near: Array | None,
@@ -85,7 +86,7 @@ def _prepare(
     person.prepare(inlier, views, body, initial, lost, feet)
 
 
-def _start(points: Array, sigma_m: Array, body: Message, config: EstimatorConfig) -> Array:
+def _start(points: Array, sigma_m: Array, body: JointTargets, config: EstimatorConfig) -> Array:
     """Where joints (R, J, 3) start that views place, at `points`, or the body; NaN where neither does."""
     placed = sigma_m <= config.refine.max_sigma_m
     return np.where(placed[..., None], points, np.where(body.known[..., None], body.xyz, np.nan))

@@ -13,9 +13,6 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
 
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
-_ROUNDING, _LEAST_KNOWN, _NOTHING = 1e-13, 1e-6, 1e-10
-"""Shares of the largest eigenvalue: off the diagonal it is none; a direction known less stays where it is, and one
-known less than by the last is not known at all."""
 _SINGULAR = 1e-11
 """A pivot that is no larger share of what it was is rounding: a state that nothing determines."""
 _FARTHEST_M = 1e6
@@ -23,7 +20,9 @@ _FARTHEST_M = 1e6
 
 
 def ready(values: Array) -> Array:
-    """The same as kernels take it: other types and orders, and what must not be written, are compiled anew."""
+    """Return an array as kernels take it: other types and orders, and what must not be written, are compiled
+    anew.
+    """
     return np.require(values, np.float64, ("C", "W"))
 
 
@@ -39,41 +38,6 @@ def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gr
             information[a, 3 + b] += square
             information[3 + a, b] += square
             information[3 + a, 3 + b] += lead * square
-
-
-@part
-def _eigen(A, values, vectors):
-    """Eigenvalues, rising, and eigenvectors (columns) of a symmetric (3, 3), which is lost: Jacobi's rotations."""
-    for a in range(3):
-        for b in range(3):
-            vectors[a, b] = 1.0 if a == b else 0.0
-    for _ in range(12):
-        if not abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2]) > _ROUNDING * (A[0, 0] + A[1, 1] + A[2, 2]):
-            break
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                ratio = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
-                t = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(ratio * ratio + 1.0))
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s, r = t * c, 3 - p - q
-                A[p, p] -= t * A[p, q]
-                A[q, q] += t * A[p, q]
-                A[p, q] = A[q, p] = 0.0
-                rp, rq = A[r, p], A[r, q]
-                A[r, p] = A[p, r] = c * rp - s * rq
-                A[r, q] = A[q, r] = s * rp + c * rq
-                for a in range(3):
-                    vp, vq = vectors[a, p], vectors[a, q]
-                    vectors[a, p], vectors[a, q] = c * vp - s * vq, s * vp + c * vq
-    for a in range(3):
-        values[a] = A[a, a]
-    for a in (0, 1, 0):
-        if values[a] > values[a + 1]:
-            values[a], values[a + 1] = values[a + 1], values[a]
-            for b in range(3):
-                vectors[b, a], vectors[b, a + 1] = vectors[b, a + 1], vectors[b, a]
 
 
 @kernel("f4 f2 f4 f3 f0 f0 f0 f3")
@@ -96,54 +60,49 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
                 points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
 
 
-@kernel("f3 f4 f2 f4 f3 f0 f0 f0 b0 i0 f0 b3 f4 f4 f3 f3 f2")
+@part
+def add_detection(x, camera, focal, at, sigma, fixed_depth, least_depth, reach, by_reach, robust, width, H, g):
+    """Add what a detection `at` (2,), of this `sigma` in pixels, says of a joint at `x` to its information and
+    gradient, if it is within `reach`: whether it is, and the residual, NaN for a joint that is too near or behind
+    the camera. With `by_reach` all are, under a Geman-McClure kernel of that width.
+    """
+    u, v, depth = project(camera, x)
+    if not depth >= least_depth:
+        return False, np.nan, np.nan
+    to_u, to_v = u - at[0], v - at[1]
+    far, reach_px = to_u * to_u + to_v * to_v, reach * focal / (fixed_depth if fixed_depth > 0.0 else depth)
+    if not (by_reach or math.sqrt(far) < reach_px):
+        return False, to_u, to_v
+    weight = 1.0 / (sigma * sigma)
+    if by_reach:
+        weight *= robust_weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
+    else:
+        weight *= robust_weight(robust, far * weight / (width * width))
+    add_view(camera, u, v, depth, to_u, to_v, weight, H, g)
+    return True, to_u, to_v
+
+
+@kernel("f3 f4 f2 f4 f3 f0 f0 f0 b0 i0 f0 b3 f4 f4 f3")
 def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
-    inlier, residual, information, gradient, target, sigma_m,
+    inlier, residual, information, gradient,
 ):  # fmt: skip
-    """`linearisation.linearise` into the last six: false, NaN, and zeros to begin with, the last two anything.
+    """`linearisation.linearise` into the last four: false, NaN, and zeros to begin with.
 
     `sigmas` (N, J, V) are 0 where nothing is seen; `focal` (S, V) pixels. `reach` is the gate's, or
     with `by_reach` the Geman-McClure kernel's, metres.
     """
     N, J, V = sigmas.shape
-    A, values, vectors = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for n in range(N):
         for j in range(J):
             x, H, g = points[n, j], information[n, j], gradient[n, j]
             for v in range(V):
-                if not sigmas[n, j, v] > 0.0:
-                    continue
-                camera = cameras[n if cameras.shape[0] > 1 else 0, v]
-                at_u, at_v, depth = project(camera, x)
-                if not depth >= least_depth:
-                    continue
-                to_u, to_v = at_u - xy[n, j, v, 0], at_v - xy[n, j, v, 1]
-                residual[n, j, v, 0], residual[n, j, v, 1] = to_u, to_v
-                far = to_u * to_u + to_v * to_v
-                reach_px = reach * focal[n if focal.shape[0] > 1 else 0, v]
-                reach_px /= fixed_depth if fixed_depth > 0.0 else depth
-                inlier[n, j, v] = by_reach or math.sqrt(far) < reach_px
-                if inlier[n, j, v]:
-                    weight = 1.0 / (sigmas[n, j, v] * sigmas[n, j, v])
-                    if by_reach:
-                        weight *= robust_weight(_GEMAN_MCCLURE, far / (reach_px * reach_px))
-                    else:
-                        weight *= robust_weight(robust, far * weight / (width * width))
-                    add_view(camera, at_u, at_v, depth, to_u, to_v, weight, H, g)
-            for a in range(3):
-                target[n, j, a] = x[a]
-                for b in range(3):
-                    A[a, b] = H[a, b]
-            _eigen(A, values, vectors)
-            for k in range(3):
-                if values[k] > _LEAST_KNOWN * max(values[2], 1e-12):
-                    along = 0.0
-                    for a in range(3):
-                        along += vectors[a, k] * g[a]
-                    for a in range(3):
-                        target[n, j, a] -= vectors[a, k] * along / values[k]
-            sigma_m[n, j] = 1.0 / math.sqrt(values[0]) if values[0] > _NOTHING * values[2] else np.inf
+                if sigmas[n, j, v] > 0.0:
+                    camera = cameras[n if cameras.shape[0] > 1 else 0, v]
+                    of_view = focal[n if focal.shape[0] > 1 else 0, v], xy[n, j, v], sigmas[n, j, v]
+                    inlier[n, j, v], residual[n, j, v, 0], residual[n, j, v, 1] = add_detection(
+                        x, camera, *of_view, fixed_depth, least_depth, reach, by_reach, robust, width, H, g
+                    )
 
 
 @part

@@ -1,6 +1,6 @@
 """Where a body can have the joints that views hardly determine: with the body, and limbs as long as its own."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -69,23 +69,28 @@ def limb_steps(joints: Array, covariance: Array, unseen: Mask, fitter: BodyFitte
     steps = np.zeros(joints.shape)
     if len(rows) == 0:
         return steps
+    body = fitter.fit_whole(JointTargets.solved(joints[rows], covariance[rows]))
     C = np.where(known[rows][..., None, None], covariance[rows], np.eye(3))
-    information = np.where(known[rows][..., None, None], np.linalg.inv(C), 0.0)
-    targets = JointTargets(np.nan_to_num(joints[rows]), (information + information.swapaxes(2, 3)) / 2)
-    body = fitter.fit_whole(targets)
     share = C @ np.linalg.inv(C + LIMB_SIGMA_M**2 * np.eye(3))
     step = np.einsum("...ij,...j->...i", share, body.joints - joints[rows])
     steps[rows] = np.where((moved[rows] & np.isfinite(step).all(axis=-1))[..., None], step, 0.0)
     return steps
 
 
-def limbs_of(joints: Sequence[str]) -> list[tuple[int, int]]:
+def limbs_of(joints: Sequence[str]) -> list[tuple[int, ...]]:
     """The arms, legs and feet among a detector's joints, as pairs of their numbers."""
-    ends = [(f"{side}{a}", f"{side}{b}") for side in "RL" for a, b in (*ARMS_AND_LEGS, *_FEET)]
-    return [(joints.index(a), joints.index(b)) for a, b in ends if a in joints and b in joints]
+    return on_both_sides((*ARMS_AND_LEGS, *_FEET), joints)
 
 
-def limb_lengths(body: Array, limbs: Sequence[tuple[int, int]]) -> Array:
+def on_both_sides(parts: Iterable[tuple[str, ...]], joints: Sequence[str]) -> list[tuple[int, ...]]:
+    """The numbers of the joints of `parts`, named without their side, right and left; those that a detector's
+    `joints` have all of.
+    """
+    named = [tuple(f"{side}{name}" for name in part) for side in "RL" for part in parts]
+    return [tuple(joints.index(name) for name in part) for part in named if {*part} <= {*joints}]
+
+
+def limb_lengths(body: Array, limbs: Sequence[tuple[int, ...]]) -> Array:
     """(L,) length of each limb, metres: the median of those of one person's body in T frames; NaN where unknown.
 
     `body` (T, J, 3) are the body's joints, NaN in frames without a body.
@@ -97,7 +102,7 @@ def limb_lengths(body: Array, limbs: Sequence[tuple[int, int]]) -> Array:
 
 
 def with_lengths(
-    joints: Array, covariance: Array, moved: Mask, lengths: Array, limbs: Sequence[tuple[int, int]]
+    joints: Array, covariance: Array, moved: Mask, lengths: Array, limbs: Sequence[tuple[int, ...]]
 ) -> Array:
     """Joints (N, J, 3), metres, of which those `moved` (N, J) go where limbs have their `lengths` (L,).
 

@@ -2,13 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Interval
 
 from factors import DEFAULT_WIDTH_SIGMA, KernelName
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -19,9 +21,11 @@ MIN_DEPTH_M = 0.2
 """An observation counts only if the joint is at least this far in front of the camera."""
 LEAST_PROBABILITY = 0.01
 """An observation that is less probably the person's counts as if it were this."""
+_DAMPING = 1e-7
+"""Share of the information of the joint that is added in all directions: a ray's length stays as it is."""
 _DEPTH_M = 8.0
-"""Of joints before the cameras of the `tune` sequences, in the median (7 to 10 m): where lengths become pixels in
-the paper's setting."""
+"""Median depth of joints before the cameras of the `tune` sequences (7 to 10 m), metres: where lengths become
+pixels in the paper's setting."""
 
 
 @dataclass(frozen=True)
@@ -95,31 +99,6 @@ statistics of real ones, and these, each view of Shelf against the others, give 
 (docs/evaluation.md)."""
 
 
-@dataclass(frozen=True)
-class Message:
-    """What is said of the joints of T frames (or of N rows), by the views or by the body, as Gaussians."""
-
-    xyz: Array
-    """(T, J, 3) where they are, metres; anything where the information is zero."""
-    information: Array
-    """(T, J, 3, 3) 1/m², positive semi-definite; zero where nothing is said."""
-
-    @property
-    def known(self) -> Mask:
-        """(T, J) of which joints anything is said."""
-        return np.asarray(self.information.any(axis=(2, 3)))
-
-    def rows(self, index: Index | slice) -> "Message":
-        """Some of the rows."""
-        return Message(self.xyz[index], self.information[index])
-
-    def where(self, chosen: Mask, times: float = 1.0) -> "Message":
-        """What is said of the `chosen` (T, J) joints, information `times` this number; nothing of others."""
-        chosen = chosen & self.known
-        information = np.where(chosen[..., None, None], self.information * times, 0.0)
-        return Message(np.where(chosen[..., None], self.xyz, 0.0), information)
-
-
 def inverses(A: Array) -> Array:
     """Inverses (..., 3, 3) of symmetric matrices, by their cofactors; nothing is raised for singular ones."""
     a, b, c, d, e, f = (A[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
@@ -130,6 +109,18 @@ def inverses(A: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         whole /= a * first + b * second + c * third
     return np.ascontiguousarray(np.moveaxis(whole, 0, -1).reshape(A.shape))
+
+
+def squared_distance(said: JointTargets, xyz: Array, covariance: Array) -> Array:
+    """Squared Mahalanobis distance (N, J) of what is `said` of joints, whose information may be singular, from
+    Gaussians at `xyz` (N, J, 3) with this `covariance` (N, J, 3, 3); NaN where these are not known.
+    """
+    known = np.asarray(np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    away = np.where(known[..., None], xyz - np.nan_to_num(said.xyz), 0.0)[..., None]
+    # (L^-1 + C)^-1 = (1 + L C)^-1 L, which holds for information L that is singular, too.
+    both = np.eye(3) + said.information @ np.where(known[..., None, None], covariance, 0.0)
+    squared = (away.mT @ np.linalg.solve(both, said.information @ away))[..., 0, 0]
+    return np.where(known, squared, np.nan)
 
 
 @dataclass(frozen=True)
@@ -147,19 +138,25 @@ class ViewEvidence:
     gradient: Array
     """(N, J, 3) J^T W r over the inliers, 1/m."""
 
-    target: Array
-    """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
+    @cached_property
+    def target(self) -> Array:
+        """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
 
-    A joint that one view saw stays at its depth and moves onto the ray: directions below 1e-6 of the strongest are
-    left out. NaN where `points` is.
-    """
-    sigma_m: Array
-    """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
+        A joint that one view saw stays at its depth and moves onto the ray. NaN where `points` is.
+        """
+        scale = np.trace(self.information, axis1=-2, axis2=-1)[..., None, None]
+        known = np.where(scale > 0, self.information + _DAMPING * scale * np.eye(3), np.eye(3))
+        return self.points - (inverses(known) @ self.gradient[..., None])[..., 0]
+
+    @cached_property
+    def sigma_m(self) -> Array:
+        """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
+        return weakest_sigma(self.information)
 
     @property
-    def message(self) -> Message:
-        """The same as Gaussians."""
-        return Message(self.target, self.information)
+    def message(self) -> JointTargets:
+        """The evidence as Gaussians."""
+        return JointTargets(self.target, self.information)
 
 
 def weakest_sigma(information: Array) -> Array:
@@ -213,15 +210,14 @@ def linearise(
     shape, kernel = observations.confidence.shape, config.robust_kernel
     inlier, residual = np.zeros(shape, dtype=bool), np.full((*shape, 2), np.nan)
     information, gradient = np.zeros((*shape[:2], 3, 3)), np.zeros((*shape[:2], 3))
-    target, sigma_m = np.empty((*shape[:2], 3)), np.empty(shape[:2])
     look(
         ready(points), views.projection, views.focal, ready(observations.xy),
         ready(np.where(observations.seen, sigmas, 0.0)), config.fixed_depth_m, MIN_DEPTH_M,
         config.rho_2d_m if reach_m is None else reach_m, reach_m is not None, ROBUST[kernel],
         1.0 if kernel is None else DEFAULT_WIDTH_SIGMA[kernel],
-        inlier, residual, information, gradient, target, sigma_m,
+        inlier, residual, information, gradient,
     )  # fmt: skip
-    return ViewEvidence(points, inlier, residual, information, gradient, target, sigma_m)
+    return ViewEvidence(points, inlier, residual, information, gradient)
 
 
 def mean_confidence(observations: Observations, inlier: Mask) -> Array:

@@ -14,7 +14,7 @@ from shapepose_fg.core.storage.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
 GAP_S = 0.4
-"""So long joints were hidden whose densities across gaps were measured."""
+"""Length of the gaps across which densities of hidden joints were measured, seconds."""
 LOST_M = 0.1
 """A joint whose views leave it less certain than this in some direction, metres, is lost from sight."""
 
@@ -77,22 +77,18 @@ class MotionModel:
     law: Motion = CONSTANT_VELOCITY
     """How a state goes on."""
 
-    def density(self, speed_m_s: Array, within_s: float = MEASURED_S) -> Array:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J); see `Motion.density`."""
-        return self.law.density(self.acceleration(speed_m_s), within_s)
+    def density(self, speed_m_s: Array, within_s: float = MEASURED_S, turning: Array | float = 0.0) -> Array:
+        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
+        have a power spectral density of at least `turning` (..., J), m²/s³; see `Motion.density`.
+        """
+        return self.law.density(np.maximum(self.acceleration(speed_m_s), turning), within_s)
 
     def acceleration(self, speed_m_s: Array) -> Array:
         """Power spectral density (..., J) of the accelerations of joints of this speed (..., J), m²/s³."""
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
-    def density_of(self, speed_m_s: Array, turning: Array) -> Array:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
-        have a power spectral density of at least `turning` (..., J), m²/s³.
-        """
-        return self.law.density(np.maximum(self.acceleration(speed_m_s), turning))
-
     def density_lost(self, speed_m_s: Array) -> Array:
-        """The same while joints are lost from sight, and their speed is a guess."""
+        """Density (..., J) while joints are lost from sight, and their speed is a guess."""
         return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 
     @classmethod

@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
-from shapepose_fg.estimation.calibration import Calibration, Clues, from_body, lasting_mean
+from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
 from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.doubt import (
     DOUBTED,
@@ -19,14 +19,14 @@ from shapepose_fg.estimation.doubt import (
     limbs_to_exchange,
     mirrored_spread,
 )
-from shapepose_fg.estimation.in_time import carried, waited_s
+from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
-    Message,
     ViewEvidence,
     inverses,
     linearise,
     mean_confidence,
+    squared_distance,
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import LOST_M
@@ -40,12 +40,13 @@ from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution,
 RUNAWAY_M = 1.0
 """A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
 RUNAWAY_SIGMA = 20.0
-"""So has one that ends this many standard deviations, and half a metre, from what views and body say of it."""
+"""A joint that ends this many standard deviations, and half a metre, from what views and body say of it has run
+away."""
 _HALF_M = 0.5
 WEAK_SCORE = 0.3
 """Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
 WEAK_PROBABILITY = 0.5
-"""So are those that are as probably somebody else's."""
+"""Detections that are less probably the person's are weak."""
 
 
 def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
@@ -130,11 +131,7 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
         return fit
     rows = np.concatenate(chosen)
     rows = rows[fit.ok[rows]]
-    xyz, information = state.joints[rows], np.zeros((len(rows), *covariance.shape[1:]))
-    known = np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance[rows]).all(axis=(2, 3))
-    information[known] = np.linalg.inv(covariance[rows][known])
-    information = (information + information.swapaxes(2, 3)) / 2
-    again = fitter.fit_whole(JointTargets(np.nan_to_num(xyz), information), fit.rows(rows))
+    again = fitter.fit_whole(JointTargets.solved(state.joints[rows], covariance[rows]), fit.rows(rows))
     return fit.with_rows(rows[again.ok], again.rows(np.flatnonzero(again.ok)))
 
 
@@ -145,7 +142,7 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
     calibration = Calibration.load(joints)
-    of_body = from_body(state.joints, covariance, body.xyz, body.information)
+    of_body = np.nan_to_num(squared_distance(body, state.joints, covariance))
     association = association_spread(rows, state.sigmas, final, body, state.views, state.config.observations)
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
@@ -154,9 +151,9 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     for person in state.people:
         mine, times_s = person.rows, person.times_s
         alone[mine] = not person.temporal
-        association[mine] = lasting_mean(association[mine], times_s, count[mine] > 0)
+        association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
-            clue[mine] = lasting_mean(clue[mine], times_s)
+            clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
     clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
     return np.where(
         alone[:, None, None, None],
@@ -237,6 +234,6 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     )
 
 
-def _pull(message: Message, X: Array) -> Array:
+def _pull(message: JointTargets, X: Array) -> Array:
     """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

@@ -9,7 +9,8 @@ from shapepose_fg.core.camera import Views, beside_segment
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 
 LEAST_VIEWS = 3
-"""So many views must look at the joint in plain view and report nothing: fewer often miss it by chance."""
+"""Minimum number of views that must look at the joint in plain view and report nothing: fewer often miss it by
+chance."""
 MISSED = 0.2
 """Share of joints in plain view that a view does not report, or weakly, in simulated crowds. One, two, three, four
 views all miss 0.18, 0.046, 0.010 and 0.003 of them, as if by themselves."""
@@ -21,7 +22,7 @@ ELSEWHERE_M = 0.25
 in simulated crowds before three and four cameras, whose detector knows every pose, the log score gives all of this
 no weight; an arm that is stretched out on real footage is what speaks for it."""
 SPEED_M_S = 2.0
-"""But no farther than it has moved since a view reported it, at this speed: `factors.CONSTANT_VELOCITY.start`."""
+"""Speed at which a joint may have moved since a view reported it, m/s: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Limbs hide what is this much behind them."""
 _TRUNK = {("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, ("RShoulder", "RHip"): 0.1, ("LShoulder", "LHip"): 0.1}

@@ -38,7 +38,7 @@ def smoothed(
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
     information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(C, T)
-    density = motion.density_of(np.maximum(speed, SPEED_M_S), turning).reshape(T - 1, C)
+    density = motion.density(np.maximum(speed, SPEED_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     unseen = np.zeros((1, 0, 3, 4)), np.zeros((T, 1, 0, 2)), np.zeros((T, 1, 0)), np.zeros((T, 1, 0)), 0, 1.0
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information

@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import Message, ViewEvidence, observation_sigmas
+from shapepose_fg.estimation.linearisation import ViewEvidence, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import FactorFunction, WindowGraph, add_factors
 
@@ -25,7 +25,7 @@ class State:
     views: Views
     """The cameras."""
     sigmas: Array
-    """(N, J, V) of the observations, pixels; 0 where there are none."""
+    """(N, J, V) standard deviations of the observations, pixels; 0 where there are none."""
     first: Array
     """(N, J, 3) X_0, metres; NaN where unknown."""
     config: EstimatorConfig
@@ -40,9 +40,9 @@ class State:
     """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
     contradicts: Mask
     """(N, J) joints whose views the body contradicts (`disagreement`): gated anew from the body's place."""
-    of_views: Message
+    of_views: JointTargets
     """What the views alone say of N rows, all of the error in it."""
-    of_body: Message
+    of_body: JointTargets
     """What the body says of each joint without the joint's own views; zero where it does not pull."""
     enough: Mask
     """(N,) rows whose views place enough joints to place a person."""
@@ -71,7 +71,7 @@ class State:
         if len(extra_factors) > 0:
             add_factors(people, extra_factors)
         N, J, V = sigmas.shape
-        of_views, of_body = (Message(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2))
+        of_views, of_body = (JointTargets(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2))
         return cls(
             observations, views, sigmas, first, config, motion, people, first.copy(),
             np.zeros((N, J, V), dtype=bool), np.zeros((N, J), dtype=bool), of_views, of_body,
@@ -81,7 +81,7 @@ class State:
         )  # fmt: skip
 
     def put(
-        self, rows: Index, joints: Array, evidence: ViewEvidence, wrong: Mask, of_body: Message, fit: BodyFit
+        self, rows: Index, joints: Array, evidence: ViewEvidence, wrong: Mask, of_body: JointTargets, fit: BodyFit
     ) -> None:
         """What a round found of some `rows` (R,)."""
         self.joints[rows], self.inlier[rows] = joints, evidence.inlier

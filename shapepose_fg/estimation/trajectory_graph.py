@@ -8,7 +8,8 @@ recording.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -44,7 +45,8 @@ _SAME_PERSON = 2.5
 _ERRORS = ((0.45, 3.5), (0.25, 0.25))
 """Shares of a detector's errors that last, and how long, seconds; all as in `calibration/refinement.py`."""
 _AVERAGED_S = 1.0
-"""So long an odometry of 1 % is better than what people say of a pose: over this, errors would average out."""
+"""Time for which an odometry of 1 % is better than what people say of a pose: over this, errors would average
+out."""
 _ANYWHERE_M = 10.0
 """Joints are about there: without it one that ends behind its cameras would make the system singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
@@ -72,19 +74,19 @@ class Mounted:
     """(T,) rising."""
     time_s: Array
     """(T, V) when each view was taken."""
-    odometry: Array = field(init=False)
-    """(T, B, 4, 4) world from carrier at the frames' times, as given."""
-    sensors: Array = field(init=False)
-    """(T, V, 4, 4) from carrier, at its frame's time, to camera, at its own; unit where a camera stands still."""
 
-    def __post_init__(self) -> None:
-        rig, middle = self.rig, self.time_s.mean(axis=1)
-        odometry = np.stack([each.at(middle) for each in rig.trajectories], axis=1)
-        sensors, on = np.tile(np.eye(4), (*self.time_s.shape, 1, 1)), rig.carrier
-        own = rig.poses(self.time_s)
-        sensors[:, on >= 0] = np.linalg.inv(odometry[:, on[on >= 0]]) @ own[:, on >= 0]
-        object.__setattr__(self, "odometry", odometry)
-        object.__setattr__(self, "sensors", sensors)
+    @cached_property
+    def odometry(self) -> Array:
+        """(T, B, 4, 4) world from carrier at the frames' times, as given."""
+        return np.stack([each.at(self.time_s.mean(axis=1)) for each in self.rig.trajectories], axis=1)
+
+    @cached_property
+    def sensors(self) -> Array:
+        """(T, V, 4, 4) from carrier, at its frame's time, to camera, at its own; unit where it stands still."""
+        sensors, on = np.tile(np.eye(4), (*self.time_s.shape, 1, 1)), self.rig.carrier
+        own = self.rig.poses(self.time_s)[:, on >= 0]
+        sensors[:, on >= 0] = np.linalg.inv(self.odometry[:, on[on >= 0]]) @ own
+        return sensors
 
     def keys(self) -> NDArray[np.int64]:
         """(T, B) key of each pose, `Pose3`, world from carrier: `factors.camera_key(carrier, frame)`."""
@@ -252,5 +254,5 @@ def poses_of(values: gtsam.Values, keys: NDArray[np.int64]) -> Array:
 
 
 def symmetric(covariance: Array) -> Array:
-    """The same without what rounding left on one side of the diagonal."""
+    """Return a covariance without what rounding left on one side of the diagonal."""
     return (covariance + covariance.swapaxes(-1, -2)) / 2

@@ -16,13 +16,8 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
-from shapepose_fg.estimation.carried_error import POSES_LAST_S, goes_with_poses
-from shapepose_fg.estimation.linearisation import (
-    Message,
-    ObservationConfig,
-    linearise,
-    observation_sigmas,
-)
+from shapepose_fg.estimation.carried_error import POSES_LAST_S, reported_with_poses
+from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.window_solution import PersonGraph
 
 if TYPE_CHECKING:
@@ -46,7 +41,7 @@ SURFACE_M = 0.015
 _REACH_M = 0.15
 """Joints within about this of a point of the surface carry it."""
 _NODES, _WIDE = 24, 6.0
-"""Of the quadrature, per axis; and how many standard deviations it spans on either side."""
+"""Number of nodes of the quadrature, per axis; and how many standard deviations it spans on either side."""
 _STEPS = 64
 """Limits at which a distance's probabilities are tabled for its quantiles."""
 
@@ -85,7 +80,7 @@ class Distance:
     apart: Array
     """(..., 3) from one to the other, metres."""
     covariance: Array
-    """(..., 3, 3) of that, m²."""
+    """(..., 3, 3) covariance of `apart`, m²."""
 
     def below(self, limit_m: ArrayLike) -> Array:
         """Probability (...,) that the distance is under a limit (...,), metres.
@@ -113,10 +108,7 @@ class Distance:
     def quantile(self, probability: ArrayLike) -> Array:
         """Distance (...,), metres, that is under what is asked with this probability, one number."""
         limits, under = self._table()
-        flat = under.reshape(_STEPS, -1)
-        found = [np.interp(float(np.asarray(probability)), flat[:, n], limits.reshape(_STEPS, -1)[:, n])
-                 for n in range(flat.shape[1])]  # fmt: skip
-        return np.asarray(found).reshape(under.shape[1:])
+        return _reached(float(np.asarray(probability)), under, limits)
 
     def interval(self, probability: float = 0.95) -> tuple[Array, Array]:
         """Distances that would not have made the measured one improbable, by Neyman's construction.
@@ -129,12 +121,8 @@ class Distance:
         way = np.where(away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0])
         limits = self._span()
         shorter = np.stack([Distance(each[..., None] * way, self.covariance).below(away) for each in limits])
-        flat, r = shorter.reshape(_STEPS, -1)[::-1], limits.reshape(_STEPS, -1)[::-1]
         ends = ((1 + probability) / 2, (1 - probability) / 2)
-        low, high = (
-            np.array([np.interp(end, flat[:, n], r[:, n]) for n in range(flat.shape[1])]).reshape(away.shape)
-            for end in ends
-        )
+        low, high = (_reached(end, shorter[::-1], limits[::-1]) for end in ends)
         return low, np.maximum(high, self.quantile(ends[0]))
 
     @property
@@ -255,9 +243,7 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
     views = Views.of(rig, seen.time_s)
     assert views.carried is not None
-    sigmas = observation_sigmas(seen, own.joints, views, config, own.joint_names.tolist())
-    evidence, nothing = linearise(seen, sigmas, own.joints, views, config), np.zeros((*own.joints.shape, 3))
-    goes = goes_with_poses(evidence, Message(own.joints, nothing), sigmas, views, config)
+    goes = reported_with_poses(seen, own.joints, views, config, own.joint_names.tolist())
     goes = goes[np.arange(len(rows)), numbers] @ symmetric_root(views.carried.covariance)
     ends = symmetric_root(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(goes, 1, 2).reshape(
         len(rows), 3, -1
@@ -338,7 +324,7 @@ def surface_distance(
 
 
 def correlation(one: Sequence[str], other: Sequence[str]) -> Array:
-    """(A, B) of the errors, in standard deviations, of joints of one person in one frame, by their names; those
+    """(A, B) correlation of the errors of joints of one person in one frame, by their names; those
     that are no part of a body known here correlate with themselves alone.
     """
     return np.array([[_together(a, b) for b in other] for a in one]).reshape(len(one), len(other))
@@ -351,25 +337,20 @@ def _over_time(apart_s: Array) -> Array:
 
 
 def _together(one: str, other: str) -> float:
-    ways, found = (_way_up(one), _way_up(other)), 1.0
-    if one == other:
-        return 1.0
-    common = [name for name, _ in ways[0] if name in dict(ways[1])]
-    if len(common) == 0:
-        return 0.0
-    for way in ways:
-        found *= dict(way)[common[0]]
-    return found
+    """Correlation of two joints: the product along the limbs between them, 0 where there are none."""
+    ways = _way_up(one), _way_up(other)
+    common = next((name for name in ways[0] if name in ways[1]), None)
+    return 0.0 if common is None else ways[0][common] * ways[1][common]
 
 
-def _way_up(joint: str) -> list[tuple[str, float]]:
+def _way_up(joint: str) -> dict[str, float]:
     """The joints from one to the middle of the hips, and the correlation with each."""
-    way, side = [(joint, 1.0)], joint[0] if joint[:1] in ("R", "L") else ""
+    way, side, correlation = {joint: 1.0}, joint[0] if joint[:1] in ("R", "L") else "", 1.0
     table = {f"{s}{a}": (b if b in ("Neck", "MidHip", "Nose") else f"{s}{b}", r)
              for (a, b), r in _LIMBS.items() for s in (("",) if a in ("Neck", "Nose") else (side,))}  # fmt: skip
-    while way[-1][0] in table:
-        parent, r = table[way[-1][0]]
-        way.append((parent, way[-1][1] * r))
+    while joint in table:
+        joint, along = table[joint]
+        way[joint] = correlation = correlation * along
     return way
 
 
@@ -401,6 +382,12 @@ def _missing(people: Reconstruction, row: int, joint: int) -> str:
     used = table.view_names[table.used[row, joint]].tolist()
     views = {0: "no camera's detection was used", 1: f"only camera {' '.join(used)} saw it"}
     return views.get(len(used), f"cameras {', '.join(used)} do not place it") + body
+
+
+def _reached(probability: float, rising: Array, limits: Array) -> Array:
+    """Limits (...,) at which probabilities (S, ...) of `limits` (S, ...) come to one value, interpolated."""
+    columns = zip(rising.reshape(len(rising), -1).T, limits.reshape(len(limits), -1).T, strict=True)
+    return np.array([np.interp(probability, *each) for each in columns]).reshape(limits.shape[1:])
 
 
 _AT, _WEIGHT = np.polynomial.legendre.leggauss(_NODES)

@@ -29,6 +29,7 @@ from factors import (
     standing_factors,
     state_keys,
 )
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import symmetric_root
@@ -37,7 +38,6 @@ from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import motion_of, near_in_time, spanned
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
-from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import leads
@@ -200,7 +200,7 @@ class WindowGraph:
 
     @property
     def seen(self) -> Mask:
-        """(T, J, V) of which joints there are detections."""
+        """(T, J, V) whether there is a detection of the joint."""
         return self._observations.seen
 
     @property
@@ -289,8 +289,8 @@ class WindowGraph:
     def solve(
         self,
         inlier: Mask,
-        views: Message,
-        body: Message,
+        views: JointTargets,
+        body: JointTargets,
         initial: Array,
         lost: Mask | None = None,
         feet: Index | None = None,
@@ -303,8 +303,8 @@ class WindowGraph:
     def prepare(
         self,
         inlier: Mask,
-        views: Message,
-        body: Message,
+        views: JointTargets,
+        body: JointTargets,
         initial: Array,
         lost: Mask | None = None,
         feet: Index | None = None,
@@ -383,7 +383,9 @@ class WindowGraph:
             person.graph, person.values, person.failure = graph, values, failure
             person.positions, person.velocity = person._points()
 
-    def _problem(self, inlier: Mask, views: Message, body: Message, near: Array, lost: Mask | None) -> Problem:
+    def _problem(
+        self, inlier: Mask, views: JointTargets, body: JointTargets, near: Array, lost: Mask | None
+    ) -> Problem:
         """What `solve` is asked; how far joints may turn goes by their speed `near` where they are."""
         of_views = of_body = self.present & self.with_offsets
         density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
@@ -391,7 +393,7 @@ class WindowGraph:
             share = self._motion.views.white_share
             variance = 1.0 / np.maximum(np.linalg.eigvalsh(views.information)[..., 0], 1.0)
             speed, turning = motion_of(near, variance, self.times_s)
-            density = self._motion.density_of(speed, turning)
+            density = self._motion.density(speed, turning=turning)
             if lost is not None:
                 around = near_in_time(lost, self.times_s, self._motion.around_s)
                 of_body = self.present & (self.with_offsets | around)
@@ -460,7 +462,7 @@ class WindowGraph:
             seen.kernel, seen.width,
         )  # fmt: skip
 
-    def _pulled(self, pulls: Message) -> list[gtsam.NonlinearFactor]:
+    def _pulled(self, pulls: JointTargets) -> list[gtsam.NonlinearFactor]:
         """The body's pull on joints."""
         known = pulls.known
         covariances = np.linalg.inv(pulls.information[known])
@@ -554,7 +556,7 @@ def name_of(function: FactorFunction) -> str:
 
 
 def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
-    """Of which joint a singular system leaves open."""
+    """Name the joint that a singular system leaves open."""
     key = undetermined_key(error)
     if key is None or all(key not in set(person.states.ravel().tolist()) for person in people):
         return ""

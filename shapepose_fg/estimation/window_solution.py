@@ -1,7 +1,7 @@
 """A solved window: everybody's joints, covariances and bodies, and one graph a person that says all of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
-from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
@@ -18,7 +18,7 @@ from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
-from shapepose_fg.estimation.linearisation import Message
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.minimise import undetermined_key
 from shapepose_fg.estimation.motion_model import Lasting
 from shapepose_fg.estimation.out_of_step import carried_to_frames
@@ -32,7 +32,7 @@ _OF_SOLUTION = 2
 
 
 @dataclass(frozen=True)
-class WindowSolution:
+class WindowSolution(Rows):
     """N rows of a window after stage II, in the order of the observations."""
 
     observations: Observations
@@ -69,19 +69,12 @@ class WindowSolution:
     seconds: dict[str, float] = field(default_factory=dict)
     """What it took, by stage."""
 
-    def __len__(self) -> int:
-        return len(self.joints)
-
     def rows(self, index: Index) -> "WindowSolution":
         """Some of the rows, without graphs: plain data, which can be sent to another process."""
         place = {row: n for n, row in enumerate(index.tolist())}
         problems = tuple(replace(each, row=place[each.row]) for each in self.problems if each.row in place)
-        kept = {each.name: getattr(self, each.name) for each in fields(self)}
-        for name, value in kept.items():
-            if isinstance(value, np.ndarray):
-                kept[name] = value[index]
-        kept |= {name: kept[name].rows(index) for name in ("observations", "fit")}
-        return WindowSolution(**kept | {"problems": problems, "people": ()})
+        observations = self.observations.rows(index)
+        return replace(super().rows(index), observations=observations, problems=problems, people=())
 
     def result(self, place: Whole, rig: Rig, joint_names: Sequence[str]) -> Reconstruction:
         """The rows as those of a result; bodies that were not fitted are NaN there.
@@ -129,10 +122,10 @@ class PersonGraph:
     solved: Array
     """(T, J, 3) where the solver has the joints, metres."""
     solved_covariance: Array
-    """(T, J, 3, 3) and how surely: marginals of its graph, m²."""
+    """(T, J, 3, 3) covariance of `solved`: marginals of its graph, m²."""
     lasting: Lasting
     """How the error goes on that is in the report and not in the solver's graph."""
-    body: Message
+    body: JointTargets
     """(T, J) what the body says of each joint without the joint's own views; nothing where it does not pull."""
     together: "list[PersonGraph]" = field(default_factory=list, repr=False)
     """The people whom factors of your own tie to this one, and this one (`tied`); none where nobody is."""
@@ -242,7 +235,7 @@ class PersonGraph:
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
-    """The same people, each with the others to whom factors of the user's own tie them."""
+    """Return the people, each with the others to whom factors of the user's own tie them."""
     together, found = dict[int, list[PersonGraph]](), list[PersonGraph]()
     for person in people:
         group = together.setdefault(id(person.window.ties), [])

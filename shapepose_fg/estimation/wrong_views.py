@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import kernel_weight
+from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.linearisation import ObservationConfig, inverses
@@ -18,7 +19,7 @@ _WIDTH, _ROUNDS = 3.0, 12
 _TURN_RAD, _SHIFT_M = np.radians(5.0), 0.5
 """How far a camera may have come off, one sigma per axis."""
 _TOGETHER = 50.0
-"""So many detections tell as much as one: errors last from frame to frame and go through a whole person."""
+"""Number of detections that tell as much as one: errors last from frame to frame and go through a whole person."""
 _LEAST = 30
 """Detections by which a camera is judged."""
 _BETTER = 1.2
@@ -39,7 +40,7 @@ class WrongView:
     before: float
     """Mean squared distance of its detections from what the others say, in sigmas, up to 36; 2 is usual."""
     after: float
-    """The same if its pose gave way."""
+    """Mean squared distance if its pose gave way."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Seen:
     sigmas_px: Array
     """(N, J, V)"""
     there: Mask
-    """(N, J, V) of which detections of placed joints."""
+    """(N, J, V) whether there is a detection of a placed joint."""
     used: Mask
     """(N, J, V) which are part of the solution."""
 
@@ -118,11 +119,8 @@ def _slope_of_pose(points: Array, slope: Array, views: Views, view: int) -> Arra
     cTw = views.cTw[..., view, :, :]
     R, t = cTw[..., :3], cTw[..., 3]
     before = points @ R.mT + (t[:, None] if cTw.ndim == 3 else t)
-    x, y, z = np.moveaxis(before, -1, 0)
-    zero = np.zeros_like(x)
-    turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=-1).reshape(*x.shape, 3, 3)
     of_camera = slope[:, :, view] @ (R.mT[:, None] if cTw.ndim == 3 else R.mT)
-    return np.concatenate([of_camera @ turned, of_camera], axis=-1)
+    return np.concatenate([of_camera @ -hat(before), of_camera], axis=-1)
 
 
 def _pose_step(slope: Array, off: Array, there: Mask) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Honest covariances without any truth: a view is left out, and what it saw is compared with the rest."""
+"""Tests covariances without ground truth: a view is left out, and its detections are compared with the rest."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,22 +14,22 @@ from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.evaluation.metrics import match_people
 
 NEAR_M = 0.3
-"""A candidate that the gate refused is compared as long as it lies within this length of the joint."""
+"""Distance from the joint, as a length, within which a candidate that the gate refused is compared, m."""
 INSIDE_95 = 5.991
 """A chi-squared variable with 2 degrees of freedom is under this in 95 of 100 cases."""
 
 Solve = Callable[[DetectionSequence, Rig], Reconstruction]
-"""Reconstruct a recording: `reconstruct`, with the settings in it."""
+"""Function that reconstructs a recording: `reconstruct`, with its settings."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What `held_out` found for one view."""
+    """Result of `held_out` for one view."""
 
     squared: Array
     """(M,) squared Mahalanobis distance of each candidate from where the other views put the joint."""
     unmatched: int
-    """Candidates of rows that the other views alone do not find, or of joints that they do not place."""
+    """Number of candidates of rows that the other views alone do not find, or of joints that they do not place."""
 
     @property
     def inside(self) -> float:
@@ -38,7 +38,7 @@ class HeldOut:
 
 
 def without_view(sequence: DetectionSequence, view: int) -> Recording:
-    """A recording as if one camera had not been there; those after it move up by one."""
+    """A recording without one camera; the numbers of the cameras after it decrease by one."""
     frames = []
     for frame in range(len(sequence)):
         kept = sequence[frame].only(sequence[frame].view != view)
@@ -54,7 +54,7 @@ def held_out(
     solve: Solve,
     config: ObservationConfig,
 ) -> HeldOut:
-    """Solve without a camera, and compare with what it saw of the `people` of the whole run.
+    """Solve without a camera, and compare with its detections of the `people` of the whole run.
 
     ValueError where `people` come without their observations.
     """
@@ -65,10 +65,10 @@ def held_out(
 def compare_view(
     camera: Camera, view: int, people: Reconstruction, without: Reconstruction, config: ObservationConfig
 ) -> HeldOut:
-    """Compare what `camera`, which is `view`, saw of `people` with the same people as they are `without` it.
+    """Compare the detections of `people` in `camera`, which is `view`, with the same people solved `without` it.
 
-    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that
-    were given to a joint, those that were not used as long as they are near it.
+    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that were
+    assigned to a joint, unused ones only if they are near it.
     """
     if people.observations is None:
         raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")

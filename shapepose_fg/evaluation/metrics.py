@@ -1,4 +1,4 @@
-"""How good joints are against a known truth: who is who, precision, recall, MPJPE, people found, covariances."""
+"""Metrics of joints against ground truth: matching, precision, recall, MPJPE, people found, covariances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +13,11 @@ from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.skeleton import BODY_25
 
 MAX_DISTANCE_M = 0.5
-"""Metres. A prediction this far from a person, in the mean over joints, is not that person."""
+"""Mean joint distance from which on a prediction is not that person, m."""
 
 
 class People(Protocol):
-    """What is scored: a `Reconstruction`, or anything with its two arrays."""
+    """Input of the metrics: a `Reconstruction`, or anything with its two arrays."""
 
     @property
     def frame(self) -> Whole:
@@ -32,7 +32,7 @@ class People(Protocol):
 
 @dataclass(frozen=True)
 class PlainPeople:
-    """N rows, one per person and frame, of which nothing but joints is known; implements `People`."""
+    """N rows, one per person and frame, with joints only; implements `People`."""
 
     frame: NDArray[np.int64]
     """(N,) frame of each row."""
@@ -46,7 +46,7 @@ class PlainPeople:
 
 @dataclass(frozen=True)
 class Matches:
-    """M predictions that are people, and the people and predictions that are left over."""
+    """M matched predictions, and the unmatched people and predictions."""
 
     row: Index
     """(M,) row of the prediction."""
@@ -55,19 +55,19 @@ class Matches:
     person: Index
     """(M,) index of the person in the truth."""
     duplicated: Index
-    """Rows of predictions near a person who is matched with another prediction."""
+    """Rows of further predictions of people who are matched with another one: duplicates."""
     invented: Index
-    """Rows of predictions that are near no person."""
+    """Rows of predictions that are near no person: false positives."""
     missed: Index
-    """(K, 2) frame and person of the people who are matched with no prediction."""
+    """(K, 2) frame and person of the people without a prediction."""
 
 
 def match_people(frame: Whole, joints: Real, truth: Real, frames: Sequence[int] | range | None = None) -> Matches:
     """Match predictions `joints` (N, J, 3) of `frame` (N,) with `truth` (T, P, J, 3), all in metres.
 
-    `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other frames are left
-    out, as are predictions and true people without any joint. The cost of a pair is its `mean_distance`; the
-    assignment is the best one of each frame (Hungarian), pairs of 0.5 m or more are none.
+    `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other frames are left out,
+    as are predictions and true people without any joint. The cost of a pair is its `mean_distance`; the assignment
+    is optimal in each frame (Hungarian), without pairs of 0.5 m or more.
     """
     predicted, true = np.asarray(joints, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if true.ndim != 4 or true.shape[3] != 3:
@@ -111,34 +111,34 @@ def mean_distance(predicted: Array, truth: Array) -> Array:
 
 
 CORRECT_M = 0.2
-"""A joint is correct if it is at most this far from the true one (the protocol of Zhang et al.), metres."""
+"""Largest distance of a correct joint from the true one, m (the protocol of Zhang et al.)."""
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
-"""The levels at which `covariance_calibration` asks how many truths lie inside the ellipsoid."""
+"""Levels at which `covariance_calibration` counts the truths inside the ellipsoid."""
 _LEAST_LOG_SCORE = -50.0
-"""What a joint counts at least in the mean log score: ten sigma off; one exchanged limb must not decide alone."""
+"""Minimum log score of a joint in the mean: ten sigma off; one exchanged limb must not decide alone."""
 
 
 @dataclass(frozen=True)
 class JointMetrics:
-    """What `joint_metrics` found; counts of joints and of people are over all frames."""
+    """Result of `joint_metrics`; counts of joints and of people are over all frames."""
 
     joints_correct: int
-    """Predicted joints within 0.2 m of the true joint of the person they are matched with."""
+    """Number of predicted joints within 0.2 m of the true joint of the matched person."""
     joints_predicted: int
-    """Predicted joints, of false positives too."""
+    """Number of predicted joints, including those of false positives."""
     joints_true: int
-    """Joints that the truth knows."""
+    """Number of joints in the truth."""
     mpjpe_mm: float
     """Mean distance of the joints of matched people, near or far, millimetres; NaN if there are none."""
     people_true: int
-    """People who were there."""
+    """Number of people in the truth."""
     people_found: int
-    """People who are matched with a prediction (mean joint distance under 0.5 m)."""
+    """Number of people who are matched with a prediction (mean joint distance under 0.5 m)."""
     people_duplicated: int
-    """Further predictions of people who were found already."""
+    """Number of further predictions of matched people."""
     people_invented: int
-    """Predictions that are near no person."""
+    """Number of predictions that are near no person."""
 
     @property
     def precision(self) -> float:
@@ -157,12 +157,12 @@ class JointMetrics:
 
     @property
     def people_missed(self) -> int:
-        """People who are matched with no prediction."""
+        """Number of people without a prediction."""
         return self.people_true - self.people_found
 
     @property
     def false_positives(self) -> int:
-        """Predictions that are matched with no person: duplicates, and people who are not there."""
+        """Number of unmatched predictions: duplicates, and people who do not exist."""
         return self.people_duplicated + self.people_invented
 
     @property
@@ -181,9 +181,8 @@ def joint_metrics(
     """Compare predictions with the `truth` (T, P, J, 3), metres, NaN where a person or joint is absent.
 
     `predicted` is a `Reconstruction`, or one array (P_t, J, 3) for each frame; NaN joints are missing. `frames`
-    (T,) says which frame numbers of a `Reconstruction` the truth has, 0 to T - 1 by default; other frames are
-    not scored. People are matched by `match_people`. A predicted joint that the truth does not know counts
-    neither way.
+    (T,) are the frame numbers of the truth in a `Reconstruction`, 0 to T - 1 by default; other frames are not
+    scored. People are matched by `match_people`. A predicted joint that the truth lacks is not counted.
     """
     truth = np.asarray(truth, dtype=np.float64)
     if isinstance(predicted, Sequence):
@@ -200,7 +199,7 @@ def joint_metrics(
 
 
 def metrics_of(matches: Matches, joints: Array, truth: Array, *, correct_m: float = CORRECT_M) -> JointMetrics:
-    """The figures of people who are matched already: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres."""
+    """The metrics of matched people: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres."""
     true_known = np.isfinite(truth.sum(axis=3))
     distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
     both = np.isfinite(distance)
@@ -219,11 +218,11 @@ def metrics_of(matches: Matches, joints: Array, truth: Array, *, correct_m: floa
 
 @dataclass(frozen=True)
 class CovarianceCalibration:
-    """Whether covariances say how far the joints really are from the truth."""
+    """Consistency of covariances with the joints' errors."""
 
     nees: Array
     """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees of freedom
-    if the covariances are true."""
+    if the covariances are correct."""
     coverage: dict[float, float]
     """Share of the truths inside the ellipsoid that should hold 50, 90 and 95 % of them."""
     log_score: float
@@ -232,12 +231,12 @@ class CovarianceCalibration:
 
     @property
     def mean_nees(self) -> float:
-        """3 if the covariances are true; more if they promise too much; NaN without joints."""
+        """Mean NEES: 3 if the covariances are correct; more if they are too small; NaN without joints."""
         return float(self.nees.mean()) if len(self.nees) else float("nan")
 
 
 def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibration:
-    """Compare `errors` (..., 3), metres, with the `covariances` (..., 3, 3), m², that came with them.
+    """Compare `errors` (..., 3), metres, with their `covariances` (..., 3, 3), m².
 
     Pairs with NaN are left out. ValueError for a covariance that is not positive definite.
     """
@@ -260,5 +259,5 @@ def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibra
 
 
 def share(part: float, whole: float) -> float:
-    """`part` of `whole`; NaN of nothing."""
+    """`part` / `whole`; NaN where `whole` is 0."""
     return float(part / whole) if whole > 0 else float("nan")

@@ -1,6 +1,6 @@
-"""How good a reconstruction of the Shelf recording is: PCP@0.5, MPJPE and recall against its annotation.
+"""Scores a reconstruction of the Shelf recording: PCP@0.5, MPJPE and recall against its annotation.
 
-No precision: not everyone in view is annotated, so a prediction without an annotation may well be right.
+No precision: not everyone in view is annotated, so that a prediction without an annotation may be right.
 """
 
 from collections.abc import Iterable
@@ -13,6 +13,7 @@ from rich.table import Table
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import People, PlainPeople
@@ -33,37 +34,38 @@ _LIMBS = {
 LIMB_NAMES = tuple(_LIMBS)
 """The 10 scored limbs."""
 LIMBS = np.array([[SHELF_JOINTS.index(joint) for joint in ends] for ends in _LIMBS.values()])
-"""(10, 2) their ends in `SHELF_JOINTS`."""
+"""(10, 2) indices of their ends in `SHELF_JOINTS`."""
 ACTORS = (0, 1, 2)
 """The scored ids of the annotation: actors 1, 2 and 3."""
 MISSING_JOINT_M, RECALL_M = 0.5, 0.2
-"""What a missing joint counts in the choice of a prediction; a joint is recalled when it is at most so far off."""
+"""Distance that a missing joint counts as in the choice of a prediction, and largest distance of a recalled
+joint, m."""
 
 
 @dataclass(frozen=True)
 class ShelfScore:
-    """What `evaluate_shelf` found."""
+    """Result of `evaluate_shelf`."""
 
     limbs_right: NDArray[np.int64]
-    """(3, 10) limbs that are right, by actor and limb."""
+    """(3, 10) number of correct limbs, by actor and limb."""
     limbs_all: NDArray[np.int64]
-    """(3, 10) limbs that are annotated, by actor and limb."""
+    """(3, 10) number of annotated limbs, by actor and limb."""
     mpjpe_mm: float
     """Mean distance of the joints of people who were found (mean joint distance under 0.5 m), millimetres."""
     recall: float
     """Share of the actors' annotated joints with a prediction within 0.2 m."""
     people_found: int
-    """Annotated people with a prediction whose mean joint distance is under 0.5 m."""
+    """Number of annotated people with a prediction whose mean joint distance is under 0.5 m."""
     people: int
-    """Annotated people who were scored: the actors, in the scored frames."""
+    """Number of annotated people who were scored: the actors, in the scored frames."""
     frames: int
-    """Frames that were scored: annotated, and reconstructed."""
+    """Number of scored frames: annotated, and reconstructed."""
     frames_annotated: int
-    """Frames with an annotated actor."""
+    """Number of frames with an annotated actor."""
 
     @property
     def pcp(self) -> Array:
-        """(3,) percentage of right limbs of each actor; NaN for one who is not in the scored frames."""
+        """(3,) PCP of each actor, per cent; NaN for one who is not in the scored frames."""
         return _percent(self.limbs_right.sum(axis=1), self.limbs_all.sum(axis=1))
 
     @property
@@ -74,11 +76,11 @@ class ShelfScore:
 
     @property
     def pcp_pooled(self) -> float:
-        """Right limbs of all limbs whoever they belong to, per cent."""
+        """Share of correct limbs among all, whoever they belong to, per cent."""
         return float(_percent(self.limbs_right.sum(), self.limbs_all.sum()))
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures under plain names, for JSON; None where there is nothing to score."""
+        """The figures by plain names, for JSON; None where there is nothing to score."""
         by_limb = _percent(self.limbs_right, self.limbs_all)
         limbs = {f"actor {a + 1}": dict(zip(LIMB_NAMES, map(_plain, by_limb[a]), strict=True)) for a in ACTORS}
         return {
@@ -154,7 +156,9 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
 
 
 def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
-    """(G, 15) distances of the joints that annotated people (G, 15, 3) take, metres; NaN where there is none."""
+    """(G, 15) distances of the joints of the predictions of annotated people (G, 15, 3), metres; NaN where
+    there is none.
+    """
     joints = np.asarray(people.joints, dtype=np.float64)
     if tuple(getattr(people, "joint_names", BODY_25.joints)) != BODY_25.joints:
         raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
@@ -203,7 +207,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def _frames_run(people: People) -> Iterable[int] | None:
-    """The frames that the reconstruction says it covered, if it says so."""
+    """The frames that the reconstruction covers, if it states them."""
     try:
         spans = covered_frames(getattr(people, "run", None) or {})
     except ValueError as error:
@@ -212,11 +216,9 @@ def _frames_run(people: People) -> Iterable[int] | None:
 
 
 def _spans(frames: NDArray[np.int64]) -> str:
-    """Frames as people write them: "0-100, 216-230"."""
-    if len(frames) == 0:
-        return "none"
-    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+    """Frames in words: "0-100, 216-230"."""
+    spans = spans_of(frames.tolist())
+    return ", ".join(f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans) or "none"
 
 
 def _percent(part: Any, whole: Any) -> Array:

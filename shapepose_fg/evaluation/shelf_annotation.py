@@ -1,4 +1,4 @@
-"""Shelf's annotation, read: the text format of 4D Association."""
+"""Reads Shelf's annotation: the text format of 4D Association."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +17,7 @@ SHELF_JOINTS = tuple(
 )
 """The 15 annotated joints, in the order of the file."""
 _MAX_PEOPLE, _MAX_FRAMES = 1000, 10**7
-"""Counts beyond these are none."""
+"""Largest numbers of people and frames; larger ones are invalid."""
 
 
 def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
@@ -52,7 +52,7 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
 
 
 class _Lines:
-    """The lines of a text file that are not blank, one after the other, and where we are in it."""
+    """The lines of a text file that are not blank, one after the other, with the current position."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -82,7 +82,7 @@ class _Lines:
         return values
 
     def left(self) -> bool:
-        """Whether there is one more, which is the present one then."""
+        """Advance to the next line; returns whether there is one."""
         self._place, line = next(self._lines, (self._place, ""))
         return len(line) > 0
 

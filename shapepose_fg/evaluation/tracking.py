@@ -1,4 +1,4 @@
-"""How good a reconstruction over time is against a known truth: joints, identities, motion, covariances."""
+"""Metrics of a reconstruction over time against ground truth: joints, identities, motion, covariances."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,31 +26,31 @@ from shapepose_fg.evaluation.metrics import (
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 FAST_M_S = 1.5
-"""A wrist faster than this is where a smoother that is too stiff shows, metres a second."""
+"""Speed of a wrist above which a too stiff smoother becomes visible, m/s."""
 LONG_UNSEEN = 10
-"""A joint is long unseen when no view has seen it in this frame and the nine before it."""
+"""Number of frames, with the present one, without a view after which a joint counts as long unseen."""
 UNMATCHED = np.iinfo(np.int64).min
 """Stands for no identity: any other number may be one."""
 
 
 @dataclass(frozen=True)
 class IdentityMetrics:
-    """What `identity_metrics` found, over all frames."""
+    """Result of `identity_metrics`, over all frames."""
 
     true_positives: int
-    """IDTP: rows that are the person whom their identity is assigned to for the whole recording."""
+    """IDTP: number of rows of the person to whom their identity is assigned for the whole recording."""
     rows: int
-    """Rows of the scored frames that have a joint."""
+    """Number of rows in the scored frames that have a joint."""
     people_true: int
-    """People in frames in which they have a joint."""
+    """Number of people in frames in which they have a joint."""
     switches: int
-    """Times that a person is matched with another identity than the last time."""
+    """Number of times that a person is matched with another identity than the last time."""
     tracks: int
-    """Identities."""
+    """Number of identities."""
     false_tracks: int
-    """Identities at most half of whose rows are matched with a person."""
+    """Number of identities with at most half of their rows matched."""
     longest_false_positive: int
-    """The most rows of one identity that are matched with no person."""
+    """Largest number of unmatched rows of one identity."""
 
     @property
     def idf1(self) -> float:
@@ -60,7 +60,7 @@ class IdentityMetrics:
 
 @dataclass(frozen=True)
 class MotionScore:
-    """How joints of matched rows move, against the truth: those of the result, or those of its bodies."""
+    """Motion of the joints of matched rows, or of those of their bodies, against the truth."""
 
     mpjpe_mm: float
     """Mean distance to the true joints, millimetres."""
@@ -72,7 +72,7 @@ class MotionScore:
 
 @dataclass(frozen=True)
 class TrackingScore:
-    """What `score_tracks` found."""
+    """Result of `score_tracks`."""
 
     joints: JointMetrics
     """Precision, recall, F1 at 0.2 m, MPJPE, duplicates and other false positives."""
@@ -89,7 +89,7 @@ class TrackingScore:
     (`seen`), one view (`one_view`), none (`no_view`), and none in this frame and the nine before (`unseen`)."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures under plain names, for tables and JSON; None where there is nothing to measure."""
+        """The figures by plain names, for tables and JSON; None where there is nothing to measure."""
         figures = {name: 100 * getattr(self.joints, name) for name in ("f1", "precision", "recall")}
         figures["idf1"] = np.nan if self.identities is None else 100 * self.identities.idf1
         figures["velocity_error"] = self.velocity_error
@@ -111,9 +111,9 @@ def score_tracks(
 ) -> TrackingScore:
     """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
 
-    Scored are the frames from the truth's first to its last. Without `identities` the column `person` only counts
-    the people of a frame; what asks for one and the same person then goes by the person of the truth with whom a
-    row is matched. ValueError for an identity twice in one frame.
+    Scored are the frames from the truth's first to its last. Without `identities` the column `person` only numbers
+    the people of a frame; metrics over time then use the true person with whom a row is matched. ValueError for an
+    identity twice in one frame.
     """
     true, first = joints_by_frame(truth), int(truth.frame.min()) if len(truth) > 0 else 0
     frames = range(first, first + len(true))
@@ -161,11 +161,11 @@ def identity_metrics(
 ) -> IdentityMetrics:
     """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
 
-    Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the truth, -1
-    for a frame that is not scored. For IDF1 every identity is one person for good, and every person one identity,
-    so that as many rows as possible are nearer than 0.5 m to theirs (Ristani et al., "Performance
-    Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016). Switches go by `matches`, which are
-    made frame by frame.
+    Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the truth, -1 for
+    a frame that is not scored. For IDF1 identities and people are assigned one to one for the whole recording, so
+    that as many rows as possible are nearer than 0.5 m to theirs (Ristani et al., "Performance Measures and a Data
+    Set for Multi-Target, Multi-Camera Tracking", 2016). Switches are counted with `matches`, which are made frame
+    by frame.
     """
     scored = np.flatnonzero((index >= 0) & np.isfinite(joints.sum(axis=2)).any(axis=1))
     present = np.isfinite(truth.sum(axis=3)).any(axis=2)
@@ -194,22 +194,24 @@ def identity_metrics(
 
 
 def body_joints(people: Reconstruction) -> Array:
-    """(N, J, 3) joints of the fitted bodies, with the offsets that the run learnt; NaN where there is no body."""
+    """(N, J, 3) joints of the fitted bodies, with the offsets that the run estimated; NaN where there is no
+    body.
+    """
     model = detector_s_body(people)
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
     return model.keypoints(BodyParameters(*columns))
 
 
 def detector_s_body(people: Reconstruction) -> BodyModel:
-    """The open body, its joints where the run has learnt that the detector puts them."""
+    """The open body, with joints where the run has estimated that the detector puts them."""
     model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
     return model if offsets is None else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
 
 
 def views_used(people: Reconstruction) -> Index:
-    """(N, J) how many views' detections each joint was solved from.
+    """(N, J) number of views with a detection that each joint was solved from.
 
-    Without a record of observations a joint with a confidence counts as seen by two: nothing tells more.
+    Without recorded observations a joint with a confidence counts as seen by two views.
     """
     if people.observations is None:
         return np.where(people.confidence > 0, 2, 0)
@@ -252,9 +254,9 @@ def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
 
 
 def frames_unseen(seen: Mask, frame: Whole, identity: Whole) -> NDArray:
-    """(N, J) for how many frames, up to this one and with it, a joint of an identity has not been `seen` (N, J).
+    """(N, J) number of frames, with the present one, in which a joint of an identity has not been `seen` (N, J).
 
-    The count begins anew where the identity has no row in the frame before.
+    The count starts again where the identity has no row in the frame before.
     """
     order = np.lexsort((frame, identity))
     seen, frame, identity = seen[order], frame[order], identity[order]
@@ -268,6 +270,6 @@ def frames_unseen(seen: Mask, frame: Whole, identity: Whole) -> NDArray:
 
 
 def _mean(values: Array) -> float:
-    """Mean of what is known; NaN where nothing is."""
+    """Mean of the known values; NaN where there are none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) > 0 else float("nan")

@@ -1,4 +1,4 @@
-"""What names of files say: which is which camera's, and which frame's."""
+"""Cameras and frame numbers from names of files."""
 
 import re
 from collections.abc import Sequence
@@ -8,18 +8,18 @@ from pathlib import Path
 from shapepose_fg.core.errors import InputError
 
 MOST_FRAME = 10**12
-"""No frame has a higher number."""
+"""Largest number of a frame."""
 _WORDS = re.compile(r"[^\W\d_]+|\d{1,18}", re.ASCII)
 _NUMBERS = re.compile(r"\d+")
 
 
 def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
-    """For each camera the place of its name among `names`, which are longer or written differently.
+    """For each camera the index of its name among `names`, which are longer or written differently.
 
-    A camera is told by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), by the
+    A camera is recognised by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), by the
     only number in both (`cam01` is camera `int_cam1`), or by what is left of both without the words with which all
-    cameras, or all names, begin and end (`2022-09-19_synced_Cam1` is `view_01_json`). None where it is not so for
-    every camera, or something else could be meant too: then nothing is guessed.
+    cameras, or all names, begin and end (`2022-09-19_synced_Cam1` is `view_01_json`). None where this fails for a
+    camera, or is ambiguous: nothing is guessed.
     """
     words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras]
     found = [[index for index, name in enumerate(names) if word.search(name) is not None] for word in words]
@@ -33,8 +33,8 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
 
 
 def _own_words(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
-    """Words and numbers of each name, in small letters, without those with which all begin or end; None where one
-    has none left, or two have the same.
+    """Words and numbers of each name, in small letters, without those with which all begin or end; None where
+    nothing is left of one, or two are equal.
     """
     words = [[int(word) if word.isdigit() else word for word in _WORDS.findall(name.lower())] for name in names]
     for _ in range(2):  # from the beginning, and from the end
@@ -75,7 +75,7 @@ def listing(names: Sequence[str], nothing: str = "nothing") -> str:
 
 
 def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
-    """Files by the numbers of their frames, which rise; InputError where a number is no frame's or there twice."""
+    """Files sorted by their frame numbers; InputError where a number is invalid or occurs twice."""
     ordered = sorted(files)
     if ordered[-1][0] >= MOST_FRAME:
         raise InputError(f"{ordered[-1][1]}: no frame has so high a number; number them by the recording's frames")

@@ -1,4 +1,4 @@
-"""Settings as TOML: tables onto nested dataclasses and back, each setting with its comment."""
+"""Settings as TOML: nested dataclasses as tables, each setting with its docstring as a comment."""
 
 import ast
 import inspect
@@ -24,17 +24,18 @@ _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 def read_config(path: str | Path, kind: type[T]) -> T:
-    """Read settings of the dataclass `kind` from a TOML file; what is not in the file keeps its default.
+    """Read settings of the dataclass `kind` from a TOML file; settings that are not in the file keep their
+    defaults.
 
-    A field that is itself a dataclass is a table. Raises InputError naming the file, the key and the cure
-    for bad TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
+    A field that is itself a dataclass is a table. Raises InputError naming the file, the key and the cure for bad
+    TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
     """
     return config_from(read_toml(Path(path), may_be_empty=True), kind, path)
 
 
 _CURE = "`shapepose-fg config` shows the defaults"
 ANOTHER_VERSION = "another version of this program wrote it; reconstruct the recording again"
-"""The cure for settings that no person wrote."""
+"""Cure for settings that a program wrote."""
 
 
 def config_from(

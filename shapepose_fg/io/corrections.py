@@ -1,4 +1,4 @@
-"""Corrections of a result's identities, kept beside it: corrections.json, and the result as it was before them."""
+"""Corrections of a result's identities, kept beside it: corrections.json, and the uncorrected result."""
 
 import json
 import shutil
@@ -18,9 +18,9 @@ from shapepose_fg.io.validation import validated
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
-"""The list of what was corrected, and the folder of the result as it was before."""
+"""The list of corrections, and the folder of the uncorrected result."""
 _PART = f".{UNCORRECTED}.part"
-"""That folder while it is made, or deleted."""
+"""Name of the folder of the uncorrected result while it is created, or deleted."""
 _FILES = (PEOPLE, RUN, OBSERVATIONS)
 _CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to begin anew"
 
@@ -41,10 +41,10 @@ class _File(BaseModel, strict=True, extra="forbid"):
 
 
 def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
-    """What was corrected in the result in `folder`, first to last; none where there is no corrections.json.
+    """The corrections of the result in `folder`, first to last; none where there is no corrections.json.
 
-    InputError, one sentence, where that file is damaged, people.npz is not what the corrections led to, or there
-    is `uncorrected` without it: a correction was stopped half way, or `uncorrected` is of an earlier result.
+    InputError, one sentence, where that file is damaged, people.npz is not the corrected result, or there is
+    `uncorrected` without corrections.json: a correction was interrupted, or `uncorrected` is of an earlier result.
     """
     file = Path(folder) / CORRECTIONS
     if not file.is_file():
@@ -63,10 +63,11 @@ def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
 
 
 def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edited:
-    """Make one more correction to the result in `folder`, and note it down; returns the result and who changed.
+    """Correct the result in `folder` once more, and add the correction to the list; returns the result and the
+    changed people.
 
-    Who changed is solved anew by `solve`; without it joints and bodies stay as they were. InputError where the
-    correction cannot be made. The first one keeps the result as it was in `uncorrected`.
+    Changed people are solved again by `solve`; without it joints and bodies stay as they were. InputError where
+    the correction is impossible. The first correction keeps the original result in `uncorrected`.
     """
     folder = Path(folder)
     edits, people = _kept_edits(folder), Reconstruction.load(folder)
@@ -86,10 +87,10 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
 
 
 def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Reconstruction]:
-    """Take the last correction back; returns it and the result without it. InputError where there is none.
+    """Undo the last correction; returns it and the result without it. InputError where there is none.
 
-    Without any other, the files are again what they were before the first. Only people that the last
-    correction touched are solved anew.
+    Without any other, the files are again those from before the first. Only people that the last correction
+    changed are solved again.
     """
     folder = Path(folder)
     edits = _kept_edits(folder)
@@ -107,7 +108,7 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
 
 
 def refuse_corrected(folder: Path) -> None:
-    """InputError where `folder` holds a result that was corrected by hand: a new one would make that worthless."""
+    """InputError where `folder` holds a result that was corrected by hand, which a new one would replace."""
     there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
     if len(there) > 0:
         cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
@@ -115,7 +116,7 @@ def refuse_corrected(folder: Path) -> None:
 
 
 def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
-    """Save the result, and then what led to it: killed between the two, the next reader is told."""
+    """Save the result, and then its corrections: if interrupted between the two, the next reader reports it."""
     counts = people.run.get("people", {})
     people.with_run(people=counts | people.counts()).save(folder)
     kept = [{name: value for name, value in vars(edit).items() if value is not None} for edit in edits]
@@ -124,7 +125,7 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
 
 
 def _kept_edits(folder: Path) -> tuple[Edit, ...]:
-    """`read_corrections`; InputError where the result as it was before them is not there any more."""
+    """`read_corrections`; InputError where the uncorrected result is missing."""
     edits, file = read_corrections(folder), inside(folder, UNCORRECTED) / PEOPLE
     if len(edits) > 0 and not file.is_file():
         cure = f"put it back, or delete {CORRECTIONS} to keep the result as it is now"
@@ -133,7 +134,7 @@ def _kept_edits(folder: Path) -> tuple[Edit, ...]:
 
 
 def _restore(folder: Path) -> None:
-    """The files as they were before the first correction, which leaves no trace."""
+    """Restore the files from before the first correction."""
     for name in _FILES:
         file = folder / UNCORRECTED / name
         if file.is_file():
@@ -148,5 +149,5 @@ def _restore(folder: Path) -> None:
 
 
 def _checksum(folder: Path) -> str:
-    """Which people.npz it is."""
+    """Checksum of people.npz."""
     return next(iter(checksums([folder / PEOPLE]).values()))

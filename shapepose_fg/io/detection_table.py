@@ -1,4 +1,4 @@
-"""A whole recording of 2D candidates, kept in blocks of frames: in memory, or as files where it is larger."""
+"""A whole recording of 2D candidates, stored in blocks of frames: in memory, or as files where it is larger."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,9 +13,9 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
 
 BLOCK_FRAMES = 128
-"""Frames that are read, kept and taken together."""
+"""Number of frames that are read and stored together."""
 _AT_HAND = 4
-"""Blocks that stay in memory: windows are solved a little behind the frame that is read."""
+"""Number of blocks that stay in memory: windows are solved a little behind the frame that is read."""
 _KEPT: dict[str, Any] = {
     "view": np.int16,
     "joint": np.int16,
@@ -24,7 +24,7 @@ _KEPT: dict[str, Any] = {
     "pairs": np.int32,
     "affinity": np.float64,
 }
-"""What is kept of a block, and as which numbers: 28 bytes a candidate, 16 an affinity."""
+"""Arrays of a stored block, and their types: 28 bytes a candidate, 16 an affinity."""
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,19 @@ class DetectionTable:
     skeleton: Skeleton
     """The detector's joints."""
     kept: KeptArrays
-    """The blocks (`keep_block`)."""
+    """Storage of the blocks (`keep_block`)."""
     frame_count: int
-    """T, frames of the recording."""
+    """T, the number of frames of the recording."""
     sources: tuple[Path, ...] = ()
     """The file or folder that each view was read from."""
     notes: tuple[str, ...] = ()
-    """What the reader made of the files and left out, a sentence each."""
+    """Notes, a sentence each, on how the reader interpreted the files and what it left out."""
     first: int = 0
-    """The first frame that a file says anything of."""
+    """Number of the first frame in the files."""
     picture: Index | None = None
-    """(T, V) which frame of its file each view shows in each frame, -1 for none; None where it is the same one."""
+    """(T, V) frame of its file that each view shows in each frame, -1 for none; None where numbers are equal."""
     _at_hand: dict[int, Arrays] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """The blocks that were asked for last."""
+    """The blocks that were read last."""
 
     def __len__(self) -> int:
         return self.frame_count
@@ -75,10 +75,10 @@ class DetectionTable:
 
 
 def keep_block(kept: KeptArrays, number: int, candidates: Detections, start: Index, pair_start: Index) -> None:
-    """Keep block `number` of a recording: the candidates of its T frames, one frame after the other.
+    """Store block `number` of a recording: the candidates of its T frames, one frame after the other.
 
-    `pairs` count from the first candidate of their own frame; `start` and `pair_start` (T + 1,) are
-    where each frame's candidates and pairs begin.
+    `pairs` count from the first candidate of their own frame; `start` and `pair_start` (T + 1,) are where each
+    frame's candidates and pairs begin.
     """
     arrays = {name: getattr(candidates, name).astype(dtype) for name, dtype in _KEPT.items()}
     kept.keep(_name(number), arrays | {"candidate_start": start, "pair_start": pair_start})

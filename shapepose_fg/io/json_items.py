@@ -10,7 +10,8 @@ from shapepose_fg.core.storage.files import MIDDLE, bounded, has_long_number, no
 
 _SPACE = " \t\n\r"
 _NEAR = 16
-"""Characters from the end of what was read: a mistake there may be a value that is cut, `\\u00` of `\\u00e9`."""
+r"""Number of characters at the end of what was read in which an error may come from a value that is cut, such
+as `\u00` of `\u00e9`."""
 
 
 class JsonItems:
@@ -25,13 +26,13 @@ class JsonItems:
         self.key: str | None = None
         """The key under which the list is; None where the file is the list, or there is none."""
         self.value: Any = None
-        """What is there instead: under the key, or as the whole file, an object without its values."""
+        """The value instead of a list: under the key, or the whole file, an object without its values."""
         self.others: dict[str, Any] = {}
-        """Values under other keys, those behind the list when all items have been read."""
+        """Values under other keys; those after the list are there when all items have been read."""
         self._text = _Text(path)
         begin = self._text.peek()
         self.found, self._in_object = begin == "[", begin == "{"
-        """`found`: whether there is one."""
+        """`found`: whether there is such a list."""
         if self._in_object:
             self.value = {}
             self._text.next_of("{")
@@ -59,7 +60,7 @@ class JsonItems:
             text.end()
 
     def _members(self, keys: Collection[str], *, may_end: bool = False) -> None:
-        """Take in keys and values of the object, to the list under one of `keys` or to the object's end."""
+        """Read keys and values of the object, to the list under one of `keys` or to the object's end."""
         text = self._text
         going = not (may_end and text.peek() == "}" and text.next_of("}"))
         while going:
@@ -133,7 +134,7 @@ class _Text:
             return bounded(value, self._path, numbers=long)
 
     def end(self) -> None:
-        """InputError where anything is left."""
+        """Raise InputError where anything is left."""
         if self.peek() != "":
             raise self.refuse("Extra data")
 
@@ -146,7 +147,7 @@ class _Text:
         return not_json(self._path, line, column, problem, rest=self._left[at:] if self._over else None)
 
     def _more(self) -> bool:
-        """Read on, as much again as there is; whether there was more. What is decoded is forgotten."""
+        """Read on, as much again as is in memory; returns whether there was more. Decoded text is dropped."""
         done, left = self._left[: self._at], len(self._left) - self._at
         breaks = done.count("\n")
         if left > MIDDLE:

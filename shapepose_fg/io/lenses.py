@@ -1,4 +1,4 @@
-"""Cameras of which only the field of view is known: names from files of detections, sizes from the footage."""
+"""Cameras with a known field of view only: names from files of detections, sizes from the footage."""
 
 import warnings
 from collections.abc import Sequence
@@ -9,32 +9,32 @@ import numpy as np
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.storage.files import open_regular
-from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.reading import camera_names
 from shapepose_fg.io.footage.placement import read_used_footage
+from shapepose_fg.io.footage.places import per_camera
 
 _NARROWEST, _WIDEST = 5.0, 150.0
-"""Degrees from left to right that a lens without distortion can see."""
+"""Smallest and largest horizontal field of view of a lens without distortion, degrees."""
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF")
-"""Pillow's names of what these hold: its other readers, of which some start programs, are not tried."""
+"""Pillow's names of the supported formats: its other readers, of which some start programs, are disabled."""
 _MOST_BYTES = 2**28
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """The tags of EXIF's own directory in a photo, and of FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
 _USUAL = 65.0
-"""What phones see, about."""
+"""Typical horizontal field of view of a phone, degrees."""
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
     """Cameras without poses, one for each file or folder of `detections`, in the order of their names.
 
-    `fields` are degrees from left to right, or a photo of the same lens whose EXIF tells the focal length;
-    `CAMERA=` before it is for one camera. `size` (width, height) are the pictures'
-    pixels; without it footage.json, which `detect` writes, says them. InputError names what is missing.
+    `fields` are horizontal fields of view in degrees, or a photo of the same lens whose EXIF has the focal length;
+    `CAMERA=` before it is for one camera. `size` (width, height) are the pictures' pixels; without it
+    footage.json, which `detect` writes, has them. InputError names what is missing.
     """
     names = camera_names(detections)
-    given = _given(fields, names)
+    given = dict(zip(names, per_camera("--field-of-view", fields, names, one_for_all=True), strict=True))
     footage = detections / "footage.json"
     sizes = (
         {}
@@ -42,46 +42,35 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
         else {each.name: each.placement.calibrated_size for each in read_used_footage(footage)}
     )
     cameras = []
-    for name in names:
+    for name, field in given.items():
         picture = size or sizes.get(name)
+        if field is None:
+            raise InputError(f"--field-of-view: camera {name} has none; give {name}=DEGREES")
         if picture is None:
             raise InputError(
                 f"camera {name}: nothing says how large its pictures are; pass --image-size WIDTHxHEIGHT"
             )
         with naming(detections):
-            cameras.append(_camera(name, picture, _degrees(given[name], picture)))
+            cameras.append(_camera(name, picture, _degrees(field, picture)))
     with naming(detections):
         return Rig(tuple(cameras), "z")
 
 
 def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:
-    """Cameras of which nothing is known but their pictures' sizes (width, height), without poses, upright."""
+    """Cameras with known sizes of pictures (width, height) only, without poses, upright."""
     return Rig(tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z")
 
 
 def _camera(name: str, size: tuple[int, int], degrees: float) -> Camera:
-    """A camera without a pose that sees so many degrees from left to right."""
+    """A camera without a pose, with a horizontal field of view of `degrees`."""
     width, height = size
     f = width / 2 / np.tan(np.radians(degrees) / 2)
     K = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
     return Camera(name, K, np.eye(4), size)
 
 
-def _given(fields: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """What is given for each camera: what is for all of them, or its own."""
-    found = dict[str, str]()
-    for text in fields:
-        name, given, value = text.partition("=")
-        if given and name not in names:
-            raise InputError(f"--field-of-view {text}: no such camera; give one of {listing(names)}")
-        found |= {name: value} if given else {each: text for each in names if each not in found}
-    if missing := [name for name in names if name not in found]:
-        raise InputError(f"--field-of-view: camera {missing[0]} has none; give {missing[0]}=DEGREES")
-    return found
-
-
 def _degrees(given: str, size: tuple[int, int]) -> float:
-    """From left to right of pictures of a size (width, height)."""
+    """Horizontal field of view of pictures of a size (width, height), degrees."""
     if Path(given).suffix.lower() in _PHOTOS:
         longer = _focal_of_photo(Path(given)) * max(size)
         return float(np.degrees(2 * np.arctan(size[0] / 2 / longer)))
@@ -97,8 +86,8 @@ def _degrees(given: str, size: tuple[int, int]) -> float:
 
 
 def _focal_of_photo(file: Path) -> float:
-    """A photo's focal length, as a part of its longer side, from EXIF's FocalLengthIn35mmFilm: of a film's picture
-    with the same diagonal (EXIF 2.3, 4.6.5).
+    """A photo's focal length relative to its longer side, from EXIF's FocalLengthIn35mmFilm: that of a film's
+    picture with the same diagonal (EXIF 2.3, 4.6.5).
     """
     image = optional("PIL.Image", "photos")
     cure = "give a photo as the camera wrote it, or degrees"

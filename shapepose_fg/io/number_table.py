@@ -14,7 +14,7 @@ from shapepose_fg.io.validation import is_number
 _MOST_BYTES = 2**28
 """Largest file, bytes: a line per frame, a day of 30 cameras."""
 MISSING = "-"
-"""Stands for a number that is missing, in the columns that may lack some."""
+"""Placeholder of a missing number, in the columns that may lack some."""
 
 
 def read_number_table(

@@ -1,4 +1,4 @@
-"""A Pose2Sim project as it lies: which of its files are what, and where its next steps look for results."""
+"""Reads a Pose2Sim project: finds its files, and the places where its next steps look for results."""
 
 import shlex
 from dataclasses import dataclass
@@ -17,45 +17,45 @@ from shapepose_fg.io.footage.places import VIDEOS
 
 CONFIG = "Config.toml"
 _POSES = ("pose-sync", "pose", "pose-associated")
-"""Folders of 2D detections, the best first: brought into step, as detected, and one person as Pose2Sim chose them.
-Who is who in the cameras is found anew, so that what Pose2Sim dropped is not lost."""
+"""Folders of 2D detections, the best first: synchronised, as detected, and one person as Pose2Sim chose them.
+People are associated between cameras anew, so that what Pose2Sim dropped is not lost."""
 _MOST_KEYPOINTS = 1000
-"""No detector has as many: a larger id is a mistake."""
+"""Largest number of a keypoint: a larger id is a mistake."""
 _RATE = 30.0
-"""Frames a second where neither Config.toml nor a video says it, as in Pose2Sim."""
+"""Frame rate where neither Config.toml nor a video states it, Hz, as in Pose2Sim."""
 
 
 @dataclass(frozen=True)
 class Pose2SimProject:
-    """What a project says, and where its files are."""
+    """The content of a project, and the paths of its files."""
 
     folder: Path
     """The trial's own folder."""
     calibration: Path
-    """The cameras."""
+    """Path of the cameras."""
     detections: Path
     """The folder of 2D detections."""
     fps: float | None
-    """Frames a second; None where the detections' times.csv says when frames were taken."""
+    """Frame rate, Hz; None where the detections' times.csv has the times of frames."""
     first_number: int
-    """What the project calls its first frame: results have the project's numbers."""
+    """Number of the first frame in the project: results have the project's numbers."""
     frames: tuple[int, int] | None
-    """The project's own numbers of the first frame to be reconstructed and of the one after the last."""
+    """The project's own numbers of the first frame to reconstruct and of the one after the last."""
     multi_person: bool
-    """Whether everybody is of interest, or one person."""
+    """Whether all people are wanted, or one person."""
     joints: DeclaredJoints | None
-    """The detector's joints as pose.pose_model says; None where it says nothing."""
+    """The detector's joints from pose.pose_model; None where it is missing."""
     notes: tuple[str, ...]
-    """What was taken to be what."""
+    """Notes on how the files were interpreted."""
 
     @property
     def output(self) -> Path:
-        """Where our own results go."""
+        """Folder of our own results."""
         return self.folder / "shapepose-fg"
 
     @property
     def pose_3d(self) -> Path:
-        """Where Pose2Sim's next steps look for TRC and C3D."""
+        """Folder in which Pose2Sim's next steps look for TRC and C3D."""
         return self.folder / "pose-3d"
 
     @property
@@ -69,7 +69,7 @@ class Pose2SimProject:
         return f"{self.name}{who}_{first}-{last}"
 
     def span(self, count: int) -> range:
-        """Frames of a recording of `count` that are wanted, counted from 0; InputError where there are none."""
+        """Wanted frames of a recording of `count` frames, counted from 0; InputError where there are none."""
         if self.frames is None:
             return range(count)
         start, stop = (min(max(number - self.first_number, 0), count) for number in self.frames)
@@ -119,7 +119,7 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
 
 
 def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
-    """frame_rate, frame_range and multi_person of [project]; InputError for what they cannot be."""
+    """frame_rate, frame_range and multi_person of [project]; InputError for invalid values."""
 
     def wrong(key: str, wanted: str) -> InputError:
         return InputError(f"{file}: project.{key} must be {wanted}, got {project[key]!r}; correct it")
@@ -138,7 +138,7 @@ def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
 
 
 def _joints(config: dict[str, Any], file: Path) -> DeclaredJoints | None:
-    """What pose.pose_model says of the keypoints: a layout's name, or the tree of joints under that name."""
+    """Joints from pose.pose_model: a layout's name, or the tree of joints under that name."""
     pose = config.get("pose", config.get("pose-2d", {}))
     if not isinstance(pose, dict):
         raise InputError(f"{file}: pose must be a table; write [pose] as Pose2Sim's demos do")

@@ -1,4 +1,4 @@
-"""A recording as it is reconstructed: what all cameras saw at the same moments, and when these were."""
+"""A recording for reconstruction: synchronised detections of all cameras, and their times."""
 
 import re
 from dataclasses import replace
@@ -21,11 +21,11 @@ from shapepose_fg.io.timestamps import read_own_times, read_timestamps
 
 _MOST_BYTES = 2**28
 TIMES = "times.csv"
-"""The times of detections, beside them."""
+"""Name of the file with the times of detections, beside them."""
 
 
 def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -> Path | None:
-    """The file with the times of the frames: the one that is given, or without a rate the one beside; or none."""
+    """The file with the times of the frames: the given one, or without a rate the one beside; or none."""
     if fps is not None and timestamps is not None:
         raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
     beside = detections / TIMES
@@ -41,11 +41,12 @@ def read_recording(
     timestamps: Path | None = None,
     own_frames: bool = False,
 ) -> tuple[DetectionTable, FrameTimes | None]:
-    """What the cameras saw, in the empty folder `kept`, and the times of its frames; None where nothing says them.
+    """Detections of all cameras, in the empty folder `kept`, and the times of the frames; None where these are
+    unknown.
 
     `timestamps` is a file that `read_timestamps` reads, times.csv beside the detections by default. Cameras that
-    began at other times, or run at other rates, are put together by it: frames are moments then. With `own_frames`
-    it is not known when cameras began: frames are each camera's own, and all are kept.
+    started at different times, or have different rates, are grouped by it to synchronised frame sets, which are
+    then the frames. With `own_frames` start times are unknown: frames are each camera's own, and all are kept.
     InputError, one sentence that names file, place and cure.
     """
     file = times_beside(detections, fps, timestamps)
@@ -67,13 +68,13 @@ def read_recording(
 
 
 def own_times(recording: DetectionTable, times: FrameTimes, views: int) -> Array:
-    """(T, V) when each camera took its own frames, on its own clock; NaN for frames that it does not have."""
+    """(T, V) times of each camera's own frames, on its own clock; NaN for frames that it lacks."""
     own = times.of_views(views)
     return own if recording.picture is None else np.where(recording.picture >= 0, own, np.nan)
 
 
 def _own(there: Mask) -> Index:
-    """(T, V) the frame itself where a camera has it, else -1."""
+    """(T, V) the frame's own number where a camera has it, else -1."""
     return np.where(there, np.arange(len(there))[:, None], -1)
 
 
@@ -85,7 +86,7 @@ def write_moments(file: Path, rig: Rig, picture: Index) -> None:
 
 
 def read_moments(file: Path) -> dict[str, Index]:
-    """What `write_moments` wrote: (T,) pictures by the camera's name; InputError on anything else."""
+    """Read a file of `write_moments`: (T,) pictures by the camera's name; InputError on anything else."""
     lines = [re.split(r",\s*", line) for line in read_text(file, most=_MOST_BYTES).splitlines()]
     names, *rows = lines if len(lines) > 0 else [[""]]
     try:

@@ -17,7 +17,7 @@ _FACE_AND_TOES = {
     "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel",
     "left_hand", "right_hand", "left_foot", "right_foot",
 }  # fmt: skip
-"""Points of the body by which a person is not recognised."""
+"""Points of the body that are not core joints."""
 _HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
 
 
@@ -33,7 +33,9 @@ class _File(BaseModel, strict=True, extra="forbid"):
 
 
 def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
-    """A skeleton, by itself, its name (`joint_names.layouts_called`), or the file that describes it."""
+    """A skeleton, given as itself, by its name (`joint_names.layouts_called`), or by the file that describes
+    it.
+    """
     if wanted is None or isinstance(wanted, Skeleton):
         return wanted
     name = str(wanted)
@@ -50,7 +52,7 @@ def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
 
 
 def read_skeleton(path: str | Path) -> Skeleton:
-    """Read a skeleton's TOML file; its joints are then called as the body calls those points.
+    """Read a skeleton's TOML file; its joints get the names of the body's points.
 
     InputError, one sentence that names the file, the key and the cure.
     """

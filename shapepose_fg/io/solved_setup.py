@@ -1,4 +1,4 @@
-"""What a saved result was solved with: its cameras and its body."""
+"""The cameras and the body that a saved result was solved with."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +13,7 @@ from shapepose_fg.io.calibration import read_rig
 
 
 def cameras_of(folder: Path) -> Rig:
-    """The cameras of the result in `folder`; InputError, which says where to get them, where there are none."""
+    """The cameras of the result in `folder`; InputError with the cure where there are none."""
     file = folder / CAMERAS
     if not file.exists():
         raise InputError(
@@ -24,7 +24,7 @@ def cameras_of(folder: Path) -> Rig:
 
 
 def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
-    """The body model of a result whose run.json says `run`, or of the file `given`; InputError if it is gone."""
+    """The body model of a result with run.json `run`, or of the file `given`; InputError if it is missing."""
     named = run.get("body") if given is None else given
     file = None if named is None else Path(str(named))
     if file is None:

@@ -1,4 +1,4 @@
-"""When frames were taken, from a text file: a line per frame, in seconds; one column, or one for each camera."""
+"""Times of frames from a text file: a line per frame, in seconds; one column, or one for each camera."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,17 +19,16 @@ from shapepose_fg.io.validation import is_number
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 1e-6, 10.0
-"""Frames nearer or farther apart than this are no recording of motion: the file is in another unit."""
+"""Shortest and longest time between frames, s: outside of these the file has another unit."""
 
 
 def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
     """The times of a recording of `frames` frames, from a text file (docs/conventions.md).
 
-    Numbers are apart by commas or spaces. Without a header each line is a time in seconds, frame 0 first. The
-    header names the columns: `time_s`, or the rig's cameras; and `frame`, if lines say which frame they are of.
-    Where cameras took frames of one number farther apart than from one frame to the next, or lack some, pictures
-    of other numbers belong together: the moments say which, and the times are theirs. InputError, one sentence
-    that names file, line and cure.
+    Numbers are separated by commas or spaces. Without a header each line is a time in seconds, frame 0 first. The
+    header names the columns: `time_s`, or the rig's cameras; and `frame`, if lines have frame numbers. Where the
+    times of frames with the same number differ by more than a frame, or cameras lack some, pictures are grouped to
+    synchronised frame sets, whose times are returned. InputError, one sentence that names file, line and cure.
     """
     path = Path(path)
     time_s, clocks = _times(path, rig, frames)
@@ -50,10 +49,10 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
 
 
 def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]:
-    """The times of each camera's own frames, where it is not known how cameras lie in time to each other.
+    """The times of each camera's own frames, where the offsets of the cameras are unknown; and (T, V) which exist.
 
-    And (T, V) whether the camera has such a frame; times of those that it lacks go on at its rate. InputError as
-    `read_timestamps`, and where cameras have different rates.
+    Times of missing frames continue at the camera's rate. InputError as in `read_timestamps`, and where cameras
+    have different rates.
     """
     time_s, clocks = _times(path, rig, frames)
     periods = [clock.period for clock in clocks]
@@ -103,13 +102,13 @@ def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]
 
 
 def nameable(names: Sequence[str]) -> bool:
-    """Whether columns can be called after these cameras."""
+    """Whether columns can be named after these cameras."""
     return not any(set(name) & set(", \t#") for name in names)
 
 
 def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
-    """Write when frames were taken, from 0 on, as `read_timestamps` reads it: (T,), or (T, V) for each camera, NaN
-    for frames that it does not have.
+    """Write the times of frames, from 0 on, as `read_timestamps` reads them: (T,), or (T, V) for each camera,
+    NaN for frames that it lacks.
     """
     if times.ndim == 2 and not nameable(names):
         raise InputError(f"{path}: a camera's name has a blank, a comma or #; rename it in the calibration")
@@ -137,7 +136,7 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
 
 
 def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> Index:
-    """(T,) the row of each frame of the recording; frames that it does not have are passed over."""
+    """(T,) the row of each frame of the recording; other frames are skipped."""
     odd = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
     if len(odd) > 0:
         line, number = lines[odd[0]], numbers[odd[0]]

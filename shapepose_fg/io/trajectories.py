@@ -1,4 +1,4 @@
-"""Trajectories of what carries cameras: TUM's text and our own CSV, which may say how surely poses are known."""
+"""Trajectories of carriers of cameras: TUM's text and our own CSV, which may have covariances."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from shapepose_fg.io.validation import is_number
 
 _MOST_METRES = 1e6
 _UNIT = 0.01
-"""How far the length of a quaternion may be from 1."""
+"""Largest deviation of a quaternion's length from 1."""
 _SHORTEST_S = 1e-6
 
 

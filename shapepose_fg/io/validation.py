@@ -1,4 +1,4 @@
-"""What pydantic found wrong, said once and plainly."""
+"""Validation errors of pydantic as plain sentences."""
 
 import math
 from collections.abc import Mapping
@@ -12,9 +12,9 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validated(model: type[Model], value: object, place: object, cure: str | Mapping[str, str]) -> Model:
-    """`value`, of a file, as the `model`; InputError that names place, key and cure where it is none.
+    """`value`, from a file, as the `model`; InputError that names place, key and cure where it is invalid.
 
-    `cure` may have one for each key: the innermost that is known is given.
+    `cure` may be by key: that of the innermost known key is used.
     """
     try:
         return model.model_validate(value)
@@ -114,4 +114,4 @@ _WANTED = {
     "dataclass_type": "a table",
     "finite_number": "a finite number",
 }
-"""What each of pydantic's type errors asks for, in words."""
+"""What each of pydantic's type errors expects, in words."""

@@ -1,6 +1,6 @@
-"""2D detections written for other systems: 4D Association's text with its calibration, and OpenPose's JSON.
+"""Writes 2D detections for other programs: 4D Association's text with its calibration, and OpenPose's JSON.
 
-Both hold the pixels that the real lens gives: a rig with distortion distorts them again.
+Both have distorted pixels: for a rig with distortion, detections are distorted again.
 """
 
 import json
@@ -22,7 +22,7 @@ from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
 SMALLEST_PERSON = 3
-"""Groups of fewer joints are false positives, as in OpenPose's default settings."""
+"""Minimum number of joints of a group that counts as a person, as in OpenPose's default settings."""
 
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
@@ -84,7 +84,7 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
 
 
 def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
-    """InputError where `write_openpose` would mix its frames with others, to be known before long work."""
+    """InputError where `write_openpose` would mix its frames with others; to be called before long work."""
     for camera in rig.cameras:
         place = Path(folder) / camera.name
         if next(place.glob("*_keypoints.json"), None) is not None:
@@ -92,7 +92,7 @@ def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
 
 
 def _check(recording: DetectionSequence) -> None:
-    """Refuse what the formats have no words for."""
+    """Refuse what the formats cannot hold."""
     if recording.skeleton.joints != BODY_25.joints:
         raise ValueError(f"only BODY_25 can be written, not {recording.skeleton.name}")
     if len(recording) == 0:
@@ -146,5 +146,5 @@ def association_lines(
 
 
 def _numbers(values: Array, decimals: int) -> str:
-    """Numbers in a line; zeros short, for they are most of an affinity matrix."""
+    """Numbers in a line; zeros are short, because they are most of an affinity matrix."""
     return " ".join("0" if value == 0 else f"{value:.{decimals}f}" for value in values.tolist())

@@ -1,1 +1,1 @@
-"""People as detections come: the newest moment at once, and the same refined within a fixed lag."""
+"""Online reconstruction: the people of the newest frame at once, and refined results within a fixed lag."""

@@ -1,4 +1,4 @@
-"""Which cameras are believed while it runs: who repeats pictures, falls silent, or sees people elsewhere."""
+"""Detects faulty cameras online: those that repeat pictures, fall silent, or contradict the others."""
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -11,62 +11,64 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.repeated_pictures import repeated_views
 
 _OVER_S = 1.0
-"""Over about so long a camera's distances are averaged: a crowd hides people for less."""
+"""Time over which a camera's distances are averaged, s: a crowd hides people for less."""
 _SILENT_S = 0.5
-"""A camera that gives nothing for longer is silent."""
+"""Time without detections after which a camera is silent, s."""
 _NEAREST = 0.25
-"""A camera sees people as near to where they are as the nearest quarter of their joints, or of its detections:
-others may be hidden from it, and it may see others."""
+"""Quantile of the distances between people's joints and detections that measures a camera: other people may be
+hidden from it, and it may see further ones."""
 _OFF_M, _TIMES = 0.06, 2.5
-"""It contradicts the others where that is farther, three times a detector's error, and so many times as far as in
-the median camera."""
+"""A camera contradicts the others above this distance, m, three times a detector's error, and above this
+multiple of the median camera's distance."""
 _BACK_M = 0.04
-"""It is believed again where it is nearer than this."""
+"""Distance below which a camera is used again, m."""
 _CAP_M = 0.5
-"""A distance counts no more."""
+"""Maximum of a distance in the average, m."""
 _LEAST = 12
-"""Joints in a picture, and detections there, that say anything: about half a person."""
+"""Minimum number of joints in a picture, and of detections, from which distances are computed: half a person."""
 
 
 class CameraState(IntEnum):
-    """What is the matter with a camera."""
+    """Status of a camera."""
 
     OK = 0
-    """Nothing."""
+    """The camera works."""
     FROZEN = 1
-    """Its picture repeats: its detections are left out."""
+    """The picture repeats; its detections are left out."""
     SILENT = 2
-    """It gives no detections where people should be seen."""
+    """The camera gives no detections where people should be seen."""
     CONTRADICTS = 3
-    """It sees people elsewhere than the others do: its detections are left out until it agrees again."""
+    """The camera contradicts the others; its detections are left out until it agrees again."""
     DOUBTED = 4
-    """Too many cameras see people elsewhere to tell which of them are right: all are used."""
+    """Too many cameras contradict each other to tell which of them are right; all are used."""
     OFF_CLOCK = 5
-    """Its times are seconds away from those of the other cameras: its views are left out until they agree."""
+    """The camera's times are seconds away from those of the others; its views are left out until they agree."""
 
 
 @dataclass(frozen=True)
 class CameraWatch:
-    """What is known of V cameras so far."""
+    """Statuses and statistics of V cameras."""
 
     apart_m: Array
-    """(V,) how far people's joints are from the nearest detection, averaged over a second; NaN unknown."""
+    """(V,) distance of people's joints from the nearest detection, averaged over a second, m; NaN where
+    unknown."""
     heard_s: Array
-    """(V,) when each gave detections last."""
+    """(V,) times of the last detections of each camera, s."""
     state: Whole
     """(V,) codes of `CameraState`."""
 
     @classmethod
     def of(cls, views: int) -> "CameraWatch":
-        """Nothing is known yet."""
+        """Initial state, in which nothing is known."""
         return cls(np.full(views, np.nan), np.full(views, -np.inf), np.zeros(views, dtype=np.int64))
 
     def seen(
         self, given: Detections, before: Detections | None, rig: Rig, time_s: float
     ) -> tuple["CameraWatch", Rig]:
-        """With a frame's detections: what is said of each camera, and the rig without those that are left out.
+        """Update with a frame's detections; returns the new state and the rig without the cameras that are left
+        out.
 
-        A view without any detection counts as without a picture: who should be seen there is not missed.
+        A view without any detection is treated as one without a picture: people are not expected in it.
         """
         views = len(rig)
         there = np.bincount(given.view, minlength=views) > 0
@@ -80,14 +82,16 @@ class CameraWatch:
         return now, now.believed(given, rig)
 
     def believed(self, given: Detections, rig: Rig) -> Rig:
-        """The rig of a frame with these detections, without the cameras that are left out."""
+        """The rig for a frame with these detections, without the cameras that are left out."""
         there = np.bincount(given.view, minlength=len(rig)) > 0
         out = ~there | np.isin(self.state, (CameraState.FROZEN, CameraState.CONTRADICTS))
         doubted = np.flatnonzero(self.state == CameraState.DOUBTED).tolist()
         return replace(rig, dark=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
 
     def compared(self, given: Detections, places: Array, rig: Rig, lasts_s: float) -> "CameraWatch":
-        """With how far the detections are from people at `places` (A, J, 3), metres, NaN where unknown."""
+        """Update with the distances of the detections from people at `places` (A, J, 3), metres, NaN where
+        unknown.
+        """
         if len(places) == 0 or len(given) == 0:
             return self
         uv, depth = rig.project(places)
@@ -109,7 +113,9 @@ class CameraWatch:
         return replace(self, apart_m=apart_m)
 
     def _judged(self) -> Whole:
-        """(V,) which contradict the others; where these are not more than half, and two, all are doubted."""
+        """(V,) codes of `CameraState`: cameras that contradict the others; all are doubted unless at least two
+        agree, and more agree than contradict.
+        """
         known = np.isfinite(self.apart_m)
         was = self.state == CameraState.CONTRADICTS
         if not known.any():

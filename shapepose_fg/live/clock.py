@@ -1,4 +1,4 @@
-"""The clock that cameras share: a camera whose time is elsewhere does not move it, most of them together do."""
+"""The common clock of cameras: one camera with a wrong time does not move it, most of them together do."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -7,38 +7,38 @@ from typing import Generic, TypeVar
 Given = TypeVar("Given")
 
 JUMP_S = 2.0
-"""A time farther than this from the newest frame's is a jump, seconds; no lag is longer."""
+"""Distance from the newest frame's time above which a time is a jump, s; no lag is longer."""
 _AGREE_S = 1.0
-"""Cameras that jump to times within this of each other agree, seconds."""
+"""Maximum difference between the times of cameras that jump together, s."""
 _ALIVE = 4
-"""A camera counts as alive if it gave one of the last views, so many for each camera."""
+"""Number of recent views, per camera, among which a camera must have one to count as alive."""
 _PATIENCE = 2
-"""Cameras that are alive and do not confirm a jump are waited for during so many views for each camera."""
+"""Number of views, per camera, during which cameras that are alive may still confirm a jump."""
 
 
 @dataclass
 class CommonClock(Generic[Given]):
-    """Views whose times jump wait until other cameras confirm the jump.
+    """Keeps views back whose times jump until other cameras confirm the jump.
 
     One camera, or one line, with a wrong time changes nothing for the others. After a pause of all cameras, or
-    when their clock is set, the first views wait for those of the others, and are taken in with them.
+    when their clock is set, the first views wait for those of the others, and are processed with them.
     """
 
     cameras: int
-    """V."""
+    """V, the number of cameras."""
     off: dict[int, int] = field(default_factory=dict)
-    """By camera: how many views in a row were kept back."""
+    """By camera: number of consecutive views that were kept back."""
     _held: dict[int, tuple[float, Given]] = field(default_factory=dict)
     """By camera: the time and content of its newest view, where that is a jump."""
     _stay: set[int] = field(default_factory=set)
-    """Cameras that gave a view without a jump since the first one that is held."""
+    """Cameras with a view that did not jump since the first one that is kept back."""
     _passed: int = 0
-    """Views since the first one that is held."""
+    """Number of views since the first one that is kept back."""
     _recent: deque[int] = field(default_factory=deque)
     """The cameras of the last views."""
 
     def admit(self, camera: int, time_s: float, now_s: float, given: Given) -> tuple[list[Given], bool]:
-        """The views to take in, in order of time, and whether the clock jumps with them.
+        """The views to process now, in order of time, and whether the clock jumps with them.
 
         `given` is what a camera saw at `time_s`, and `now_s` the time of the newest frame, -inf before the first.
         The view is kept back, and the list empty, if it jumps and the others have not confirmed that.

@@ -1,7 +1,7 @@
-"""One moment after the other: who is there, and where, from what came so far; a function of its arguments alone.
+"""Online tracking, one frame after the other: a pure function of the state and the frame.
 
-Following, finding and measuring are those of recordings (`tracking/`). The future is missing: who is there is
-decided by the same evidence as it comes in.
+Tracking, searching and measuring are those of recordings (`tracking/`). Without the future, track births and
+deaths are decided by the same evidence as it comes in.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -27,55 +27,56 @@ ON_TRIAL = -1
 _SEARCH_S = 0.1
 """Interval between searches for new people, seconds."""
 _SURE = 0.3
-"""Evidence a second of a new person who is shown at once: a probability of 0.97 (`presence.probability`)."""
+"""Evidence per second from which a new person is reported at once: a probability of 0.97
+(`presence.probability`)."""
 _WAITS_S = 1.0
-"""Whoever may be somebody who left waits no longer for their bones to be known."""
+"""Longest time for which a new track that may be a re-identification waits for its bone lengths, s."""
 _MOST_GONE = 256
 """Maximum number of ended tracks that are remembered."""
 _LONGEST_S = 0.1
-"""A frame stands for no more, however long nothing came before it: evidence is of what was seen."""
+"""Maximum duration that a frame's evidence counts for, s, however long no other frame came before."""
 
 
 @dataclass(frozen=True)
 class Gone:
-    """G people who left and may come back."""
+    """G tracks that ended and may be re-identified."""
 
     identity: Whole
-    """(G,) who."""
+    """(G,) identities."""
     time_s: Array
-    """(G,) when they were seen last, seconds."""
+    """(G,) times of the last detections, seconds."""
     place: Array
-    """(G, 3) centre of their core joints then, metres."""
+    """(G, 3) centre of the core joints at that time, metres."""
     bones: Array
-    """(G, B) mean length of each bone between core joints, metres; NaN where it is not known."""
+    """(G, B) mean length of each bone between core joints, metres; NaN where unknown."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The people after a frame: A tracks, and who left. Arrays and numbers only, so that they can be saved."""
+    """The state after a frame: A tracks, and ended ones. Arrays and numbers only, so that it can be saved."""
 
     tracks: Tracks
-    """Where they are."""
+    """States of the tracks' joints."""
     views: Whole
-    """(A, J) how many views' detections of each joint the last frame had."""
+    """(A, J) number of views with a detection of each joint in the last frame."""
     identity: Whole
-    """(A,) who each is for good; `ON_TRIAL` for whom too little speaks yet."""
+    """(A,) permanent identities; `ON_TRIAL` for tracks with insufficient evidence."""
     running_s: Array
-    """(A,) evidence since they appeared, seconds in which all of a person is seen by all views."""
+    """(A,) evidence since the birth of each track, as seconds in which a whole person is seen by all views."""
     peak_s: Array
-    """(A,) the most that it was."""
+    """(A,) maximum of this evidence so far."""
     born_s: Array
-    """(A,) when they were found, seconds."""
+    """(A,) times of birth, seconds."""
     place: Array
-    """(A, 3) the centre of their core joints then, metres."""
+    """(A, 3) centre of the core joints at birth, metres."""
     length_m: Array
-    """(A, B) sum of each bone's lengths, metres."""
+    """(A, B) sum of each bone's measured lengths, metres."""
     count: Array
     """(A, B) number of frames in which each bone was measured."""
     gone: Gone
-    """Who left."""
+    """Tracks that ended."""
     sought_s: float = -np.inf
-    """When new people were sought last."""
+    """Time of the last search for new people, s."""
     next_track: int = 0
     """The number of the next track."""
     next_identity: int = 0
@@ -83,31 +84,31 @@ class Moment:
 
     @property
     def named(self) -> Mask:
-        """(A,) who is somebody."""
+        """(A,) which tracks have an identity."""
         return self.identity != ON_TRIAL
 
     def rows(self, index: NDArray) -> "Moment":
-        """Some of the tracks."""
+        """The state with some of the tracks."""
         own = {name: getattr(self, name)[index] for name in OF_TRACKS}
         return replace(self, tracks=self.tracks.rows(index), **own)
 
 
 OF_TRACKS = ("views", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
-"""What a `Moment` has a row of for each track."""
+"""Fields of a `Moment` with one row per track."""
 
 
 @dataclass(frozen=True)
 class Filter:
-    """From one moment to the next."""
+    """Updates the state with a frame."""
 
     tracker: Tracker
-    """Follows people, finds new ones: that of recordings."""
+    """Tracks people and finds new ones, as in recordings."""
     stitching: StitchingConfig
-    """Who is recognised when they come back."""
+    """Settings of re-identification."""
 
     @cached_property
     def nobody(self) -> Moment:
-        """Before the first frame."""
+        """The state before the first frame."""
         J, B = len(self.tracker.skeleton), self._trace(np.zeros((0, len(self.tracker.skeleton), 3))).bones.shape[1]
         whole, real = np.zeros(0, np.int64), np.zeros(0)
         gone = Gone(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
@@ -116,11 +117,11 @@ class Filter:
         return Moment(self.tracker.nobody(), *own, gone)
 
     def step(self, before: Moment, given: Input) -> tuple[Moment, Index, Input]:
-        """The next frame, the detections (A, J, V) of each of its tracks, -1 for none, and the frame that they
-        are of, with people's sides held.
+        """Process the next frame; returns the state, the detections (A, J, V) of its tracks, -1 for none, and the
+        frame with left and right corrected.
 
-        People are predicted, given their detections and measured; ten times a second others are sought in what is
-        left over.
+        Tracks are predicted, detections assigned to them and their states updated; ten times a second new people
+        are searched for in the unassigned detections.
         """
         time_s, last_s, tracker = float(given.time_s.mean()), before.tracks.time_s, self.tracker
         tracks, given = hold_now(tracker, before.tracks, given)
@@ -133,16 +134,16 @@ class Filter:
         return self._with_names(now), candidate, given
 
     def placed(self, now: Moment) -> Array:
-        """(A, J, 3) where joints are, metres; NaN where that is not known well."""
+        """(A, J, 3) joints, metres; NaN where their uncertainty is too large."""
         joints = now.tracks.joints
         return np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
 
     def observations(self, now: Moment, candidate: Index, given: Input) -> Observations:
-        """The rows of a frame: its tracks and their detections, for stage II."""
+        """The rows of a frame for stage II: its tracks and their detections."""
         return observed(given, candidate, self.placed(now), now.tracks.ids)
 
     def _weighed(self, now: Moment, candidate: Index, given: Input, lasts_s: float) -> tuple[Moment, Index]:
-        """What the frame says for and against everybody being there, and how long their bones are."""
+        """Update the evidence for each track, and the lengths of its bones, with a frame."""
         if len(now.tracks) == 0:
             return now, candidate
         places, tracker = self.placed(now), self.tracker
@@ -163,7 +164,7 @@ class Filter:
         ), candidate
 
     def _without_ended(self, now: Moment, candidate: Index) -> tuple[Moment, Index]:
-        """Without those who had no evidence lately, or of whom more is missing than appearing anew costs."""
+        """Remove tracks without recent evidence, and those whose missing evidence costs more than a new birth."""
         stays = self.tracker.alive(now.tracks) & (now.running_s >= now.peak_s - 2 * APPEARS_S)
         if stays.all():
             return now, candidate
@@ -207,13 +208,14 @@ class Filter:
             "count": blank,
         }
         both = {name: np.concatenate([getattr(now, name), columns[name]]) for name in OF_TRACKS}
-        now = replace(now, tracks=tracks.joined(new), next_track=now.next_track + count, **both)
+        now = replace(now, tracks=Tracks.concatenate([tracks, new]), next_track=now.next_track + count, **both)
         return now, np.concatenate([candidate, own])
 
     def _with_names(self, now: Moment) -> Moment:
-        """Those for whom enough speaks are somebody: who left and fits in place, time and build, or a new person.
+        """Give identities to tracks with sufficient evidence: that of an ended track that fits in place, time and
+        build, or a new one.
 
-        Whoever may be somebody who left waits until enough bones are known.
+        A track that may be a re-identification waits until enough bones are measured.
         """
         ready = np.flatnonzero(~now.named & (now.running_s >= LEAST_S))
         if len(ready) == 0:
@@ -232,7 +234,7 @@ class Filter:
         return replace(now, identity=identity, next_identity=next_identity, gone=gone)
 
     def _may_be_back(self, now: Moment, row: int) -> bool:
-        """Whether too little is known of somebody to tell from those who left nearby."""
+        """Whether too little is known of a track to distinguish it from ended tracks nearby."""
         if now.tracks.time_s - now.born_s[row] > _WAITS_S or (now.count[row] >= LEAST_ROWS).mean() >= 0.5:
             return False
         gap_s = now.born_s[row] - now.gone.time_s
@@ -259,5 +261,5 @@ class Filter:
         return {int(row): int(gone.identity[names[G + n]]) for n, row in enumerate(ready) if names[G + n] < G}
 
     def _trace(self, places: Array) -> Trace:
-        """Centres and bones of people at `places` (A, J, 3)."""
+        """Centres and bone lengths of people at `places` (A, J, 3)."""
         return Trace.of(0, np.zeros(len(places)), places, self.tracker.skeleton)

@@ -1,8 +1,7 @@
-"""Where detections come from while they come: lines of JSON from a file, a pipe or clients of a socket; MCAP.
+"""Online inputs of detections: lines of JSON from a file, a pipe or clients of a socket; MCAP.
 
-One line does not end the service. A line that cannot be used is left out with a note. Who begins with a line that
-cannot be read, or sends ten in a row, is given up: a client is cut off and the others go on, a file is an
-`InputError`.
+One bad line does not end the service: it is left out with a note. A sender that begins with an unreadable line, or
+sends ten in a row, is refused: a client is disconnected and the others continue, a file is an `InputError`.
 """
 
 import selectors
@@ -23,26 +22,26 @@ from shapepose_fg.io.ros.mcap_files import read_views
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
 Push = Callable[..., None]
-"""Takes what `OnlineReconstructor.push_view` takes; raises ValueError where that is refused."""
+"""Function that accepts what `OnlineReconstructor.push_view` does, and raises ValueError where it refuses."""
 Note = Callable[[str], None]
 _LONGEST_LINE = 2**20
-"""Bytes of a line of detections: 600 people."""
+"""Maximum length of a line of detections, bytes: 600 people."""
 _PIECE = 2**16
 """Bytes that are read at a time."""
 _MOST_BAD = 10
-"""Lines in a row that cannot be used, after which their sender is given up."""
+"""Number of consecutive unusable lines after which their sender is refused."""
 _RECONNECT_S = 2.0
-"""A socket is served for so long after the last client who sent something has left, seconds: it may come back."""
+"""Time for which a socket stays open after its last client has left, s: clients may reconnect."""
 _SILENT_S = 60.0
-"""Clients that were silent for so long make room for new ones where there are too many."""
+"""Time of silence after which a client is disconnected where others need its place, s."""
 
 
 def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push) -> None:
-    """Give `push` what cameras saw, as it comes, to the end of the input.
+    """Pass detections to `push` as they come, until the input ends.
 
     `where` is a file or a pipe of lines, `-` or None for standard input, `FILE.mcap`, or `tcp://HOST:PORT`, which
-    ends when everybody who sent something has left. `note` is told of what is left out.
-    InputError where the input cannot be used.
+    ends when all clients that sent something have left. `note` receives what is left out. InputError where the
+    input cannot be used.
     """
     given = _Given(rig, skeleton, note, push)
     if where is not None and where.startswith("tcp:"):
@@ -63,7 +62,7 @@ def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push
 
 @dataclass(frozen=True)
 class _Given:
-    """What all senders of an input have in common: see `feed`."""
+    """The arguments of `feed` that all senders share."""
 
     rig: Rig
     skeleton: Skeleton
@@ -73,21 +72,21 @@ class _Given:
 
 @dataclass
 class _Sender:
-    """Who sends lines, one after the other."""
+    """A sender of lines."""
 
     name: str
-    """A file, or a client of a socket, for messages."""
+    """Name of the file or the client, for messages."""
     given: _Given
     good: int = 0
-    """Lines that were taken."""
+    """Number of accepted lines."""
     refused: InputError | None = None
-    """Why the first of those lines was not taken that say what lines should say."""
+    """The reason why the first line that states the format was refused."""
     _number: int = 0
     _bad: int = 0
-    """Lines in a row that could not be read."""
+    """Number of consecutive unreadable lines."""
 
     def line(self, line: bytes | None) -> None:
-        """Take the next line, None for one that is too long. InputError where the sender is to be given up."""
+        """Process the next line, None for one that is too long. InputError where the sender is to be refused."""
         if line is not None and self._number == 0:
             line = line.removeprefix(b"\xef\xbb\xbf")
         if line is None or line.strip():
@@ -96,7 +95,7 @@ class _Sender:
             self._number += 1
 
     def take(self, read: Callable[[str], tuple[Any, ...] | None]) -> None:
-        """Push what `read` makes of the name of the next line, unless it is None. InputError as in `line`."""
+        """Push the result of `read` for the name of the next line, unless it is None. InputError as in `line`."""
         self._number += 1
         place = f"{self.name}, line {self._number}"
         try:
@@ -120,7 +119,7 @@ class _Sender:
             self.good += 1
 
     def end(self) -> None:
-        """InputError where lines came and none was taken."""
+        """Raise InputError where lines came and none was accepted."""
         if self.good == 0 and self.refused is not None:
             raise self.refused
 
@@ -178,7 +177,7 @@ class _Client:
     sender: _Sender
     lines: _Lines
     heard_s: float
-    """When it sent something last, or came, on the monotonic clock."""
+    """Time of its last data, or of its connection, on the monotonic clock, s."""
 
 
 def _from_socket(where: str, given: _Given) -> None:

@@ -1,18 +1,20 @@
-"""Notes of a service that goes on: however often something happens, they do not flood the terminal."""
+"""Rate-limited notes of a running service, however often something happens."""
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from types import TracebackType
 
 _BETWEEN_S = 1.0
-"""Shortest time between two notes, seconds: others are counted."""
+"""Shortest time between two notes, s; further ones are counted."""
 _AT_ONCE = 10
-"""Notes that are passed on at once before."""
+"""Number of notes that are passed on at once before the limit applies."""
 
 
-class SparingNotes:
-    """Passes notes on: the first ten, then one a second, with how many were left out. A context, which ends with
-    that number.
+class SparingNotes(AbstractContextManager["SparingNotes"]):
+    """Passes notes on: the first ten, then one a second, with the number of those left out.
+
+    A context manager, which ends with that number.
     """
 
     def __init__(self, note: Callable[[str], None]) -> None:
@@ -28,9 +30,6 @@ class SparingNotes:
         self._left -= 1
         self._count()
         self._note(text)
-
-    def __enter__(self) -> "SparingNotes":
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

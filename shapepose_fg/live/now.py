@@ -1,4 +1,4 @@
-"""The people of the newest moment, and after it: joints with covariances, velocities, bodies."""
+"""The people of the newest frame, and predictions beyond it: joints with covariances, velocities, bodies."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import MODEL_SIGMA_M
 from shapepose_fg.estimation.carried_error import carried_covariance
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import Message, linearise, observation_sigmas
+from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.filtering import Moment
 from shapepose_fg.tracking.motion_filter import JointStates
@@ -27,11 +27,12 @@ _OWN_S, _TOGETHER_S = 0.3, 0.7
 0.3 and 1 s ahead errors are 11 and 39 % smaller than with constant velocity (simulated, split tune and
 crossing)."""
 _LATER, _FADES_S = 3.5, 0.25
-"""What the density of accelerations (`MotionModel.acceleration`) is multiplied with; for so long they last."""
+"""Factor on the power spectral density of accelerations (`MotionModel.acceleration`) in predictions, and the
+time constant with which accelerations decay, s."""
 _PACE, _PACE_UNSEEN = 0.1, 0.4
-"""What the filter's variances of velocities are multiplied with, of joints that two views see and of others: it
-follows as if everybody were fast (`pipeline.setup.FAST_M_S`). With these 95 % regions hold 94 to 97 % of joints
-0.1 to 1 s ahead (four stretches of split `tune`, six cameras, on which they were chosen)."""
+"""Factors on the filter's variances of velocities, for joints that two views see and for others: the filter
+assumes fast joints (`pipeline.setup.FAST_M_S`). With these 95 % regions hold 94 to 97 % of joints 0.1 to 1 s
+ahead (four stretches of split `tune`, six cameras, on which they were chosen)."""
 _FORGOTTEN = 0.1
 """Share of the filter's variance, which grows while no two views see a joint, that is added to the variance
 from the body: a hidden head may have turned. Regions of 95 % then hold 98 to 100 % of unseen joints in three
@@ -39,7 +40,7 @@ stretches of split `tune`, and 92 and 86 % in crowds, where they held 91 to 95, 
 
 
 def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
-    """The people after a frame, with joints where its `refined` rows put them, as far as they do."""
+    """The state after a frame, with joints replaced by those of its `refined` rows where these are known."""
     _, rows, which = np.intersect1d(now.identity, refined.person, return_indices=True)
     by, known = _states(tracker, refined.rows(which))
     mean, covariance = now.tracks.joints.mean.copy(), now.tracks.joints.covariance.copy()
@@ -49,40 +50,42 @@ def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
 
 
 def of_poses(rows: Observations, joints: JointStates, rig: Rig, config: EstimatorConfig) -> Array:
-    """(A, J, 3, 3) what is in the covariances of joints because poses of cameras that move are not known exactly.
+    """(A, J, 3, 3) part of the joints' covariances that comes from the uncertain poses of moving cameras.
 
-    `rows` are what the newest frame has of A people: errors of poses last, so that no frame averages them out.
+    `rows` are the newest frame's rows of A people. Errors of poses are correlated over time, so that frames do not
+    average them out.
     """
     places, views = joints.position, Views.of(rig, rows.time_s)
     sigmas = observation_sigmas(rows, places, views, config.observations, config.joints)
     evidence = linearise(rows, sigmas, places, views, config.observations)
-    nothing = Message(places, np.zeros((*places.shape, 3)))
+    nothing = JointTargets(places, np.zeros((*places.shape, 3)))
     return carried_covariance(evidence, nothing, sigmas, views, config.observations)
 
 
 @dataclass(frozen=True)
 class Newest:
-    """The newest frame, as `people` is asked of it."""
+    """The newest frame, from which `people` is computed."""
 
     frame: int
-    """Its number."""
+    """Number of the frame."""
     moment: Moment
-    """The people, and who may be some."""
+    """The tracks, also those without an identity yet."""
     fitter: BodyFitter
     """Fits their bodies."""
     doubted: bool = False
-    """Whether cameras contradict each other and nothing says which are wrong."""
+    """Whether cameras contradict each other and it is unknown which are wrong."""
     doubt: Array | None = None
-    """(A, J, 3, 3) added to covariances, m²: of cameras that move (`of_poses`) and of sides; None for nothing."""
+    """(A, J, 3, 3) added to covariances, m², for moving cameras (`of_poses`) and ambiguous sides; None for
+    nothing."""
 
     @cached_property
     def people(self) -> tuple[Moment, Array, Array, BodyFit]:
-        """Who is somebody, by identity; covariances (P, J, 3, 3) of joints, NaN of unknown ones, codes (P, J) of
-        `Known`, and bodies.
+        """Tracks with identities, covariances (P, J, 3, 3) of their joints, NaN where unknown, codes (P, J) of
+        `Known`, and their bodies.
 
-        Bodies are fitted to the joints as far as these are known. Joints that no two views see are where the body
-        has them, if that is surer, and some joint is seen: else the body is a guess between motion and what bodies
-        are like. Nobody of whom no joint is known is among them.
+        Bodies are fitted to the known joints. Joints that no two views see are taken from the body, if its
+        covariance is smaller and some joint is seen; otherwise the body is a guess from motion and the prior.
+        Tracks without a known joint are left out.
         """
         named = np.flatnonzero(self.moment.named & (self.moment.tracks.joints.sigma_m < PLACED_M).any(axis=1))
         order = named[np.argsort(self.moment.identity[named], kind="stable")]
@@ -113,7 +116,7 @@ class Newest:
 
 
 def people_at(newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: float) -> Reconstruction:
-    """Everybody `ahead_s` after the newest moment, as rows of its frame."""
+    """All people `ahead_s` after the newest frame, as rows of its number."""
     now, surely, code, fit = newest.people
     P, J = now.views.shape
     mean, covariance = later(now, surely, skeleton, motion, ahead_s)
@@ -142,13 +145,12 @@ def people_at(newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: 
 def later(
     now: Moment, surely: Array, skeleton: Skeleton, motion: MotionModel, ahead_s: float
 ) -> tuple[Array, Array]:
-    """Position and velocity (A, J, 6) of everybody's joints `ahead_s` later, and what is reported of them:
-    covariances (A, J, 6, 6) of either, without what they have in common. `surely` (A, J, 3, 3) is how joints are
-    known now.
+    """Position and velocity (A, J, 6) of all joints `ahead_s` later, and covariances (A, J, 6, 6) to report.
 
-    A joint's velocity becomes that of its person, the median of the core joints', and this fades: white noise on
-    accelerations, with friction; more the faster the joint and the person's joints are: who walks swings the leg
-    that stands.
+    The covariances leave out the correlation of position and velocity. `surely` (A, J, 3, 3) are the joints'
+    present covariances. A joint's velocity converges to that of its person, the median of the core joints', which
+    decays: white noise on accelerations, with friction; more the faster the joint and the person's joints are,
+    because in walking the leg swings that stood before.
     """
     joints = now.tracks.joints
     x, v = joints.position, joints.velocity
@@ -170,7 +172,7 @@ def later(
 
 
 def _states(tracker: Tracker, rows: Reconstruction) -> tuple[JointStates, Mask]:
-    """Refined joints as the filter's states, and which of them (P, J) are known."""
+    """Refined joints as states of the filter, and which of them (P, J) are known."""
     start = tracker.scale.motion.start
     known = np.asarray(np.isfinite(rows.joints).all(axis=-1)) & np.isfinite(rows.covariance).all(axis=(-2, -1))
     states = JointStates.at(np.where(known[..., None], rows.joints, 0.0), np.ones(known.shape), start)

@@ -1,9 +1,9 @@
-"""People as detections come: `push` what the cameras see, ask for `people` at any time, take what is `settled`."""
+"""Online reconstruction: `push` detections, read `people` at any time, and collect `settled` rows."""
 
 import threading
 from bisect import bisect_left
 from collections import deque
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -37,22 +37,23 @@ from shapepose_fg.pipeline.workers import workers as worker_processes
 from shapepose_fg.proposal.thinning import thinned
 
 AHEAD_S = 1.0
-"""People can be asked for up to so long after the newest frame."""
+"""Longest prediction after the newest frame, s."""
 _ROUNDS = 1
-"""Detections of a window are assigned again so often at the most: the filter has assigned them already, and two
-rounds take a seventh to a fifth more for the same figures (Shelf, crossing)."""
+"""Maximum rounds of reassociation in a window: the filter has assigned detections already, and two rounds take
+a seventh to a fifth more time for the same figures (Shelf, crossing)."""
 _KEPT_S = 10.0
-"""What is settled and nobody takes is kept for so long."""
+"""Time for which settled rows are kept if they are not collected, s."""
 _SETTLES = 2 / 3
-"""What a window settles at least, of the lag, where there are several frames in a lag."""
+"""Share of the lag that a window settles at least, where the lag has several frames."""
 _BEFORE = 7.0
-"""A window has the lag over this before what it settles: a frame or two. With a third of the lag it takes an
-eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
+"""Duration that a window includes before the settled frames: the lag over this, a frame or two. With a third of
+the lag it takes an eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
 _BEHIND = 3.0
-"""Frames older than so many lags are settled as they are, where solving does not keep up."""
+"""Age of a frame, in lags, at which it is settled without refinement, because solving does not keep up."""
 _MOST_SAID = 1000
 _OFF_CLOCK = 10
-"""Views in a row whose time is elsewhere, after which a camera is named, and the frames of `push` are believed."""
+"""Number of consecutive views with a wrong time after which the camera is reported, and frames from `push` are
+accepted."""
 _STANDS = 30
 """Excess of views without a pose over views with one, after which a camera is taken to stand where the rig has
 it."""
@@ -62,42 +63,42 @@ _BACK_S = 1.0
 
 @dataclass(frozen=True)
 class Said:
-    """What was noticed of a camera while it ran."""
+    """A change of a camera's status during the run."""
 
     time_s: float
-    """When."""
+    """Time of the change, s."""
     camera: str
-    """Which."""
+    """Name of the camera."""
     state: CameraState
-    """What is the matter with it from then on."""
+    """Status of the camera from then on."""
 
 
 @dataclass(frozen=True)
 class LiveReport:
-    """How it goes."""
+    """Counts of a run, and the status of each camera."""
 
     frames: int
-    """Frames that were taken in."""
+    """Number of frames that were processed."""
     late: int
-    """Frames among `frames` that came after a later one."""
+    """Number of these frames that came after a later one."""
     dropped: int
-    """Frames, or a camera's detections, that came too late, or twice: left out."""
+    """Number of frames, or detections of one camera, that were left out because they came too late, or twice."""
     unrefined: int
-    """Frames that nobody refined, because solving did not keep up."""
+    """Number of frames that were settled without refinement, because solving did not keep up."""
     not_taken: int
-    """Settled rows that nobody took in time."""
+    """Number of settled rows that were not collected in time."""
     jumps: int
-    """How often the clock of all cameras jumped, by a pause or because it was set: people are followed anew where
-    it went back, or by more than people can be gone."""
+    """Number of jumps of the common clock, after a pause or because it was set: tracking starts again where it
+    went back, or by more than the longest absence of a track."""
     cameras: dict[str, CameraState]
-    """How each camera is."""
+    """Status of each camera by name."""
 
 
-class OnlineReconstructor:
-    """Follows people from frame to frame as they come, and refines them within a fixed lag.
+class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
+    """Tracks people from frame to frame as they come, and refines them within a fixed lag.
 
-    A context: processes that refine end with it. `push`, `push_view`, `settled`, `save` and `close` wait for each
-    other; `people` and `report` wait for nobody and may be called by any thread.
+    A context manager, at whose end the refining processes end. `push`, `push_view`, `settled`, `save` and `close`
+    block each other; `people` and `report` block on nothing and may be called by any thread.
     """
 
     def __init__(
@@ -110,10 +111,10 @@ class OnlineReconstructor:
         workers: int = 2,
         fitter: BodyFitter | None = None,
     ) -> None:
-        """`skeleton` are the detector's joints; `lag_s` is how much later the refined people are handed out.
+        """`skeleton` are the detector's joints; `lag_s` is the delay of the refined people.
 
         `workers` processes refine; with 1 it is done within `push`, in the same order, so that the same frames
-        give the same bytes. Where the detector puts its joints comes from `config.offsets.source`, where that is a
+        give the same bytes. Offsets of the detector's joints come from `config.offsets.source`, where that is a
         file. ValueError for fewer than two cameras, or a lag that is not 0.1 to 2 seconds.
         """
         config = PipelineConfig() if config is None else config
@@ -158,7 +159,7 @@ class OnlineReconstructor:
         workers: int = 2,
         fitter: BodyFitter | None = None,
     ) -> "OnlineReconstructor":
-        """Go on from what `save` wrote, with the same cameras, settings and lag; else InputError."""
+        """Resume from a file of `save`, with the same cameras, settings and lag; else InputError."""
         found = cls(rig, config, skeleton=skeleton, lag_s=lag_s, workers=workers, fitter=fitter)
         try:
             found._state = read_state(Path(path), found._id, rig, found._filter)
@@ -168,27 +169,24 @@ class OnlineReconstructor:
             raise
         return found
 
-    def __enter__(self) -> "OnlineReconstructor":
-        return self
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
 
     def close(self) -> None:
-        """End the processes that refine. What was settled can still be taken."""
+        """End the refining processes. Settled rows can still be collected."""
         with self._lock:
             self._open.close()
 
     def push(self, detections: Detections, time_s: float | Array) -> None:
-        """Take in a frame of all cameras, taken at `time_s`: seconds, or (V,) for cameras out of step.
+        """Process a frame of all cameras, taken at `time_s`: seconds, or (V,) for asynchronous cameras.
 
-        A camera that gave nothing has no detections in it. Frames may come late or out of order by up to the lag:
-        everything after them is followed once more. Older ones, and a second one of the same time, are counted and
-        left out; ten in a row that are seconds old say that the clock was set back, and people are followed anew.
-        ValueError where a detection is of a camera or joint that there is not, or not finite, or of a camera that
-        moves (`push_view`) and nothing says where it was, and for times seconds apart.
+        A camera without detections has none in it. Frames may come late or out of order by up to the lag: all
+        later frames are then tracked again. Older ones, and a second one of the same time, are counted and left
+        out; ten in a row that are seconds old mean that the clock was set back, and tracking starts again.
+        ValueError where a detection is of a camera or joint that does not exist, or not finite, or of a moving
+        camera (`push_view`) whose pose is not known, and for times seconds apart.
         """
         times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
         self._check_time(times)
@@ -213,21 +211,21 @@ class OnlineReconstructor:
         pose: Array | None = None,
         pose_covariance: Array | None = None,
     ) -> None:
-        """Take in what one camera saw at `time_s`, seconds, on the clock that all share.
+        """Process the detections of one camera at `time_s`, seconds, on the common clock.
 
-        Views make a frame: it is complete when every camera that was heard in the last half second is in it (the
-        first one: every camera), or when one comes again. What comes for a frame that was complete joins it where
-        it is within half a frame of it and within the lag; else it is counted and left out. `detections` are of
-        this camera whatever their `view` says.
+        Views make a frame: it is complete when every camera that was active in the last half second is in it (the
+        first one: every camera), or when one comes again. A view for a completed frame is added to it where it is
+        within half a frame of it and within the lag; else it is counted and left out. `detections` are of this
+        camera whatever their `view` says.
 
         A view whose time is seconds away from the others' waits until those of other cameras confirm it: one
-        camera does not move the clock of the others. Where all of them jump, the views that waited are taken in.
+        camera does not move the common clock. Where all cameras jump, the waiting views are processed.
 
-        `pose` (4, 4) is world from camera then, or from what carries it (`Camera.carrier`), metres;
-        `pose_covariance` (6, 6) how surely, turn then way along its own axes, rad² and m² (GTSAM's order); without
-        it, exactly. Between poses at most half a second apart they are interpolated. A camera that nothing carries
-        moves if its first view has a pose. ValueError as `push`, for a camera that there is not, and for the pose
-        of a camera that stands still; nothing has changed then.
+        `pose` (4, 4) is world from camera at that time, or from its carrier (`Camera.carrier`), metres;
+        `pose_covariance` (6, 6) its covariance, rotation before translation along its own axes, rad² and m²
+        (GTSAM's order); without it, the pose is exact. Between poses at most half a second apart they are
+        interpolated. A camera without a carrier moves if its first view has a pose. ValueError as in `push`, for a
+        camera that does not exist, and for the pose of a camera that stands still; the state has not changed then.
         """
         if camera not in self.rig.names:
             raise ValueError(f"there is no camera {camera}; there are {', '.join(self.rig.names)}")
@@ -254,7 +252,7 @@ class OnlineReconstructor:
                 raise refused
 
     def _placed(self, view: int, time_s: float, pose: Array | None, covariance: Array | None) -> Rig:
-        """The cameras with a pose that came with a view, which is checked. ValueError, and nothing has changed."""
+        """The cameras with the pose of a view, which is checked. ValueError, and the state has not changed."""
         state, name = self._state, self.rig.names[view]
         moves, alone = bool(state.rig.cameras[view].carrier), not self.rig.cameras[view].carrier
         if pose is None:
@@ -275,7 +273,7 @@ class OnlineReconstructor:
     def _take_view(
         self, view: int, own: Detections, time_s: float, pose: Array | None, covariance: Array | None
     ) -> None:
-        """A view whose time fits, into its frame."""
+        """Add a view whose time fits to its frame."""
         if pose is not None:
             self._state.rig = self._placed(view, time_s, pose, covariance)
             self._state.without_pose[view] = max(self._state.without_pose[view] - 1, 0)
@@ -287,14 +285,14 @@ class OnlineReconstructor:
             self._take(frame, times)
 
     def _say_clock(self, view: int, was_off: int, off: int) -> None:
-        """Count a view that is kept back for good, and name its camera after several."""
+        """Count a view that is dropped, and report its camera after several."""
         self._state.dropped += int(off > 1)
         if off == _OFF_CLOCK or (off == 0 and was_off >= _OFF_CLOCK):
             code = CameraState.OFF_CLOCK if off > 0 else CameraState(int(self._state.watch.state[view]))
             self._said.append(Said(self._state.views.done_s, self.rig.names[view], code))
 
     def _jump(self, time_s: float) -> None:
-        """The clock of all cameras goes on at `time_s`."""
+        """Continue the common clock at `time_s`."""
         state = self._state
         for frame, times in state.views.rest():
             self._take(frame, times)
@@ -305,7 +303,7 @@ class OnlineReconstructor:
             self._begin_anew()
 
     def _begin_anew(self) -> None:
-        """Settle all frames; the next one is a first one, and its people are new ones."""
+        """Settle all frames; the next one starts tracking again."""
         state = self._state
         self._refine(last=True)
         if len(state.slots) > 0:
@@ -319,9 +317,9 @@ class OnlineReconstructor:
     def people(self, time_s: float | None = None) -> Reconstruction:
         """The people at `time_s`, from the newest frame's time (the default) to a second after it.
 
-        A row per person, of the newest frame's number. Joints are predicted by the model of motion, and their
-        covariances grow with the time ahead. Bodies are fitted to the newest joints when somebody asks first, and
-        moved along with them; joints that no two views see are the body's. ValueError for another time.
+        A row per person, with the newest frame's number. Joints are predicted by the motion model, and their
+        covariances grow with the prediction time. Bodies are fitted to the newest joints at the first call, and
+        moved with them; joints that no two views see are the body's. ValueError for another time.
         """
         newest = self._now
         newest_s = newest.moment.tracks.time_s
@@ -334,8 +332,9 @@ class OnlineReconstructor:
         return people_at(newest, self._setup.skeleton, self._motion, max(ahead_s, 0.0))
 
     def settled(self, *, wait: bool = False) -> Reconstruction:
-        """The refined rows of all frames that have settled since this was asked last; with `wait`, until all that
-        are under way are there. Rows that nobody takes within ten seconds are counted and forgotten.
+        """The refined rows of all frames that have settled since the last call; with `wait`, also those of
+        windows that are still being solved. Rows that are not collected within ten seconds are counted and
+        dropped.
         """
         with self._lock:
             self._collect(wait=wait)
@@ -345,7 +344,7 @@ class OnlineReconstructor:
         return Reconstruction.concatenate(parts) if len(parts) > 0 else Reconstruction.empty(names)
 
     def finish(self) -> Reconstruction:
-        """`settled` of all frames up to the newest: the stream has ended."""
+        """`settled` of all frames up to the newest, at the end of the stream."""
         with self._lock:
             for frame, times in self._state.views.rest():
                 self._take(frame, times)
@@ -353,8 +352,8 @@ class OnlineReconstructor:
             return self.settled(wait=True)
 
     def save(self, path: Path | str) -> None:
-        """Write all that is needed to go on with `load`; what is under way is waited for. The same state gives the
-        same bytes. What was noticed of cameras (`said`) is left out.
+        """Write the state for `load`, after waiting for windows in progress. The same state gives the same
+        bytes. Changes of cameras' statuses (`said`) are left out.
         """
         with self._lock:
             self._collect(wait=True)
@@ -362,7 +361,7 @@ class OnlineReconstructor:
         write_state(Path(path), arrays, self._id)
 
     def report(self) -> LiveReport:
-        """How it goes: counts, and how each camera is."""
+        """Counts, and the status of each camera."""
         cameras = {
             name: CameraState(code) for name, code in zip(self.rig.names, self._state.watch.state, strict=True)
         }
@@ -377,7 +376,7 @@ class OnlineReconstructor:
         return LiveReport(*counts, cameras)
 
     def said(self) -> list[Said]:
-        """What was noticed of cameras, oldest first; the last thousand."""
+        """Changes of cameras' statuses, oldest first; the last thousand."""
         return list(self._said)
 
     def _check_time(self, time_s: Array) -> None:
@@ -395,14 +394,14 @@ class OnlineReconstructor:
             raise ValueError("xy and confidence must be finite")
 
     def _check_places(self, detections: Detections, times: Array, rig: Rig | None = None) -> None:
-        """ValueError where nothing says where a camera was that moves and has detections."""
+        """ValueError where a moving camera has detections and no pose."""
         rig = self._state.rig if rig is None else rig
         for view in np.flatnonzero(rig.carrier >= 0).tolist():
             if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(times[view]):
                 raise ValueError(f"{rig.names[view]} moves: give a pose with what it sees at {times[view]:g} s")
 
     def _take(self, detections: Detections, times: Array) -> None:
-        """A frame, in its place among those that came."""
+        """Insert a frame among the others by its time."""
         time_s, slots = float(times.mean()), self._state.slots
         detections, _ = thinned(detections, self.rig, self._config.candidates)
         if len(slots) > 0 and time_s <= slots[-1].time_s + LEAST_STEP_S:
@@ -426,7 +425,7 @@ class OnlineReconstructor:
         self._collect()
 
     def _insert(self, detections: Detections, times: Array, time_s: float) -> None:
-        """A frame that came after later ones: these are followed once more."""
+        """Insert a frame that came after later ones, which are tracked again."""
         slots = self._state.slots
         at = bisect_left([slot.time_s for slot in slots], time_s)
         twice = any(abs(slot.time_s - time_s) <= LEAST_STEP_S for slot in slots[max(at - 1, 0) : at + 1])
@@ -440,7 +439,7 @@ class OnlineReconstructor:
         self._again(at)
 
     def _join(self, view: int, detections: Detections, time_s: float) -> None:
-        """A camera's detections that came after their frame: it is made anew with them."""
+        """Add a camera's detections that came after their frame, which is processed again."""
         times = np.array([slot.time_s for slot in self._state.slots])
         at = int(np.abs(times - time_s).argmin()) if len(times) > 0 else 0
         near_s = self._state.views.period_s / 2
@@ -463,7 +462,7 @@ class OnlineReconstructor:
         self._again(at)
 
     def _again(self, first: int) -> None:
-        """Follow from slot `first` on once more."""
+        """Track again from slot `first` on."""
         for at in range(first, len(self._state.slots)):
             slot = self._state.slots[at]
             last = self._state.slots[at - 1].moment
@@ -473,8 +472,8 @@ class OnlineReconstructor:
         self._show()
 
     def _restart(self, refined: Reconstruction) -> None:
-        """Follow anew from a frame on whose people are refined: they know better where joints are. Not where it is
-        older than the lag: the frames since take too long.
+        """Restart tracking at a frame with refined people, whose joints are more accurate; not where it is
+        older than the lag, because the frames since take too long.
         """
         slots = self._state.slots
         frames = [slot.given.frame for slot in slots if slots[-1].time_s - slot.time_s < self.lag_s]
@@ -485,9 +484,9 @@ class OnlineReconstructor:
             self._again(at + 1)
 
     def _refine(self, *, last: bool = False) -> None:
-        """Send what is due, forget what is done.
+        """Submit windows that are due, and drop frames that are no longer needed.
 
-        A window settles what is older than a third of the lag as soon as something is as old as the lag, with the
+        A window settles what is older than a third of the lag as soon as a frame is as old as the lag, with the
         third after it and a little before it.
         """
         slots, around_s = self._state.slots, self.lag_s / 3
@@ -512,7 +511,7 @@ class OnlineReconstructor:
         del slots[: int((age_s > needed_s).sum())]
 
     def _collect(self, *, wait: bool = False) -> None:
-        """Take in windows that were solved meanwhile: rows that are settled, and bodies for the newest moment."""
+        """Collect the windows solved meanwhile: settled rows, and bodies for the newest frame."""
         for refined in self._refinery.came(wait=wait):
             if len(refined.rows) > 0:
                 self._state.settled.append(refined.rows)
@@ -524,7 +523,7 @@ class OnlineReconstructor:
         self._show()
 
     def _show(self) -> None:
-        """From now on `people` is asked of the newest moment as it is."""
+        """Use the newest state for `people` from now on."""
         if len(self._state.slots) > 0:
             newest, rig, setup, added = self._state.slots[-1], self._state.rig, self._setup, None
             if rig.moves or newest.given.detections.mirrored.any():
@@ -537,7 +536,7 @@ class OnlineReconstructor:
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:
-    """Detections before those cameras that are not dark."""
+    """Detections without those of dark cameras."""
     gone = np.zeros(len(rig), dtype=bool)
     gone[list(rig.dark)] = True
     return detections.only(~gone[detections.view]) if gone[detections.view].any() else detections

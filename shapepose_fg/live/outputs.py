@@ -1,8 +1,8 @@
-"""Where people go to, as they come: lines of JSON, a socket, MCAP; rerun, to look.
+"""Online outputs of people: lines of JSON, a socket, MCAP, or rerun for display.
 
 `-` or nothing is standard output; `tcp://:5000` listens on this machine only, `tcp://0.0.0.0:5000` for everybody;
-a name that ends in `.mcap` or `.rrd` is that, `rerun` a viewer that is started, `rerun+http://...` one that runs;
-any other is a file or a pipe of lines.
+a name that ends in `.mcap` or `.rrd` is such a file, `rerun` a viewer that is started, `rerun+http://...` a
+running one; any other is a file or a pipe of lines.
 """
 
 import json
@@ -28,7 +28,7 @@ from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 Publish = Callable[[str, Reconstruction], None]
 """Function that takes the kind of the rows, `now` or `settled`, and the rows."""
 _MOST_WAITING = 2**23
-"""Bytes that a client may be behind with."""
+"""Maximum backlog of a client, bytes."""
 _LOOK_S = 0.2
 """Longest time that the end waits for the thread that accepts readers, s."""
 _LAST_S = 2.0
@@ -37,7 +37,7 @@ _LAST_S = 2.0
 
 @contextmanager
 def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
-    """What takes people out, frame by frame, to all those places; standard output where there is none."""
+    """Function that writes people, frame by frame, to all these targets; standard output where there is none."""
     with ExitStack() as files:
         targets = [files.enter_context(_target(each, rig, note)) for each in where or ["-"]]
 
@@ -81,7 +81,7 @@ def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publi
 
 
 def line_of(kind: str, people: Reconstruction, time_s: float) -> str:
-    """A moment's people as a line of JSON: metres, m², m/s; null where unknown."""
+    """The people of a frame as a line of JSON: metres, m², m/s; null where unknown."""
     rows = [
         {
             "person": int(people.person[n]),
@@ -110,12 +110,12 @@ def _plain(values: np.ndarray) -> Any:
 
 
 class _Listeners:
-    """Sends lines to whoever is there; who reads too slowly is cut off, and nobody is waited for."""
+    """Sends lines to all connected clients; clients that read too slowly are disconnected, and none blocks."""
 
     def __init__(self, listening: socket.socket, note: Callable[[str], None]) -> None:
         self._listening, self._note = listening, note
         self._waiting: dict[socket.socket, deque[memoryview]] = {}
-        """By client: what it has still to get. Lines are in memory once, whoever they wait for."""
+        """By client: what is still to be sent. Lines are in memory once for all clients."""
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._wait_for_readers, daemon=True)
@@ -139,7 +139,7 @@ class _Listeners:
                     continue
 
     def send(self, line: str) -> None:
-        """Send a line, and what waits before it, as far as each client takes it now."""
+        """Send a line, after the backlog, as far as each client accepts it now."""
         self._welcome()
         data = memoryview(line.encode())
         for client, waiting in list(self._waiting.items()):
@@ -159,7 +159,9 @@ class _Listeners:
                 self._part(client, "a reader is too slow, and cut off")
 
     def _wait_for_readers(self) -> None:
-        """Let in who comes while there is nothing to send, in a thread: the system lets only some wait."""
+        """Accept clients in a thread while there is nothing to send, because the system's queue of them is
+        short.
+        """
         with selectors.DefaultSelector() as ready:
             ready.register(self._listening, selectors.EVENT_READ)
             while not self._ended.is_set():
@@ -167,7 +169,7 @@ class _Listeners:
                     self._ended.wait(1.0)
 
     def _welcome(self) -> bool:
-        """Take in who came since; whether the system had room for them."""
+        """Accept waiting clients; returns whether the system had room for them."""
         try:
             with self._lock:
                 for _ in range(MOST_CLIENTS):  # and then a line again, however many come

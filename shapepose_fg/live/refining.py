@@ -1,4 +1,4 @@
-"""Behind the newest moment: windows of frames solved by stage II, in order, here or in processes of their own."""
+"""Refinement behind the newest frame: windows solved by stage II, in order, here or in other processes."""
 
 from collections import Counter, deque
 from concurrent.futures import Future
@@ -24,49 +24,50 @@ from shapepose_fg.pipeline.workers import Pool, naming_lost_work
 
 @dataclass
 class Slot:
-    """A frame, and the people after it."""
+    """A frame, and the state after it."""
 
     given: Input
-    """What the cameras gave that is believed; its number counts frames as they came."""
+    """The input that is used; its number counts frames in order of arrival."""
     moment: Moment
-    """The people."""
+    """The state after the frame."""
     candidate: Index
-    """(A, J, V) the detections of its tracks; -1 for none."""
+    """(A, J, V) detections of its tracks; -1 for none."""
     settled: bool = False
-    """Whether its rows have been refined, or are being refined."""
+    """Whether its rows are refined, or being refined."""
     refined: Reconstruction | None = None
-    """The newest rows of a window that ends here: what comes later is followed from them. Not saved."""
+    """The rows of the newest window that ends here, from which later frames are tracked. Not saved."""
 
     @property
     def time_s(self) -> float:
-        """When it was, the mean of its views."""
+        """Time of the frame, mean over its views, s."""
         return float(self.given.time_s.mean())
 
 
 @dataclass
 class LiveState:
-    """All that changes while frames come in, but for windows that are under way."""
+    """All state that frames change, except windows in progress."""
 
     rig: Rig
-    """The cameras; of those that move, where they were lately."""
+    """The cameras, with recent poses of moving ones."""
     watch: CameraWatch
-    """Which cameras are believed."""
+    """Statuses of the cameras."""
     views: ViewsInStep
     """Views that wait for the others of their frame."""
     clock: CommonClock[tuple[Any, ...]]
     """Views that wait until other cameras confirm their time. Not saved."""
     begin: Moment
-    """The people before the first frame: nobody, and the next identity. Not saved."""
+    """The state before the first frame: no tracks, and the next identity. Not saved."""
     without_pose: Counter[int] = field(default_factory=Counter)
-    """By view: how many more were given without a pose than with one. Not saved."""
+    """By view: the excess of views without a pose over those with one. Not saved."""
     slots: list[Slot] = field(default_factory=list)
-    """The last frames, in order of time: those that are not settled, and what a window needs before them."""
+    """The last frames, in order of time: those that are not settled, and those that a window includes before
+    them."""
     before: Detections | None = None
     """The newest frame's detections, all of them."""
     settled: deque[Reconstruction] = field(default_factory=deque)
-    """Rows that nobody has taken yet."""
+    """Rows that were not collected yet."""
     frames: int = 0
-    """How many frames were taken in, and so on (`LiveReport`)."""
+    """Number of processed frames; the next ones are counts of `LiveReport`."""
     late: int = 0
     dropped: int = 0
     unrefined: int = 0
@@ -76,30 +77,30 @@ class LiveState:
 
 @dataclass(frozen=True)
 class Refined:
-    """A window that was solved."""
+    """A solved window."""
 
     rows: Reconstruction
-    """The rows that are settled by it."""
+    """Rows that the window settles."""
     newest: Reconstruction
-    """Those of its newest frame: as far as the bodies are known that people have now."""
+    """The rows of its newest frame, whose bodies are the initial ones of the newest people."""
 
 
 @dataclass(frozen=True)
 class _Sent:
-    """A window under way."""
+    """A window in progress."""
 
     part: "Future[Part]"
     frames: Whole
-    """(T,) the frames' own numbers."""
+    """(T,) numbers of the frames."""
     names: dict[int, int]
-    """Tracks to identities."""
+    """Identities of the tracks."""
     own: int
-    """How many of its frames from `Span.start` on are settled by it."""
+    """Number of its frames from `Span.start` on that it settles."""
     start: int
 
 
 class Refinery:
-    """Sends windows to be solved, and gives back what came of them in the order in which they were sent."""
+    """Submits windows, and returns their solutions in order."""
 
     def __init__(self, pool: Pool[Setup], following: Filter) -> None:
         self._pool, self._filter = pool, following
@@ -107,11 +108,11 @@ class Refinery:
 
     @property
     def waiting(self) -> int:
-        """How many windows are under way."""
+        """Number of windows in progress."""
         return len(self._sent)
 
     def send(self, window: list[Slot], start: int, own: int, rig: Rig) -> None:
-        """Have the `own` slots from `start` on solved with those around them, before the cameras of `rig`."""
+        """Submit the `own` slots from `start` on with those around them, and the cameras of `rig`."""
         names = dict[int, int]()
         for slot in window:
             ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
@@ -135,7 +136,7 @@ class Refinery:
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:
-        """Windows that have been solved since, oldest first; with `wait` all of them."""
+        """Windows that have been solved since the last call, oldest first; with `wait` all of them."""
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()

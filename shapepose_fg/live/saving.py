@@ -1,4 +1,4 @@
-"""What a running reconstruction is made of as arrays, and back: to go on elsewhere, or after a restart."""
+"""Saves the state of an online reconstruction as arrays, and restores it in another process or after a restart."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ FORMAT = "shapepose-fg live state 3"
 _CURE = "begin without it"
 _WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place", "mirrored")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
-"""The columns of detections."""
+"""Columns of detections."""
 _POSES = ("time_s", "wTb", "covariance")
-"""The columns of poses of cameras that move, beside the carrier's name."""
+"""Columns of poses of moving cameras, besides the carrier's name."""
 _MOST_PIXELS, _MOST_APART_M, _MOST_AFFINITY = 1e9, 1e3, 10
 """Largest coordinate of a detection, px, distance of a camera from the others, m, and affinity."""
 _LEAST_VARIANCE = 1e-12
-"""Least variance of a place in any direction, m²: its inverse is a number."""
+"""Minimum variance of a position in any direction, m²: smaller ones have no finite inverse."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """The counts of a state."""
 _COLUMNS = {
@@ -74,19 +74,18 @@ _COLUMNS = {
     "seen.pairs": Column("E 2", _WHOLE),
     "seen.affinity": Column("E", most=1e9),
 }
-"""What is kept of the frames, one after the other; `slots` says how much of it is each frame's: its number,
-whether it is settled, the next track and identity, and how many tracks, detections, pairs and people who left it
-has."""
+"""Arrays of the frames, one frame after the other; `slots` has the share of each frame: its number, whether it
+is settled, the next track and identity, and its numbers of tracks, detections, pairs and ended tracks."""
 
 
 def setup_id(rig: Rig, skeleton: Skeleton, config: PipelineConfig, lag_s: float) -> str:
-    """A digest of all that a state goes with."""
+    """Digest of everything that a saved state depends on."""
     told = repr((asdict(config), rig.names, skeleton.joints, skeleton.limbs, lag_s)).encode()
     return hashlib.sha256(told + rig.K.tobytes() + rig.cTw.tobytes()).hexdigest()
 
 
 def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
-    """Frames and the people after each, as arrays: at least one frame."""
+    """One or more frames and the states after them, as arrays."""
     moments, given = [slot.moment for slot in slots], [slot.given for slot in slots]
     seen = [each.detections for each in given]
     views = len(given[0].rig)
@@ -122,7 +121,7 @@ def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
 
 
 def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
-    """The cameras of a state, those that move where they were lately."""
+    """The cameras of a state, with recent poses of moving ones."""
     if "pose.carrier" not in arrays:
         return rig
     found = []
@@ -136,8 +135,8 @@ def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
 
 
 def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> list[Slot]:
-    """The frames that `slot_arrays` made the arrays of; ValueError where they are not of these cameras, or of no
-    run.
+    """The frames from the arrays of `slot_arrays`; ValueError where they do not fit these cameras, or no run
+    wrote them.
     """
     J, B = nobody.views.shape[1], nobody.count.shape[1]
     sizes = {"V": len(rig), "J": J, "B": B, "S": nobody.tracks.joints.mean.shape[2]}
@@ -194,7 +193,9 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
 
 
 def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
-    """ValueError where detections are of no camera or joint, or nowhere, or people have others than these."""
+    """ValueError where detections have no valid camera, joint or place, or where tracks have detections that do
+    not exist.
+    """
     if not (np.abs(seen.xy) <= _MOST_PIXELS).all():
         raise ValueError("its detections must be finite")
     for each, most in ((seen.confidence, 1), (seen.mirrored, 1), (seen.affinity, _MOST_AFFINITY)):
@@ -250,7 +251,7 @@ def write_state(path: Path, arrays: Mapping[str, NDArray[Any]], setup: str) -> N
 
 
 def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState:
-    """A state. InputError where it is none, or of another set-up."""
+    """Read a state. InputError where the file is none, or has another set-up."""
     names = ["counts", "cameras", "clock", "waiting_s"]
     names += [f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS]
     optional = [f"settled.{each}" for each in Reconstruction.ROWS]
@@ -270,7 +271,7 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
 
 
 def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -> LiveState:
-    """A state of its arrays; ValueError where they make none."""
+    """The state from its arrays; ValueError where they do not fit."""
     V, skeleton = len(rig), following.tracker.skeleton
     shapes = {"counts": (len(_COUNTS),), "cameras": (4, V), "clock": (2,), "waiting_s": (V,)}
     for name, shape in shapes.items():

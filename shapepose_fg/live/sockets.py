@@ -1,4 +1,4 @@
-"""Sockets on which `live` waits for others, and how many of these it serves."""
+"""Sockets on which `live` listens, and the number of their clients."""
 
 import socket
 from urllib.parse import urlsplit
@@ -6,12 +6,14 @@ from urllib.parse import urlsplit
 from shapepose_fg.core.errors import InputError
 
 MOST_CLIENTS = 64
-"""Connections served at a time, of each socket: fewer than the files that a process may have open."""
+"""Maximum number of clients of a socket: fewer than the files that a process may have open."""
 _OWN_MACHINE = "127.0.0.1"
 
 
 def listen(where: str) -> socket.socket:
-    """A socket for `tcp://HOST:PORT` that nothing waits for; without a host, on this machine only. InputError."""
+    """A listening socket for `tcp://HOST:PORT`; without a host, on this machine only. InputError where it
+    fails.
+    """
     try:
         parts = urlsplit(where)
         host, port = parts.hostname or _OWN_MACHINE, parts.port
@@ -27,7 +29,7 @@ def listen(where: str) -> socket.socket:
 
 
 def accept(listening: socket.socket) -> tuple[socket.socket, str] | None:
-    """The next connection, which does not block, and who it is; None where there is none. OSError where the system
+    """The next connection, non-blocking, and its address; None where there is none. OSError where the system
     has no room for it.
     """
     try:

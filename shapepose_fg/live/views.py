@@ -1,4 +1,4 @@
-"""Cameras on their own clocks: views as they come, put together to frames."""
+"""Combines the views of asynchronous cameras into frames as they come."""
 
 from dataclasses import dataclass, field, replace
 
@@ -11,20 +11,20 @@ from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.clock import JUMP_S
 
 _HEARD_S = 0.5
-"""A frame waits for cameras that were heard so lately."""
+"""Time since the last view of a camera for which frames wait for it, s."""
 _ASSUMED_S = 1 / 30
-"""Between a camera's pictures, until it has given two."""
+"""Assumed time between a camera's pictures before two of them have come, s."""
 _FRESH = 0.05
-"""How much of a camera's period its last step is."""
+"""Weight of a camera's last step in the running mean of its period."""
 SHORTEST_S = 1 / 250
-"""Shortest time between a camera's pictures: closer ones are one picture, told twice."""
+"""Shortest time between a camera's pictures, s: closer ones are one picture, received twice."""
 MOST_S = 1e12
-"""Largest time, seconds: behind it doubles are too coarse for pictures."""
+"""Largest time, s: beyond it the resolution of doubles is too coarse."""
 _BEFORE_S = 0.4
-"""A camera was so long where its first pose has it."""
+"""Time for which the first pose of a camera holds before it came, s."""
 
 Frame = tuple[Detections, Array]
-"""What all cameras saw, and (V,) when."""
+"""Detections of all cameras, and their times (V,)."""
 
 
 @dataclass
@@ -32,31 +32,31 @@ class ViewsInStep:
     """Views that wait for the others of their frame."""
 
     views: int
-    """V."""
+    """V, the number of views."""
     waiting: dict[int, tuple[Detections, float]] = field(default_factory=dict)
-    """By view: what it saw, and when."""
+    """By view: its detections, and their time."""
     heard_s: Array = field(default_factory=lambda: np.zeros(0))
     """(V,) time of the last view of each camera."""
     done_s: float = -np.inf
-    """Time of the last frame that is complete."""
+    """Time of the last complete frame, s."""
     period_s: float = _ASSUMED_S
-    """Between pictures of a camera, about."""
+    """Approximate time between pictures of a camera, s."""
 
     def __post_init__(self) -> None:
         if len(self.heard_s) == 0:
             self.heard_s = np.full(self.views, -np.inf)
 
     def is_late(self, view: int, time_s: float) -> bool:
-        """Whether the frame of this view is complete without it, or it is the camera's last one again."""
+        """Whether the frame of this view was completed without it, or the camera's last view is repeated."""
         step_s = min(self.period_s, max(time_s - float(self.heard_s[view]), SHORTEST_S))
         return time_s <= max(self.heard_s[view], self.done_s + step_s / 2)
 
     def heard(self, view: int, time_s: float) -> None:
-        """A camera was heard, if late."""
+        """Note the time of a view, also of a late one."""
         self.heard_s[view] = max(self.heard_s[view], time_s)
 
     def add(self, view: int, detections: Detections, time_s: float) -> list[Frame]:
-        """Take in a view; the frames that are complete with it."""
+        """Add a view; returns the frames that are complete with it."""
         found = self.rest() if view in self.waiting else []
         step_s = time_s - float(self.heard_s[view])
         if np.isfinite(step_s):
@@ -69,7 +69,7 @@ class ViewsInStep:
         return found + (self.rest() if all(each in self.waiting for each in alive) else [])
 
     def rest(self) -> list[Frame]:
-        """What waits, as a frame: of views whose times are far apart, as the first ones may be, most of them."""
+        """The waiting views as a frame; where their times are far apart, as at the beginning, most of them."""
         if len(self.waiting) == 0:
             return []
         every = [time_s for _, time_s in self.waiting.values()]
@@ -86,8 +86,9 @@ class ViewsInStep:
 
 
 def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array | None, since_s: float) -> Rig:
-    """The rig in which a camera, or what carries it, has a pose (4, 4) with its covariance (6, 6) at `time_s`,
-    too; those before `since_s` are forgotten but for one. ValueError where it is no pose.
+    """The rig in which a camera, or its carrier, has one more pose (4, 4) with covariance (6, 6), at `time_s`.
+
+    Poses before `since_s` are dropped except for one. ValueError where `pose` is none.
     """
     camera = rig.cameras[view]
     name = camera.carrier or camera.name

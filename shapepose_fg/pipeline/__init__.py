@@ -1,1 +1,1 @@
-"""The whole way, from detections to a result: windows, processes, chunks, resuming."""
+"""The pipeline from detections to a result: windows, processes, chunks, resuming."""

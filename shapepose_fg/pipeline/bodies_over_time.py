@@ -1,4 +1,4 @@
-"""One body per person over a recording: one shape, and poses that move as people do, fitted to solved joints."""
+"""One body per person over a recording: one shape, and a smooth motion, fitted to the solved joints."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,49 +22,48 @@ from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.pipeline.keyframes import bodies_between, spaced
 
 SEGMENT_ROWS = 4000
-"""Rows of a person that are fitted together at the most. The shape of a longer track is what so many of its rows
-say, in pieces spread evenly over it; poses are then fitted with that shape, segment by segment. Neither memory nor
-the time of a row grows with the recording."""
+"""Maximum number of a person's rows that are fitted together. The shape of a longer track is fitted to this
+many of its rows, in pieces spread evenly over it; poses are then fitted with that shape, segment by segment.
+Neither memory nor the time per row grows with the recording."""
 PIECE_ROWS = 160
 """Rows of such a piece: some seconds, so that poses are linked in time there, too."""
 _OVERLAP_ROWS = 32
-"""Rows that a segment has of its neighbours, on either side, when poses are fitted."""
+"""Rows that a segment shares with its neighbours, on either side, when poses are fitted."""
 
 
 @dataclass(frozen=True)
 class Person:
-    """What one person's bodies are fitted to, N rows; plain data, which can be sent to another process."""
+    """The data that one person's bodies are fitted to, N rows; plain data, which can be sent to another
+    process.
+    """
 
     number: int
-    """Who it is."""
+    """Number of the person."""
     targets: JointTargets
     """The joints as they were solved."""
     time_s: Array
     """(N,) seconds."""
     shapes: Shapes | None = None
-    """What is known of the shape, (1)."""
+    """The known shape, one row; None where none is known."""
     fixed_shapes: bool = False
-    """Whether the shape is known and stays."""
+    """Whether the shape is kept fixed."""
     kept: range | None = None
-    """The rows whose bodies are wanted, None for all. Others overlap with what is before and after, or tell of the
-    shape only."""
+    """The rows whose bodies are returned, None for all. Others overlap with neighbouring segments, or
+    contribute to the shape only."""
     floor: Floor | None = None
-    """What bodies do not sink into, where it was found."""
+    """Floor that bodies do not sink into; None where none was found."""
     keyframe_s: float = 0.0
-    """Bodies are fitted to rows at most so far apart, and turned evenly between them; 0: to every row."""
+    """Maximum time between the rows that bodies are fitted to, s, with poses interpolated between them; 0:
+    every row."""
 
     @classmethod
     def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
-        """From the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
-        solved = np.isfinite(joints.sum(axis=-1)) & np.isfinite(covariance.sum(axis=(-1, -2)))
-        information = np.zeros_like(covariance)
-        information[solved] = np.linalg.inv(covariance[solved])
-        information = (information + information.swapaxes(-1, -2)) / 2
-        return cls(number, JointTargets(np.where(solved[..., None], joints, 0.0), information), time_s)
+        """Data of the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
+        return cls(number, JointTargets.solved(joints, covariance), time_s)
 
     def fitted(self, fitter: BodyFitter) -> dict[str, NDArray[Any]]:
-        """The bodies as arrays: `ok` (N,) which rows have one, `betas` to `transl` as in `Reconstruction`; and the
-        shape that they share, `mean` (1, 10) and `information` (1, 10, 10) by what all rows say of it.
+        """Fit the bodies; returns arrays: `ok` (N,) which rows have one, `betas` to `transl` as in
+        `Reconstruction`; and the common shape, `mean` (1, 10) and `information` (1, 10, 10), from all rows.
         """
         rows = np.flatnonzero(spaced(self.time_s, self.keyframe_s))
         targets, time_s, group = self.targets.rows(rows), self.time_s[rows], np.full(len(rows), self.number)
@@ -88,27 +87,29 @@ _BODIES = {name: column for name, column in columns_of(Reconstruction).items() i
     "mean": Column("1 10", most=1e3),
     "information": Column("1 10 10", most=1e12),
 }
-"""What `Person.fitted` gives."""
+"""Columns of the arrays that `Person.fitted` returns."""
 Fits = Callable[[Iterable[Person]], Iterable[dict[str, NDArray[Any]]]]
-"""Fits the bodies of people (`Person.fitted`), in order."""
+"""Function that fits the bodies of people (`Person.fitted`), in order."""
 
 
 @dataclass(frozen=True)
 class BodiesOverTime:
-    """Everybody's bodies, kept stretch by stretch."""
+    """The bodies of all people, stored in segments."""
 
     kept: KeptArrays
-    """Where they are."""
+    """Storage of the segments."""
     places: Mapping[int, Mapping[str, range]]
-    """Under which names each person's are, and which of the person's own rows each name has, in order."""
+    """For each person the names of the stored segments, and the range of the person's own rows in each, in
+    order."""
     shapes: SubjectShapes
-    """Everybody's shape; those who were recognised by their known names."""
+    """The shapes of all people; recognised people have their known names."""
 
     def filled(self, column: str, values: NDArray[Any], person: Whole, before: Mapping[int, int]) -> NDArray[Any]:
-        """Rows of a column of a result with these bodies, where there are any; `status` says that there are.
+        """Rows of a column of a result with these bodies, where there are any; `status` becomes that of a row with
+        a body.
 
-        `values` (R, ...) are the rows as they were, `person` (R,) whose they are, and `before` how many rows of
-        each person there are before them. Other columns stay as they are.
+        `values` (R, ...) are the rows as they were, `person` (R,) their people, and `before` the number of rows of
+        each person in front of them. Other columns stay as they are.
         """
         if column not in (*BODY, "status"):
             return values
@@ -143,19 +144,19 @@ def fit_everybody(
     known: SubjectShapes,
     lengths: tuple[int, int] = (SEGMENT_ROWS, PIECE_ROWS),
 ) -> BodiesOverTime:
-    """Fit one body per person to the joints as they were solved; what is kept already is not fitted again.
+    """Fit one body per person to the joints as they were solved; stored segments are not fitted again.
 
-    `counts` is how many rows everybody has; `person` gives what somebody's bodies are fitted to in some of these,
-    one range after the other, and `fits` fits people, side by side if it likes. `known` are people from other
-    recordings: who is recognised by shape (`recognise`) is fitted again with that as the prior. `lengths` are rows
-    of a segment and of a piece.
+    `counts` is the number of rows per person; `person` returns the data of a person in some of these rows, one
+    range after the other, and `fits` fits several people, in parallel if it can. `known` are people from other
+    recordings: a person who is recognised by shape (`recognise`) is fitted again with the known shape as the
+    prior. `lengths` are the rows of a segment and of a piece.
     """
     most, piece = lengths
     long = [number for number, count in counts.items() if count > most]
     places: dict[int, dict[str, range]] = {}
 
     def fit(jobs: Mapping[str, tuple[int, Callable[[], Person]]]) -> None:
-        """Fit what is not kept yet under these names: so many rows, of whom."""
+        """Fit what is not stored yet under these names: the number of rows, and their data."""
         there = set(kept.names(""))
         for name in jobs.keys() & there:
             bodies = kept.columns(name, _BODIES, {"N": jobs[name][0]})
@@ -166,14 +167,14 @@ def fit_everybody(
             kept.keep(name, bodies)
 
     def whole(number: int, prior: Shapes | None) -> Person:
-        """What the shape is fitted to, and the bodies where the track is short."""
+        """The data that the shape is fitted to, and the bodies where the track is short."""
         if number in long:
             rows = person(number, _spread(counts[number], most, piece))
             return replace(rows, shapes=prior, kept=range(0))
         return replace(person(number, [range(counts[number])]), shapes=prior)
 
     def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
-        """Some people's shapes, and their bodies where the track is short."""
+        """Shapes of some people, and their bodies where the track is short."""
         names = {number: f"{kind}-{number}" for number in prior}
         rows = {number: 0 if number in long else counts[number] for number in names}
         fit({name: (rows[number], partial(whole, number, prior[number])) for number, name in names.items()})
@@ -210,7 +211,9 @@ def fit_everybody(
 
 
 def _spread(count: int, most: int, length: int) -> list[range]:
-    """At most so many of `count` rows, in pieces of equal `length`, spread evenly from the first to the last."""
+    """Ranges of at most `most` of `count` rows, in pieces of equal `length`, spread evenly from the first to
+    the last.
+    """
     length = min(length, most)
     starts = np.linspace(0, count - length, most // length).round().astype(int).tolist()
     return [range(start, start + length) for start in starts]
@@ -255,14 +258,14 @@ def with_bodies_over_time(
 
 
 def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
-    """Everybody's shape, named by their numbers."""
+    """The shapes of all people, named by their numbers."""
     mean, information = ([getattr(each, name) for each in shapes.values()] for name in ("mean", "information"))
     names = np.array([str(number) for number in shapes])
     return SubjectShapes(names, np.concatenate(mean), np.concatenate(information), body)
 
 
 def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:
-    """What people are called in the file of shapes: known names; strangers by their number, or the next free."""
+    """Names of people in the file of shapes: known names; new people get their number, or the next free one."""
     names, taken = [], set(known.names.tolist())
     for number, subject in zip(numbers, whose, strict=True):
         name = str(number) if subject < 0 else str(known.names[subject])

@@ -32,13 +32,13 @@ _ITSELF = "shapepose-fg itself"
 def cluster(
     address: str | None, count: int, shared: Shared, ahead: int = 2, *, sharing: int = 1
 ) -> Iterator[Pool[Shared]]:
-    """The processes of a Dask cluster, each of which has `shared`: what `workers` is for one machine.
+    """The processes of a Dask cluster, each of which has `shared`: the counterpart of `workers` on many machines.
 
-    Its scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here, while the block runs.
-    `ahead` items a process are under way, of all who are `sharing` the cluster together: they wait in its
-    scheduler's memory. Results do not depend on which process they come from, or how many there are; an item whose
-    process is lost is done again by another. InputError where Dask is not installed; `WorkLost` where processes
-    are lost too often, or the scheduler is gone.
+    The scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here, while the block runs.
+    `ahead` items a process are under way, for all runs that are `sharing` the cluster together; they wait in the
+    scheduler's memory. Results depend neither on the process nor on the number of processes; an item whose process
+    is lost is repeated by another. InputError where Dask is not installed; `WorkLost` where processes are lost too
+    often, or the scheduler is gone.
     """
     with ExitStack() as opened:
         at = opened.enter_context(local_cluster(count)).address if address is None else address
@@ -60,7 +60,7 @@ def pool_of(client: Any, call: tuple[Any, ...], ahead: float) -> Pool[Any]:
 
 @contextmanager
 def _naming_lost_work() -> Iterator[None]:
-    """`WorkLost` where what the block waits for is lost."""
+    """Raise `WorkLost` where the work that the block waits for is lost."""
     from distributed import KilledWorker
 
     try:
@@ -81,9 +81,9 @@ class Scheduler:
     address: str
     """`tcp://host:8786`."""
     processes: int
-    """How many there are at present."""
+    """Number of its processes at present."""
     dashboard: str | None
-    """Where its dashboard is; None where it has none."""
+    """Address of its dashboard; None where it has none."""
 
 
 @contextmanager
@@ -100,7 +100,7 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
 
 
 _running: list[Any] = []
-"""In the process that leads it: the cluster of this machine."""
+"""The cluster of this machine, in the process that leads it."""
 
 
 def _local_cluster(count: int, dashboard: bool) -> Scheduler:
@@ -128,16 +128,16 @@ def _end_local_cluster() -> None:
 
 
 def _nothing() -> None:
-    """What the process that leads a cluster needs beforehand."""
+    """Do nothing: the process that leads a cluster needs no preparation."""
 
 
 def has_dashboard() -> bool:
-    """Whether a scheduler of this machine can show one."""
+    """Whether a scheduler of this machine can have a dashboard."""
     return find_spec("bokeh") is not None
 
 
 def look_at(address: str) -> Scheduler:
-    """The scheduler at an address, whose processes have this very program; InputError otherwise."""
+    """The scheduler at an address; InputError where its processes do not have this version of the program."""
     with _client(address) as client:
         refuse_other_programs(client, address)
         shown = "dashboard" in client.scheduler_info().get("services", {})
@@ -146,7 +146,7 @@ def look_at(address: str) -> Scheduler:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """A connexion to the scheduler at an address; bodies and minutes of footage are large tasks to it."""
+    """A connection to the scheduler at an address, for large tasks such as bodies and minutes of recordings."""
     Client = _dask()
     import dask.config
 
@@ -163,7 +163,7 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def refuse_other_programs(client: Any, address: str) -> None:
-    """InputError where a process has another version of this program, or of what decides on numbers."""
+    """InputError where a process has another version of this program, or of a package that affects the numbers."""
     for process, theirs in client.run(this_program, on_error="return").items():
         if not isinstance(theirs, dict):
             raise InputError(
@@ -186,7 +186,7 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
 
 @cache
 def this_program() -> dict[str, str]:
-    """What decides about the numbers of this process."""
+    """Versions of everything that affects the numbers of this process."""
     return {**versions(), _ITSELF: program_digest()}
 
 
@@ -200,9 +200,10 @@ def _dask() -> Any:
 
 
 def one_item(program: tuple[tuple[str, str], ...], shared: Any, work: Callable[[Any, Any], Any], item: Any) -> Any:
-    """One item, in a process of the cluster; InputError where it has another `program` than the one that asks.
+    """Process one item in a process of the cluster; InputError where its `program` differs from that of the
+    caller.
 
-    Processes may come at any time, after the others were looked at.
+    Processes may join at any time, after the others were checked.
     """
     _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), this_program())
     return work(shared, item)

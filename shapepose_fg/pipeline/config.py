@@ -1,4 +1,4 @@
-"""The settings of the whole way, and the paper's; what else the steps are made of stands beside them."""
+"""The settings of the pipeline, and the paper's; constants of the steps stand beside the code that uses them."""
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal, TypeVar
@@ -21,38 +21,39 @@ from shapepose_fg.tracking.tracker import TrackingConfig
 
 @dataclass(frozen=True)
 class PeopleConfig(Settings):
-    """Who is found, and for how long somebody is followed without being seen."""
+    """Settings of the search for people, and of the time for which a person is tracked without detections."""
 
     gate_m: Metres = 0.07
-    """Largest reprojection error of a point of two views, as a length at its depth: over three times the 2 cm that
-    a detector's error leaves. More where the cameras are calibrated worse than to a pixel or two."""
+    """Largest reprojection error of a point of two views, as a length at its depth, m: over three times the 2
+    cm of a detector's error. Increase it where calibrations are worse than a pixel or two."""
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
-    """Pairs of detections of one joint in a frame: of more, each view keeps its most confident ones (18 a view of
-    30 cameras, 47 of 12, 122 of 5). More for denser crowds, fewer for detectors that see people everywhere: time
-    and memory grow with it."""
+    """Maximum number of pairs of detections of one joint in a frame; beyond it, each view keeps its most
+    confident detections (18 a view of 30 cameras, 47 of 12, 122 of 5). Increase it for denser crowds, decrease
+    it for detectors with many false positives: time and memory grow with it."""
     min_probability: Share = 0.3
-    """Least probability of a new person. Less finds people of whom little is seen, more leaves out more false
-    positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before three and four cameras."""
+    """Minimum probability of a new person. A lower value finds people of whom little is seen, a higher one
+    leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before three and four cameras."""
     min_new_joints: Count = 4
-    """Core joints (trunk, arms, legs) that two views must see for a new person over time: less where furniture
-    hides people. Frame by frame three are enough: evidence decides there."""
+    """Minimum number of core joints (trunk, arms, legs) that two views must see for a new person over time;
+    decrease it where furniture hides people. Frame by frame three are enough, because evidence decides."""
     patience_s: Seconds = 0.5
-    """Somebody without evidence for longer has gone. More for people who are often hidden; whoever comes back
-    later is recognised by `stitching`."""
+    """Time without evidence after which a track ends, s. Increase it for people who are often hidden; a person
+    who comes back later is re-identified by `stitching`."""
 
 
 @dataclass(frozen=True)
 class WindowConfig(Settings):
-    """How frames are cut into windows."""
+    """How frames are divided into windows."""
 
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
-    """What a window takes of the frames before and after its own, and does not return: smoothing reaches a few
-    frames. Windows of other lengths move joints by under 2 mm in the median (tests/pipeline/test_windows.py)."""
+    """Duration of the frames before and after a window that it includes without returning them, s: smoothing
+    reaches a few frames. Windows of other lengths move joints by under 2 mm in the median
+    (tests/pipeline/test_windows.py)."""
     keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
-    """People are followed and solved in frames at most so far apart (keyframes), and carried by motion through
-    those between, whose detections are used only where a joint strays from its curve by 3 cm; 0: in every frame.
-    Errors of detectors last longer than a frame, so that little is lost. New people are sought in those that are
-    0.3 s or more apart."""
+    """Maximum time between keyframes, s; 0: every frame is one. People are tracked and solved in keyframes, and
+    interpolated by the motion model between them, where detections are used only if a joint deviates from its
+    curve by 3 cm. Errors of detectors last longer than a frame, so that little is lost. New people are searched
+    for in keyframes that are 0.3 s or more apart."""
     again_over_time: RepeatsOrNone = 8
     """Rounds of reassociation around the initial estimate of a window, at most; they end when hardly any detection
     changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
@@ -63,25 +64,25 @@ class WindowConfig(Settings):
 
     @property
     def shared_s(self) -> float:
-        """How far windows reach into each other, seconds: to the next keyframe at least."""
+        """Overlap of windows, s: it reaches the next keyframe at least."""
         return max(self.overlap_s, self.keyframe_s)
 
 
 @dataclass(frozen=True)
 class SolvingConfig(Settings):
-    """How bodies and joints alternate (Algorithm 1), and how far the body is believed."""
+    """How bodies and joints alternate (Algorithm 1), and the weight of the body."""
 
     alternations: Repeats = 3
-    """N of Algorithm 1 frame by frame: how often the body is fitted and the joints are solved, at the most. Most
-    frames are settled after one or two; the paper has 10."""
+    """N of Algorithm 1 frame by frame: maximum number of times that the body is fitted and the joints are
+    solved. Most frames converge after one or two; the paper has 10."""
     window_alternations: Repeats = 1
     """N of Algorithm 1 over time, where a window starts from initial estimates: a second round takes twice the
     time and changed the mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
     weight_shape: Factor = 1.0
-    """w_shape of Eq. 5, multiplies the squared distances to the body model: less for people whom it does not fit,
-    in wide clothes or with a load."""
+    """w_shape of Eq. 5, multiplies the squared distances to the body model: decrease it for people whom it does
+    not fit, in wide clothes or with a load."""
     motion: str = "constant velocity"
-    """How joints move over time, a name in `factors.MOTIONS`: "constant velocity" (white noise on acceleration),
+    """Motion model of joints, a name in `factors.MOTIONS`: "constant velocity" (white noise on acceleration),
     or "constant acceleration" (on jerk)."""
 
     def __post_init__(self) -> None:
@@ -96,35 +97,36 @@ _CONSTANT = "is no table any more: its settings are constants beside the steps t
 
 @dataclass(frozen=True)
 class PipelineConfig(Settings):
-    """The settings of every step, and how the work is cut."""
+    """The settings of every step, and the size of batches."""
 
     method: Literal["default", "paper"] = "default"
     """"paper": the steps as section 3 of the paper has them. `PipelineConfig.paper()` and `config --preset paper`
     set its numbers, too."""
     people: PeopleConfig = field(default_factory=PeopleConfig)
-    """Stage I, and people over time: who is there."""
+    """Stage I and tracking: the search for people."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """How far a 2D observation is trusted, as measured for OpenPose: a detector that is twice as far off wants
-    twice the `sigma_m`."""
+    """Accuracy of 2D observations, as measured for OpenPose: for a detector with twice its errors double
+    `sigma_m`."""
     following: FollowingConfig = field(default_factory=FollowingConfig)
-    """People over time: what becomes of tracks."""
+    """Tracking: how long tracks live."""
     stitching: StitchingConfig = field(default_factory=StitchingConfig)
-    """People over time: who comes back after a longer time out of sight."""
+    """Tracking: re-identification after a longer time out of sight."""
     windows: WindowConfig = field(default_factory=WindowConfig)
-    """How frames are cut into windows, and how often detections are reassociated."""
+    """Windows of frames, and rounds of reassociation."""
     solving: SolvingConfig = field(default_factory=SolvingConfig)
     """Stage II: bodies and joints."""
     motion: MotionConfig = field(default_factory=MotionConfig)
-    """Stage II: how frames hang together."""
+    """Stage II: motion between frames."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """Stage II: how bodies are fitted."""
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
-    """Stage II: where the detector puts its joints on the body."""
+    """Stage II: offsets of the detector's joints from the body's."""
     temporal: bool = True
-    """People over time: identities, motion, one shape a person. Without it every frame stands alone."""
+    """Whether people are tracked over time: identities, motion, one shape a person. If not, every frame is
+    independent."""
     batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 128
-    """Frames that are solved together and returned: bodies are fitted fastest by the hundred. Fewer need less
-    memory."""
+    """Number of frames that are solved together and returned: bodies are fitted fastest by the hundred. Fewer
+    need less memory."""
 
     replaced: ClassVar[dict[str, str]] = {
         "threads": "is gone: bodies are fitted by one thread",
@@ -135,11 +137,11 @@ class PipelineConfig(Settings):
         "window_graph": f"{_CONSTANT}; weight_shape is in [solving]",
         "refine": f"{_CONSTANT}; alternations and window_alternations are in [solving]",
     }
-    """Tables that there were, and what took their place."""
+    """Tables of earlier versions, and their replacements."""
 
     @classmethod
     def paper(cls) -> "PipelineConfig":
-        """The method as the paper has it written in section 3, without what we settled differently."""
+        """The method as section 3 of the paper describes it, without our changes."""
         return cls(
             method="paper",
             people=PeopleConfig(gate_m=CandidateConfig.paper().gate_m, min_new_joints=1),
@@ -153,7 +155,7 @@ class PipelineConfig(Settings):
 
     @classmethod
     def fast(cls) -> "PipelineConfig":
-        """In keyframes only, eight to ten a second: half the time or less (docs/evaluation.md, "Presets")."""
+        """Keyframes only, eight to ten a second: half the time or less (docs/evaluation.md, "Presets")."""
         return cls(
             windows=WindowConfig(keyframe_s=0.12),
             offsets=OffsetConfig(frames=10),
@@ -161,28 +163,28 @@ class PipelineConfig(Settings):
         )
 
     def _rules(self, kind: type[Rules]) -> Rules:
-        """The constants of a step, ours or the paper's."""
+        """The constants of a step: ours, or those of the paper."""
         return kind.paper() if self.method == "paper" else kind()
 
     @property
     def law(self) -> Motion:
-        """People over time: how joints and bodies move."""
+        """The motion model of joints and bodies over time."""
         return MOTIONS[self.solving.motion]
 
     @property
     def candidates(self) -> CandidateConfig:
-        """Stage I (b, c): pairs of views to 3D joint candidates."""
+        """Stage I (b, c): from pairs of views to 3D joint candidates."""
         own = self.people
         return replace(self._rules(CandidateConfig), gate_m=own.gate_m, most_pairs=own.most_pairs)
 
     @property
     def proposals(self) -> ProposalConfig:
-        """Stage I (d, e): candidates to people, and people to their 2D observations."""
+        """Stage I (d, e): from candidates to people, and from people to their 2D observations."""
         return replace(self._rules(ProposalConfig), min_probability=self.people.min_probability)
 
     @property
     def tracking(self) -> TrackingConfig:
-        """People over time: how they are followed from frame to frame."""
+        """Tracking from frame to frame."""
         return TrackingConfig(self.people.min_new_joints, self.people.patience_s)
 
     @property

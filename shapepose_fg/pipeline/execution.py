@@ -1,4 +1,4 @@
-"""What runs a reconstruction: processes, a cluster, chunks, and who is told how far it is."""
+"""Execution of a reconstruction: processes, a cluster, chunks, and a callback for progress."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -10,26 +10,26 @@ from shapepose_fg.pipeline.workers import Pool, suitable_workers, workers
 
 Shared = TypeVar("Shared")
 Progress = Callable[[int, int], None]
-"""Called with the number of frames that are done and the number of all."""
+"""Called with the number of frames that are done and the number of all frames."""
 _FRAMES_WORTH_A_WORKER = 100
-"""A recording must have this many for each worker: a window is a hundred, and it is what is handed out."""
+"""Minimum number of frames of a recording per worker: work is distributed in windows of a hundred."""
 
 
 @dataclass(frozen=True)
 class Execution:
-    """What runs a reconstruction. Only `chunk_frames` may change the result."""
+    """How a reconstruction is executed. Only `chunk_frames` may change the result."""
 
     workers: int | None = 1
-    """Processes that solve windows; 1: this one does, None: as many as pay."""
+    """Processes that solve windows; 1: this process only, None: as many as pay off."""
     cluster: str | None = None
     """Address of a Dask scheduler whose processes solve instead; `local` for `workers` processes of Dask's own."""
     sharing: int = 1
-    """How many runs share the cluster: each keeps its part of the work ready there."""
+    """Number of runs that share the cluster: each keeps its share of work submitted."""
     chunk_frames: int | None = None
-    """People are followed side by side, too, in chunks of about so many frames; identities are joined across the
-    borders (`runs/chunks.py`). The result may differ by who was in hiding there."""
+    """Length of chunks whose people are tracked in parallel, frames; identities are joined across the borders
+    (`runs/chunks.py`). The result may differ where people are hidden at a border. None: no chunks."""
     progress: Progress | None = None
-    """Told how far it is."""
+    """Called while frames are solved."""
 
     def worth(self, frames: int) -> "Execution":
         """Return a copy with the number of workers that pays for this many frames, where none is given."""
@@ -37,7 +37,7 @@ class Execution:
         return replace(self, workers=count)
 
     def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:
-        """The processes that take part in solving so many frames; all have what is `shared`."""
+        """The processes that solve this many frames; all of them have `shared`."""
         count = self.worth(frames).workers or 0
         if self.cluster is None:
             return workers(count, shared)

@@ -1,4 +1,4 @@
-"""Why a joint is where it is: what each view, the body and motion say of it, and what speaks against them."""
+"""Explains why a joint is where it is: the contributions of views, body and motion, and contradictions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,17 +29,19 @@ from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, FactorR
 from shapepose_fg.pipeline.solving import Solver, solved_around
 
 OFF_SIGMA = 3.0
-"""A detection is off that lies this many standard deviations from where all else has the joint: one in 90 does by
-chance."""
+"""Distance of a detection from where everything else puts the joint, in standard deviations, above which it is
+reported: one in 90 exceeds it by chance."""
 _WINDOW_FRAMES = 48
-"""Frames before and after, whose detections tell whether a camera is wrong."""
+"""Number of frames before and after from which it is decided whether a camera is wrong."""
 _ASTRAY_RAD, _BESIDE_RAD, _BIN_RAD = 0.15, 0.03, 0.01
-"""How far detections that were given to nobody are looked for around joints; and how far from there once the
-commonest of these ways, found in bins so wide, is gone: a camera that rolled moves some parts of its picture."""
+"""Angle around joints within which unassigned detections are searched; angle from there within which they match
+once the most frequent of these shifts, found in bins of the third angle, is subtracted: a camera that rolled
+moves some parts of its picture."""
 _NEAR_M = 0.5
-"""A detection that nobody was given is named so far from a joint that its camera has none of."""
+"""Distance from a joint without a detection within which an unassigned detection is reported, m."""
 _APART = 0.5
-"""A detection is somebody else's where it lies in less than this share of the distance from theirs."""
+"""Ratio of the distance from another person's joint to that from this one, below which a detection belongs to
+the other."""
 
 
 class _Problem(BaseModel):
@@ -98,13 +100,15 @@ def explain(
     detections: DetectionSequence | None = None,
     extra_factors: ExtraFactors | None = None,
 ) -> Explanation:
-    """Why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`, seconds.
+    """Explain why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`,
+    seconds.
 
-    The person's window is solved once more, from the detections that `people.observations` has of them, before the
-    cameras `rig`; joints, covariances and gates are those of the result. With the recording's `detections` those
-    are named, too, that a detector joins with the person's and that were not given to them. `extra_factors` are
-    those that the result was solved with, if any; `window.track` is the result's person for them. InputError where
-    the person, the joint or the frame is not in the result, or where it does not say what it was solved from.
+    The person's window is solved once more, from its detections in `people.observations` and with the cameras
+    `rig`; joints, covariances and gates are those of the result. With the recording's `detections`, detections are
+    reported too that the detector joins with the person's and that were not assigned to the person.
+    `extra_factors` are those that the result was solved with, if any; their `window.track` is the result's person.
+    InputError where the person, the joint or the frame is not in the result, or where the result has no
+    observations.
     """
     table = people.observations
     if table is None:
@@ -141,7 +145,7 @@ def explain(
 
 
 def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: float | None) -> int:
-    """The row of a person in a frame, or nearest to a time."""
+    """Index of the row of a person in a frame, or nearest to a time."""
     mine = np.flatnonzero(people.person == person)
     if len(mine) == 0:
         there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
@@ -162,13 +166,13 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
 
 @dataclass(frozen=True)
 class _Detections:
-    """Everybody's detections in the frames around, N rows, against the joints as they are reported."""
+    """The detections of all people in the frames around, N rows, compared with the reported joints."""
 
     people: Reconstruction
     table: ObservationTable
     views: Views
     seen: Seen
-    """Those, and what cameras saw beside joints and nobody was given."""
+    """These detections, and unassigned ones near joints."""
 
     @classmethod
     def of(
@@ -190,9 +194,9 @@ class _Detections:
 def _with_strays(
     rows: Observations, table: ObservationTable, views: Views, pixels: Array, detections: DetectionSequence
 ) -> Observations:
-    """The rows with detections given to nobody, where a camera has none of a joint: of those of its name the
-    nearest to where it would be if the camera was turned as most of them have it. A camera that is off has few
-    others, or none.
+    """The rows with unassigned detections added where a camera has none of a joint: of the same name, nearest
+    to where it would be if the camera was rotated as most of them suggest. A camera that is off has few others,
+    or none.
     """
     parts, focal = list[tuple[Array | Index, ...]](), np.broadcast_to(views.focal, (len(table), len(views)))
     for frame in np.unique(table.frame[(table.frame >= 0) & (table.frame < len(detections))]).tolist():
@@ -218,7 +222,7 @@ def _with_strays(
 
 
 def _commonest(ways: Array) -> Array:
-    """(2,) where ways (M, 2), radians, are densest."""
+    """(2,) mode of the shifts `ways` (M, 2), radians."""
     edges = np.arange(-_ASTRAY_RAD, _ASTRAY_RAD + _BIN_RAD, _BIN_RAD)
     count = np.pad(np.histogram2d(*ways.T, bins=(edges, edges))[0], 1)
     around = np.lib.stride_tricks.sliding_window_view(count, (3, 3)).sum(axis=(-1, -2))
@@ -226,7 +230,9 @@ def _commonest(ways: Array) -> Array:
 
 
 def _owner(seen: Detections, table: ObservationTable, rows: Index) -> Index:
-    """(D,) to which of some `rows` of one frame each detection was given, counted among them; -1 for nobody."""
+    """(D,) to which of some `rows` of one frame each detection is assigned, counted among these rows; -1 for
+    none.
+    """
     given = table.candidate[rows]
     n, joint, view = np.nonzero(given >= 0)
     most = max(seen.place.max(initial=0), given.max(initial=0))
@@ -244,12 +250,12 @@ def _view_reasons(
     joint: int,
     config: PipelineConfig,
 ) -> tuple[tuple[ViewReason, ...], tuple[FactorReason, ...], tuple[float, float]]:
-    """What each camera and each factor of the user's own says of a joint; and the shares of the body and of motion
-    in what is known of it.
+    """The contributions of each camera and each of the user's factors to a joint, and the shares of the body and
+    of motion.
 
-    The solver's information of the joint is taken apart: that of each detection, of the body, and the rest, which
-    is other frames'. The share of a part is trace(part inverse(whole)) / 3. A detection is compared with the joint
-    as it would be without it: one Gauss-Newton step from where it is.
+    The solver's information about the joint is divided: into that of each detection, of the body, and the rest,
+    which comes from other frames. The share of a part is trace(part inverse(whole)) / 3. A detection is compared
+    with the joint as it would be without it: one Gauss-Newton step from where it is.
     """
     people, table = all_of_it.people, all_of_it.table
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
@@ -322,8 +328,9 @@ def _view_reasons(
 def _looks_like(
     all_of_it: _Detections, row: int, joint: int, view: int, at: Array, sigma: float, off: float
 ) -> str:
-    """Whose joint a detection at `at`, known to `sigma` and `off` from where it should be, pixels, rather is:
-    another's of the same name, or one of the other side.
+    """The joint that a detection more likely belongs to, in words: another person's of the same name, or the
+    person's own of the other side. The detection is at `at`, with standard deviation `sigma` and `off` from its
+    joint, pixels.
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
     here = np.flatnonzero(people.frame == people.frame[row])
@@ -342,7 +349,7 @@ def _looks_like(
 
 def _refused(all_of_it: _Detections, row: int, joint: int, detections: DetectionSequence | None) -> list[Finding]:
     """Detections of a joint in cameras that have none of it, which the detector joins with the person's own or
-    which lie about there, and that are not theirs: given to somebody else, or to nobody.
+    which lie near it, and that are not the person's: assigned to another person, or unassigned.
     """
     people, table = all_of_it.people, all_of_it.table
     frame = int(people.frame[row])
@@ -385,7 +392,7 @@ def _findings(
     wrong: WrongView | None,
     refused: Sequence[Finding],
 ) -> tuple[Finding, ...]:
-    """What is the matter with a joint, the gravest first."""
+    """Problems of a joint, the gravest first."""
     found, used = list[Finding](), [view for view in views if view.gate == GATES[Gate.USED]]
     problem = _problem(people, run, row, joint)
     if problem:
@@ -445,14 +452,14 @@ def _findings(
 
 
 def _problem(people: Reconstruction, told: _Run, row: int, joint: int) -> str:
-    """What run.json says went wrong with a joint; empty where nothing did."""
+    """The problem with a joint as run.json states it; empty where there was none."""
     here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
     problems = told.people.problems
     return next((each.reason for each in problems if (each.person, each.frame, each.joint) == here), "")
 
 
 def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
-    """Cameras that the set-up check left out of a row's frame, or doubted in it, as run.json has it."""
+    """Cameras that the set-up check left out of a row's frame, or doubted in it, according to run.json."""
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (
         (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
@@ -473,7 +480,7 @@ def _taken(view: ViewReason) -> str:
 
 
 def _off(view: ViewReason) -> str:
-    """How far a detection is from where all else has the joint."""
+    """The distance of a detection from where everything else puts the joint, in words."""
     if view.off_px is None or view.off_sigma is None:
         return "behind it"
     return f"{view.off_px:.0f} px or {view.off_sigma:.1f} sigmas off"

@@ -1,4 +1,4 @@
-"""What is said of a joint, and why it is where it is: as data, and in words."""
+"""An explanation of why a joint is where it is: as data, and in words."""
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -7,54 +7,54 @@ from typing import Any
 from shapepose_fg.core.observation_table import Gate
 
 GATES = {gate: gate.name.lower().replace("_", " ") for gate in Gate}
-"""How gates are called."""
+"""Names of gates in explanations."""
 
 
 class Cause(StrEnum):
-    """What is the matter with a joint, the gravest first."""
+    """Kinds of problems of a joint, the gravest first."""
 
     NOT_SOLVED = "not solved"
-    """The solver found no place for it."""
+    """The solver found no place for the joint."""
     WRONG_CAMERA = "wrong camera"
-    """A camera that saw it is off with whatever it sees: its pose, its lens or its clock is wrong."""
+    """A camera that saw the joint is off for all that it sees: its pose, its lens or its clock is wrong."""
     FOREIGN = "foreign detection"
-    """A detection is another's, or of the other side of the body."""
+    """A detection belongs to another person, or to the other side of the body."""
     CONTRADICTION = "contradiction"
-    """Several views, or a view and the body, put it at places that cannot all be true."""
+    """Several views, or a view and the body, contradict each other."""
     GATED = "gated view"
-    """One detection lies where, by all others, the joint is not, and is nobody else's."""
+    """One detection contradicts all others, and belongs to no other person."""
     PRIOR_ONLY = "prior only"
     """No view's detection was used."""
     ONE_VIEW = "one view"
-    """One view's detection was used, which tells no depth."""
+    """One view's detection was used, which does not determine depth."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is the matter."""
+    """One problem of a joint."""
 
     cause: Cause
-    """What."""
+    """The kind of problem."""
     cameras: tuple[str, ...]
-    """With which cameras; none where it is with no camera."""
+    """The cameras that have the problem; none where no camera has."""
     words: str
-    """In a sentence or two."""
+    """A description in a sentence or two."""
 
 
 @dataclass(frozen=True)
 class ViewReason:
-    """What one camera has to do with a joint."""
+    """The contribution of one camera to a joint."""
 
     camera: str
-    """Its name."""
+    """Name of the camera."""
     gate: str
-    """Whether its detection was used, and why not: a name of `Gate`."""
+    """Whether its detection was used, and the reason if not: a name of `Gate`."""
     detection_px: tuple[float, float] | None
-    """Where it is, undistorted pixels; None where there is none."""
+    """The detection, undistorted pixels; None where there is none."""
     score: float
-    """The detector's, 0 to 1."""
+    """The detector's score, 0 to 1."""
     probability: float
-    """That the detection is this person's, by the assignment."""
+    """Probability that the detection is this person's, from the assignment."""
     sigma_px: float | None
     """Standard deviation of such a detection per axis, pixels."""
     residual_px: tuple[float, float] | None
@@ -68,17 +68,18 @@ class ViewReason:
     share: float
     """Share of the information about the joint that this view gives, 0 to 1."""
     looks_like: str = ""
-    """Whose joint the detection rather is, as `person 3's RWrist`; empty where it fits nobody better."""
+    """The joint that the detection more likely belongs to, as `person 3's RWrist`; empty where there is none."""
 
 
 @dataclass(frozen=True)
 class FactorReason:
-    """What factors of the user's own have to do with a joint."""
+    """The contribution of the user's factors to a joint."""
 
     name: str
-    """The function that made them."""
+    """Name of the function that made the factors."""
     others: tuple[str, ...]
-    """The joints that they tie it to, as `person 3's RWrist`; none where they are on this joint alone."""
+    """The joints that the factors connect it to, as `person 3's RWrist`; none where they are on this joint
+    alone."""
     share: float
     """Share of the information about the joint that these factors give, 0 to 1."""
 
@@ -92,26 +93,26 @@ class Explanation:
     frame: int
     time_s: float | None
     position_m: tuple[float, float, float] | None
-    """As reported, world; None where unknown."""
+    """Position as reported, in the world, m; None where unknown."""
     sigma_m: float | None
-    """As reported: root mean square over the axes."""
+    """Standard deviation as reported, m: root mean square over the axes; None where unknown."""
     known: str
-    """A name of `Known`."""
+    """How the joint is known: a name of `Known`."""
     status: str
     """Status of the row."""
     views: tuple[ViewReason, ...]
-    """Camera by camera."""
+    """Contributions of the cameras."""
     body_share: float
     """Share of the information about the joint that the body gives, the joint's own views not counted, 0 to 1."""
     motion_share: float
     """Share of the information about the joint that comes from other frames, 0 to 1."""
     findings: tuple[Finding, ...]
-    """What is the matter, the gravest first; none where nothing is."""
+    """Problems, the gravest first; empty where there are none."""
     factors: tuple[FactorReason, ...] = ()
-    """What factors of your own say of the joint in this frame, one entry for those of one function that tie it to
-    the same joints. What they say in other frames is in `motion_share`."""
+    """Contributions of your own factors to the joint in this frame, one entry for those of one function that
+    connect it to the same joints. Their contributions in other frames are in `motion_share`."""
     missing_factors: tuple[str, ...] = ()
-    """Functions of the user's own with which the result was solved and which were not given: shares are without
+    """The user's functions that the result was solved with and that were not given here: shares do not include
     them."""
 
     def as_dict(self) -> dict[str, Any]:

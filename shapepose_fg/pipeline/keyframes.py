@@ -1,8 +1,8 @@
-"""Keyframes: the frames in which people are followed and solved; and their rows in the frames between.
+"""Keyframes, in which people are tracked and solved, and the rows in the frames between.
 
-Between two keyframes a joint moves as the model of motion has it where nothing is measured: given places and
-velocities at both ends the mean of white noise on acceleration is a cubic. Errors of detectors last longer than
-keyframes are apart, so that the covariance is that of the ends, and of the motion that nobody looked at.
+Between two keyframes a joint moves as the motion model predicts without measurements: given positions and
+velocities at both ends, the mean under white noise on acceleration is a cubic. Errors of detectors last longer
+than the time between keyframes, so that the covariance is that of the ends, and of the unobserved motion.
 """
 
 from collections.abc import Sequence
@@ -34,8 +34,8 @@ def spaced(time_s: Array, apart_s: float) -> Mask:
 
 
 def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float) -> Mask:
-    """(T,) which frames of a recording at times (T,) are keyframes: of the wanted `frames` as few as are `apart_s`
-    apart at the most, from cut to cut; all where that is 0.
+    """(T,) which frames of a recording at times (T,) are keyframes: of the wanted `frames` as few as leave no
+    gap longer than `apart_s` between cuts; all where that is 0.
     """
     chosen = np.ones(len(time_s), dtype=bool)
     for segment in segments(frames, cuts) if apart_s > 0 else ():
@@ -47,10 +47,10 @@ def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float)
 def with_rows_between(
     rows: Reconstruction, frame: Index, time_s: Array, key: Mask, motion: MotionModel
 ) -> Reconstruction:
-    """The `rows` of keyframes, and of everybody who is in two that follow each other a row in each frame between.
+    """Add rows in the frames between keyframes, for everybody who is in both of two consecutive ones.
 
-    `frame` (F,) are frames that follow each other, at `time_s` (F,) seconds, of which `key` (F,) are keyframes.
-    New rows have no detections and no body; `motion` carries their joints. Sorted by frame and person.
+    `frame` (F,) are consecutive frames, at `time_s` (F,) seconds, of which `key` (F,) are keyframes. New rows have
+    no detections and no body; their joints come from `motion`. Sorted by frame and person.
     """
     keys = np.flatnonzero(key)
     order = np.lexsort((rows.frame, rows.person))
@@ -67,10 +67,11 @@ def with_rows_between(
 
 
 def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
-    """(T - 1,) how far any joint may be from the cubic, half way between two keyframes of a person, m.
+    """(T - 1,) standard deviation of joints from the cubic, half way between two keyframes of a person, m; the
+    largest.
 
-    `joints` and `velocity` (T, J, 3), at `times_s` (T,). It is the standard deviation under white noise on the
-    acceleration, whose density is that which makes the change from one state to the next most probable.
+    `joints` and `velocity` (T, J, 3), at `times_s` (T,). It is the deviation under white noise on the
+    acceleration, whose density is the most probable one for the change from one state to the next.
     """
     lasts_s = np.diff(times_s)[:, None, None]
     moved, turned = np.diff(joints, axis=0) - lasts_s * velocity[:-1], np.diff(velocity, axis=0)
@@ -91,7 +92,7 @@ def looked_at(rows: Reconstruction) -> Mask:
 
 
 def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionModel) -> Reconstruction:
-    """The `solved` rows, and between them, carried anew, those that `rows` have of the same people besides."""
+    """The `solved` rows, and the interpolated rows between them that `rows` have of the same people."""
     width = int(rows.frame.max(initial=0)) + 1
     order = np.lexsort((solved.frame, solved.person))
     known, asked = (each.person * width + each.frame for each in (solved.rows(order), rows))
@@ -110,7 +111,7 @@ def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionM
 def _carried(
     before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
 ) -> Reconstruction:
-    """N rows at `time_s` (N,) of the people whose rows `before` and `after` are of the keyframes around it."""
+    """N rows at `time_s` (N,) of the people whose rows in the keyframes around are `before` and `after`."""
     lasts_s = (after.time_s - before.time_s)[:, None, None]
     share = (time_s - before.time_s)[:, None, None] / lasts_s
     chord = (after.joints - before.joints) / lasts_s
@@ -148,8 +149,8 @@ def _carried(
 def cubic(
     share: Array, lasts_s: Array, places: tuple[Array, Array], speeds: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Place and velocity (...) at a `share` (...) of the `lasts_s` (...) seconds between two `places` (...), where
-    the velocities are `speeds` (...).
+    """Position and velocity (...) at a `share` (...) of the `lasts_s` (...) seconds between two `places` (...),
+    where the velocities are `speeds` (...).
     """
     way, s = places[1] - places[0], share
     first, second = (lasts_s * each - way for each in speeds)
@@ -160,11 +161,12 @@ def cubic(
 def bodies_between(
     ok: Mask, bodies: Sequence[Array], key_s: Array, time_s: Array
 ) -> tuple[Mask, tuple[Array, Array, Array, Array]]:
-    """Bodies at times `time_s` (N,) within those, rising, of given ones `key_s` (B,); and which there are, (N,).
+    """Interpolate bodies at times `time_s` (N,) between given ones at rising times `key_s` (B,); returns a mask
+    (N,), too.
 
-    `bodies` are shapes (B, 10), rotations of the root (B, 3) and of the other joints (B, 23, 3), translations
-    (B, 3); those that are not `ok` (B,) count nothing. Translations and rotations, as quaternions, are cubics with
-    the slopes that their neighbours have.
+    `bodies` are shapes (B, 10), rotations of the root (B, 3) and of the other joints (B, 23, 3), translations (B,
+    3); those that are not `ok` (B,) are ignored. Translations, and rotations as quaternions, are cubics with the
+    slopes of their neighbours.
     """
     after = np.searchsorted(key_s, time_s)
     before = np.where(key_s[after] == time_s, after, after - 1)

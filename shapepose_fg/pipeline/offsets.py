@@ -1,4 +1,4 @@
-"""Where the detector of a recording puts its joints on the body: learnt from frames spread over it."""
+"""Offsets of a detector's joints from those of the body, estimated from frames spread over a recording."""
 
 from dataclasses import fields, replace
 
@@ -24,7 +24,7 @@ from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
 _OFFSETS = "keypoint-offsets"
-"""The name under which a run keeps them."""
+"""The name under which a run stores them."""
 
 
 def estimate_offsets(
@@ -35,11 +35,11 @@ def estimate_offsets(
     times: FrameTimes | None = None,
     fitter: BodyFitter | None = None,
 ) -> KeypointOffsets:
-    """Where the detector of a recording puts its joints on the body, learnt without any truth.
+    """Estimate the offsets of a recording's detector from the joints of the body, without ground truth.
 
-    From frames spread over the recording and joints that at least three views see well; what `reconstruct` does
-    by itself. `times` are needed where cameras move. `fitter` says on which body, by default the shipped one.
-    `config.offsets.source` is not looked at.
+    Uses frames spread over the recording and joints that at least three views see well, as `reconstruct` does by
+    itself. `times` are needed where cameras move. `fitter` has the body, by default the shipped one.
+    `config.offsets.source` is ignored.
     """
     config = config or PipelineConfig()
     fitter = fitter or make_fitter(config.body)
@@ -55,7 +55,7 @@ def estimate_offsets(
 def kept_offsets(
     kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """`offsets_of`; what a run began with it goes on with."""
+    """The offsets that a run stored when it began; `offsets_of` where it has none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         with naming(kept.place(_OFFSETS), ANEW):
@@ -69,7 +69,9 @@ def kept_offsets(
 def offsets_of(
     setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """Where the detector puts its joints; None where nothing says it. ValueError where a file is of no use."""
+    """The offsets of the detector's joints; None where there is no source. ValueError where a file does not
+    fit.
+    """
     config, rig, fitter = setup.config, setup.rig, setup.fitter
     source = config.offsets.source
     if source == "none":

@@ -1,4 +1,4 @@
-"""The whole way: triangulate, vote, propose, associate; follow, solve in windows, put bodies on; rows out."""
+"""The pipeline: triangulate, propose and associate people; track them, solve windows, fit bodies; return rows."""
 
 import warnings
 from collections.abc import Sequence
@@ -55,22 +55,22 @@ def reconstruct(
     extra_factors: ExtraFactors | None = None,
     execution: Execution | None = None,
 ) -> Reconstruction:
-    """Reconstruct the people of a recording over time; with `config.temporal` false, every frame by itself.
+    """Reconstruct the people of a recording over time; with `config.temporal` false, each frame separately.
 
-    `frames` picks frames of the recording (all of them by default). `times` says when the frames were taken;
-    without it 30 frames a second are assumed, and `run` says so. `cuts` are first frames of what follows a cut:
-    nothing carries over to them, identities least of all. `shapes` are people known from other recordings.
-    `fitter` replaces the body fitter. `extra_factors`, one function or several, adds factors of your own to every
-    person's window; they may join people (docs/extending.md), and `run` says how many there were.
-    Where cameras move, their trajectories are refined first, unless `refine_trajectories` has done so.
-    `Trusted(detections, check_setup(detections, rig).trust)` leaves out cameras that contradict the others.
-    `execution` says what runs it: processes, a cluster, chunks, who is told how far it is.
+    `frames` picks frames of the recording (all of them by default). `times` are the times of the frames; without
+    it 30 frames a second are assumed, and `run` says so. `cuts` are first frames after cuts: nothing carries over
+    to them, and identities do not either. `shapes` are people known from other recordings. `fitter` replaces the
+    body fitter. `extra_factors`, one function or several, adds factors of your own to every person's window; they
+    may connect people (docs/extending.md), and `run` has their number. Where cameras move, their trajectories are
+    refined first, unless `refine_trajectories` has done so. `Trusted(detections, check_setup(detections,
+    rig).trust)` leaves out cameras that contradict the others. `execution` sets how the work is executed:
+    processes, a cluster, chunks, and a callback for progress.
 
-    In the result `person` is an identity over time (without time, the number of a person within the frame). Its
-    `run` holds the configuration, versions, seconds per stage (over all processes), how many people were found and
-    dropped, with reasons, and where the detector's joints lie on the body. That is learnt from frames spread over
-    the whole recording, whatever `frames` picks; a fitter of your own takes part if it has a `model`.
-    ValueError where an argument does not fit the recording.
+    In the result `person` is an identity over time (in separate frames, the number of a person within the frame).
+    Its `run` has the configuration, versions, seconds per stage (over all processes), numbers of people that were
+    found and dropped, with reasons, and offsets of the detector's joints from the body's. These are estimated from
+    frames spread over the whole recording, whatever `frames` picks; a fitter of your own takes part if it has a
+    `model`. ValueError where an argument does not fit the recording.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
@@ -93,12 +93,13 @@ def refine_trajectories(
     cuts: Sequence[int] = (),
     camera_factors: CameraFactors | None = None,
 ) -> Rig:
-    """The rig with its trajectories as the people have them that its cameras see, covariances in them.
+    """Refine the trajectories of moving cameras with the people that the cameras see; returns the rig, with
+    covariances.
 
-    What `reconstruct` does first where cameras move; with the rig that this returns it takes poses as they are.
-    People tell of a pose where two cameras see them that do not move together; elsewhere the odometry goes on.
-    Where no camera stands still the world is that in which the first carrier starts. `camera_factors` are your own
-    on poses. Poses of frames that stand alone (`config.temporal` false) are taken as they are.
+    `reconstruct` does this first where cameras move; given the rig that this returns, it uses the poses as they
+    are. People constrain a pose where two cameras see them that do not move together; elsewhere the odometry is
+    used. Where no camera stands still the world is that in which the first carrier starts. `camera_factors` are
+    your own on poses. Poses of separate frames (`config.temporal` false) are used as they are.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, camera_factors=camera_factors)
@@ -108,7 +109,7 @@ def refine_trajectories(
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be reconstructed: the arguments of `reconstruct`, which describes them."""
+    """The arguments of `reconstruct`, which describes them."""
 
     detections: DetectionSequence
     rig: Rig
@@ -122,7 +123,7 @@ class Task:
     camera_factors: CameraFactors | None = None
 
     def whole(self) -> tuple[range, FrameTimes, list[int]]:
-        """Frames, times and cuts, those that are not given filled in; ValueError where they do not fit."""
+        """Frames, times and cuts, with defaults for missing ones; ValueError where they do not fit."""
         if len(self.rig) < 2:
             raise ValueError(f"at least 2 cameras are needed to see depth, got {len(self.rig)}")
         count = len(self.detections)
@@ -134,7 +135,7 @@ class Task:
         return frames, times, list(check_cuts(self.cuts, count))
 
     def keyframes(self) -> Index:
-        """(K,) the frames in which people are sought: all but where they are followed in some only."""
+        """(K,) the frames in which people are searched for: all, or the keyframes."""
         frames, times, cuts = self.whole()
         apart_s = self.config.windows.keyframe_s if self.config.temporal else 0.0
         chosen = keyframes(times.frame_s, frames, cuts, apart_s)
@@ -142,10 +143,11 @@ class Task:
 
 
 def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None = None) -> Assembly:
-    """`reconstruct` whose windows leave memory for `kept` as they are solved, and whose result is made of them.
+    """`reconstruct` with windows that are stored in `kept` as they are solved, and a result that is assembled from
+    them.
 
-    What an earlier call for the same task left in `kept`, wherever it was stopped, is not done again, and the
-    result is the same to the byte.
+    Windows that an interrupted call for the same task left in `kept` are not solved again, and the result is the
+    same to the byte.
     """
     execution = Execution() if execution is None else execution
     config, rig, skeleton, chunk = task.config, task.rig, task.detections.skeleton, execution.chunk_frames
@@ -217,7 +219,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
 
 
 def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) -> Setup:
-    """The set-up with trajectories that people have corrected, where cameras move; a run keeps them."""
+    """The set-up with refined trajectories, where cameras move; a run stores them."""
     rig, config = setup.rig, setup.config
     if not unrefined(rig) or not config.temporal:
         return setup
@@ -235,12 +237,12 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
 
 
 def _fit_person(setup: Setup, person: Person) -> dict[str, Any]:
-    """One person's bodies, in whatever process."""
+    """One person's bodies, fitted in any process."""
     return person.fitted(setup.fitter)
 
 
 def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int, int]:
-    """What tracks are called when those of one person are joined over longer times out of sight."""
+    """New numbers of tracks that are joined over longer times out of sight."""
 
     def trace(track: int) -> Trace:
         pieces = tracks.own_pieces(track, ("time_s", "joints"))
@@ -250,7 +252,7 @@ def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int,
 
 
 def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:
-    """What run.json says of a run, but for what it was made from."""
+    """The entries of run.json about a run, without its inputs."""
     problems = [
         {
             "person": result.names.get(each.track, each.track),

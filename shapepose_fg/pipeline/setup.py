@@ -1,4 +1,4 @@
-"""All steps from frames to rows, made of the settings: what every process that takes part needs."""
+"""All steps from frames to rows, built from the settings: the data that every process needs."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -29,18 +29,18 @@ from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.tracking.tracker import BodyScale, Tracker
 
 FAST_M_S = 3.0
-"""The tracker predicts joints as if they moved so fast: a hand that is thrown up or strikes."""
+"""Speed of the fastest joints that the tracker's predictions cover, m/s: a hand that is thrown up or strikes."""
 UNSEEN_S = 0.3
-"""Over such gaps it must."""
+"""Longest gap without detections over which the tracker's predictions cover such joints, s."""
 _ON_TRIAL = 0.5
-"""Share of the probability asked for otherwise that is enough in frames that stand alone: a body will tell."""
+"""Share of the required probability that is enough in single frames before a body is fitted."""
 _FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
-"""Why people are dropped when detections are reassociated."""
+"""Reason for dropping people when detections are reassociated."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What all processes share: plain data, but for factors of the user's own."""
+    """The data that all processes share: plain data, except for the user's own factors."""
 
     rig: Rig
     """The cameras."""
@@ -53,14 +53,13 @@ class Setup:
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
     estimator: EstimatorConfig = field(init=False)
-    """The settings of stage II. The model of motion is in it and goes along: other processes need not know its
-    name."""
+    """The settings of stage II, with the motion model: other processes need not know its name."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "estimator", replace(self.config.estimator, joints=self.skeleton.joints))
 
     def solve(self, span: Span) -> Part:
-        """One window, in whatever process: the rows of its own frames, by frame and person, and notes on them."""
+        """Solve one window, in any process: the rows of its own frames, by frame and person, and notes on them."""
         every = [frame for frame, _ in span.decided]
         given = [frame for frame in every if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
@@ -114,7 +113,7 @@ class Setup:
         return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
 
     def _result(self, solution: WindowSolution, given: Sequence[Input], rig: Rig) -> Reconstruction:
-        """The rows of a solution, which detections they are made of by their places in `given`."""
+        """The rows of a solution, with the indices of their detections in `given`."""
         frame, candidate = solution.observations.frame, solution.observations.candidate
         detections = {each.frame: each.detections for each in given}
         place = np.full(candidate.shape, -1, dtype=np.int32)
@@ -124,7 +123,7 @@ class Setup:
         return solution.result(place, rig, self.skeleton.joints)
 
     def engine(self, book: Notebook) -> Engine:
-        """Follows people; what it has to say goes into `book`."""
+        """The tracker and its windows; notes are written to `book`."""
         config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
         sure = StageOne(skeleton, config.candidates, config.proposals, book)
         # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
@@ -142,7 +141,9 @@ class Setup:
 
 
 def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:
-    """Statuses (N,) where some frames' cameras are doubted: of rows that have no two others for `LEAST_JOINTS`."""
+    """Statuses (N,) where cameras are doubted in some frames: of rows without two other views for
+    `LEAST_JOINTS`.
+    """
     used = solution.inlier.copy()
     for row, frame in enumerate(solution.observations.frame.tolist()):
         used[row][:, list(doubted.get(frame, ()))] = False
@@ -153,5 +154,5 @@ def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -
 
 
 def find_people(detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig) -> Observations:
-    """Stage I, one frame: the people's 2D observations and where their joints are to begin with."""
+    """Stage I, one frame: the people's 2D observations and their initial joints."""
     return StageOne(skeleton, config.candidates, config.proposals, Notebook())(detections, rig)

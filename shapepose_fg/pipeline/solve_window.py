@@ -1,4 +1,4 @@
-"""Stage II on one page: a window of frames, from whose detections are whose to joints, bodies and graphs."""
+"""Stage II on one page: from a window of frames with assigned detections to joints, bodies and graphs."""
 
 import time
 from collections.abc import Sequence
@@ -27,23 +27,23 @@ from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
 _SETTLED = 0.002
-"""Detections are not assigned again when fewer than this share of them changed: in crowds before six cameras after
-three or four rounds, before three after eight or more."""
+"""Share of changed detections below which reassociation ends: in crowds before six cameras after three or four
+rounds, before three after eight or more."""
 
 
 @dataclass(frozen=True)
 class Assigning:
-    """What detections are assigned again from, around drafts."""
+    """The data for reassociation around initial estimates."""
 
     frames: Sequence[Input]
     """All detections of the window's frames."""
     skeleton: Skeleton
     """The detector's joints."""
     rounds: int
-    """How often."""
+    """Maximum number of rounds."""
     over_time: bool
-    """Whether people are the same from frame to frame. If not, each round asks more of who stays
-    (`LEAST_PROBABILITY`)."""
+    """Whether people are the same from frame to frame. If not, each round demands a higher probability of
+    people (`LEAST_PROBABILITY`)."""
 
 
 def solve_window(
@@ -60,11 +60,11 @@ def solve_window(
     Rows of one track at several frames are a window, one factor graph; a row whose track has no other is the
     frame-by-frame method, and with `EstimatorConfig` of the paper its Algorithm 1. `views` are the cameras, row by
     row if they move. `extra_factors`, one function or several, add factors of your own to every window. Without
-    `assigning` detections stay with whom they are.
+    `assigning` detections keep their people.
 
-    In each round the body is fitted to what the views alone say of all joints, and then pulls the joints. What it
-    says of a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is counted twice.
-    Motion acts on the joints, never on what the body is fitted to.
+    In each round the body is fitted to the estimates of all joints from the views alone, and then constrains the
+    joints. Its constraint on a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is
+    counted twice. Motion constrains the joints, never the targets of the body.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
         raise ValueError(
@@ -73,7 +73,7 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    # Assign: detections go to whom a draft of joints and bodies puts near them, round by round.
+    # Assign: detections go to the person whose initial joints and body are near them, round by round.
     drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None

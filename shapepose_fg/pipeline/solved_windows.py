@@ -1,4 +1,4 @@
-"""The windows of a recording, solved, in order: its people are followed here, or chunk by chunk in any process."""
+"""The solved windows of a recording, in order: people are tracked in this process, or chunk by chunk in others."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -23,34 +23,34 @@ from shapepose_fg.proposal.thinning import ThinnedFrames
 
 @dataclass(frozen=True)
 class SolvedWindows:
-    """The windows of a recording: where they come from, and who solves them."""
+    """The windows of a recording: their source, and their solution."""
 
     setup: Setup
-    """What all processes share."""
+    """The data that all processes share."""
     detections: ThinnedFrames
-    """What the cameras saw."""
+    """Detections of the recording."""
     pictures: WithoutRepeats
     """The recording before it was thinned, without repeated pictures."""
     times: FrameTimes
-    """When."""
+    """Times of the frames."""
     frames: range
     """The frames that are wanted."""
     cuts: Sequence[int]
-    """First frames of what follows a cut."""
+    """First frames after cuts."""
     keyframes: Index
-    """The frames in which people are sought, rising."""
+    """(K,) the keyframes, in which people are searched for, rising."""
     book: Notebook
-    """Where this process takes its notes."""
+    """Collects the notes of this process."""
     _rigs: dict[tuple[tuple[int, ...], ...], Rig] = field(default_factory=dict, init=False)
-    """The cameras, by which of them have no picture, and which are doubted."""
+    """The cameras, by the views without a picture and the doubted views."""
 
     @cached_property
     def _time_s(self) -> Array:
-        """(T, V) when each view took each frame."""
+        """(T, V) times at which the views took the frames, seconds."""
         return self.times.of_views(len(self.setup.rig))
 
     def read(self, frame: int) -> Input:
-        """What the cameras give of a frame; between keyframes it is not thinned."""
+        """The input of a frame; between keyframes it is not thinned."""
         key = _among(frame, self.keyframes)
         with self.book.stage("read"):
             thinned = self.detections.is_thinned(frame)
@@ -88,7 +88,7 @@ class SolvedWindows:
             yield replace(part, checkpoint=behind)
 
     def _followed(self, begin: Checkpoint) -> Iterator[tuple[Span, Checkpoint | None]]:
-        """The windows as far as their people have been followed, and from where following goes on behind some."""
+        """The windows as far as their people are tracked, some with the state with which tracking continues."""
         config, engine = self.setup.config, self.setup.engine(self.book)
         next_id = begin.next_id
         for segment in segments(self.frames, self.cuts):
@@ -139,19 +139,19 @@ class SolvedWindows:
 
 
 def _among(frame: int, frames: Index) -> bool:
-    """Whether a frame is one of those, which rise."""
+    """Whether `frame` is one of the rising `frames`."""
     at = int(np.searchsorted(frames, frame))
     return at < len(frames) and frames[at] == frame
 
 
 @dataclass(frozen=True)
 class SolvedChunk:
-    """A chunk that is done; its tracks count from 0."""
+    """A solved chunk; its tracks count from 0."""
 
     parts: tuple[Part, ...]
-    """Its windows."""
+    """Windows of the chunk."""
     notes: Notes
-    """What is to be said about following its people."""
+    """Notes about tracking its people."""
     begins: Border
     """Tracks at the beginning of the chunk."""
     ends: Border
@@ -159,10 +159,10 @@ class SolvedChunk:
 
 
 def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk:
-    """Follow people through a chunk and solve its windows, in whatever process.
+    """Track people through a chunk and solve its windows, in any process.
 
-    With the chunk goes what the cameras gave from `chunk.first` on. RuntimeError where these are not the frames
-    of the chunk, each once.
+    The job has the input of all frames from `chunk.first` on. RuntimeError where these are not the frames of the
+    chunk, each once.
     """
     chunk, given = job
     book = Notebook()

@@ -1,4 +1,4 @@
-"""Rows of a result solved anew from their own observations: after corrections by hand, and for their graphs."""
+"""Solves rows of a result again from their own observations: after corrections by hand, and for their graphs."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from shapepose_fg.pipeline.windows import near_border, window_stop
 
 @dataclass(frozen=True)
 class Solver:
-    """What rows of a result are solved anew with."""
+    """The data for solving rows of a result again."""
 
     rig: Rig
     """The cameras, in the order of the observations' views."""
@@ -43,7 +43,7 @@ class Solver:
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, run_file: Path = Path("run.json")) -> "Solver":
-        """What a result before these cameras was solved with; InputError where its `run_file` does not say it."""
+        """The data for a result of these cameras; InputError where its `run_file` does not have them."""
         configuration = people.run.get("configuration")
         if not isinstance(configuration, dict):
             raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
@@ -67,10 +67,10 @@ class Solver:
 
 
 def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None = None) -> Reconstruction:
-    """Some people of a result solved anew, each over all of their rows, in the windows of the whole recording.
+    """Solve some people of a result again, each over all of their rows, in the windows of the whole recording.
 
-    Detections stay with whom they were given; gates are decided anew. `extra_factors` are factors of your own, for
-    which `window.track` is the result's person. ValueError where `rows` do not say what they were solved from.
+    Detections keep their people; gates are decided again. `extra_factors` are factors of your own, for which
+    `window.track` is the result's person. ValueError where `rows` have no observations.
     """
     parts, keyframe_s = [], solver.config.windows.keyframe_s
     motion = MotionModel.load(tuple(rows.joint_names.tolist()), solver.config.motion)
@@ -90,12 +90,12 @@ def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors
 def window_solutions(
     people: Reconstruction, rig: Rig, *, extra_factors: ExtraFactors | None = None
 ) -> Iterator[PersonGraph]:
-    """Every person of every window of a result as one graph, whose values and marginals are the result's.
+    """Every person of every window of a result as one graph, with the values and marginals of the result.
 
-    Joints and covariances are those of `people`; the graph below is solved anew from their observations, before
-    the cameras `rig`, in the order of the views. With `extra_factors`, which know people as the result does
-    (`window.track`), joints and covariances are of the graph. Windows overlap: frames near a border are in two.
-    InputError where `people.run` does not say the settings, ValueError where there are no observations.
+    Joints and covariances are those of `people`; the graphs are solved again from their observations, with the
+    cameras `rig`, in the order of the views. With `extra_factors`, whose `window.track` is the result's person,
+    joints and covariances are those of the graph. Windows overlap: frames near a border are in two. InputError
+    where `people.run` has no settings, ValueError where there are no observations.
     """
     solver = Solver.of(people, rig)
     for _, part, solution in _solved(people, solver, extra_factors):
@@ -107,8 +107,8 @@ def window_solutions(
 def solved_around(
     people: Reconstruction, solver: Solver, person: int, frame: int, extra_factors: ExtraFactors | None = None
 ) -> PersonGraph | None:
-    """Somebody's graph of the window that has this frame, solved anew from the person's own observations; None
-    where nothing is in it. With `extra_factors` everybody in the window is solved. The observations must be there.
+    """The graph of a person's window that has this frame, solved again from the person's own observations; None
+    where it is empty. With `extra_factors` all people in the window are solved. The observations must be there.
     """
     if extra_factors is None:
         people = people.rows(people.person == person if solver.config.temporal else people.frame == frame)
@@ -122,8 +122,8 @@ def _solved(
     extra_factors: ExtraFactors | None,
     frame: int | None = None,
 ) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
-    """Each window of the recording, or that of one `frame`: its own frames, and its rows with those around it,
-    solved.
+    """Solve each window of the recording, or that of one `frame`; yields its own frames, its rows with those
+    around it, and their solution.
     """
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
@@ -137,7 +137,7 @@ def _solved(
         if config.windows.keyframe_s > 0:
             part = part.rows(looked_at(part))
         assert part.observations is not None
-        # From the views: the joints as they are may be somebody else's.
+        # From the views: the joints as they are may belong to another person.
         observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
         views = Views.of(rig, observations.time_s)
         found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
@@ -145,7 +145,7 @@ def _solved(
 
 
 def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
-    """InputError where rows are not those of people over time: files may have been changed by hand."""
+    """InputError where rows are not those of people over time: files may have been edited by hand."""
     order = np.lexsort((rows.frame, rows.person))
     person, frame, time_s = (each[order] for each in (rows.person, rows.frame, rows.time_s))
     same = np.diff(person) == 0
@@ -177,7 +177,7 @@ def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float)
 def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, range]]:
     """The windows that have any of `rows`: their own frames, and those from one cut to the next around them.
 
-    As the recording was cut into them; frame by frame, each frame.
+    Windows are those in which the recording was solved; frame by frame, each frame is one.
     """
     if not config.temporal:
         return [(frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())]

@@ -1,8 +1,8 @@
-"""Where the cameras of a recording that move went: their odometry, corrected by the people that they see.
+"""Trajectories of moving cameras: their odometry, corrected by the people that they see.
 
-People are followed with the poses as they are corrected so far; each window's people and poses are solved together
+People are tracked with the poses as corrected so far; each window's people and poses are solved together
 (`estimation/trajectory_graph.py`), and at the end the poses of the whole recording in one graph, in which each
-window's people stand as what they say of the poses.
+window's people are replaced by their marginal on the poses.
 """
 
 from collections.abc import Iterator
@@ -25,18 +25,18 @@ from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import Span
 
 _SAME_S = 1e-4
-"""Poses nearer to a frame than this are not kept beside the frame's own."""
+"""Time within which a pose of the odometry coincides with a frame, s; it is then left out."""
 _KEPT = "trajectories"
-"""The name under which a run keeps them, and the number of each behind it."""
+"""Prefix of the names under which a run stores trajectories, followed by their number."""
 
 
 def unrefined(rig: Rig) -> bool:
-    """Whether cameras move whose trajectories people have not corrected yet."""
+    """Whether there are moving cameras whose trajectories have not been refined yet."""
     return rig.moves and not all(each.refined for each in rig.trajectories)
 
 
 def kept_rig(kept: KeptArrays, rig: Rig) -> Rig | None:
-    """The rig with the trajectories that a run has kept; None where it has none yet, or needs none."""
+    """The rig with the trajectories that a run has stored; None where it has none yet, or needs none."""
     if not rig.moves:
         return None
     found = []
@@ -51,7 +51,7 @@ def kept_rig(kept: KeptArrays, rig: Rig) -> Rig | None:
 
 
 def keep(kept: KeptArrays, rig: Rig) -> None:
-    """What `kept_rig` gives."""
+    """Store the trajectories for `kept_rig`."""
     for number, each in enumerate(rig.trajectories):
         kept.keep(
             f"{_KEPT}-{number}",
@@ -60,7 +60,7 @@ def keep(kept: KeptArrays, rig: Rig) -> None:
 
 
 def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) -> Rig:
-    """The rig of `windows` with trajectories as the people of the recording have them, and their covariances."""
+    """The rig of `windows` with trajectories refined by the people of the recording, and their covariances."""
     rig, time_s = windows.setup.rig, windows.times.of_views(len(windows.setup.rig))
     frames = np.arange(windows.frames.start, windows.frames.stop)
     if len(frames) < 2:
@@ -84,7 +84,7 @@ def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) 
 
 
 def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
-    """What run.json says of trajectories: cameras, way, how far people corrected them, how sure they are."""
+    """The entry of run.json about trajectories: cameras, length, corrections, standard deviations."""
     told = []
     for number, (old, new) in enumerate(zip(given.trajectories, refined.trajectories, strict=True)):
         cameras = [name for name, on in zip(given.names, given.carrier, strict=True) if on == number]
@@ -109,28 +109,28 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
 
 @dataclass
 class _Pass:
-    """Through the recording once, window by window."""
+    """One pass through the recording, window by window."""
 
     windows: SolvedWindows
     """The recording."""
     time_s: Array
-    """(T, V) when each view took each frame."""
+    """(T, V) times at which the views took the frames, seconds."""
     camera_factors: CameraFactors | None
-    """The user's own."""
+    """The user's own factors on camera poses."""
     correction: Array = field(init=False)
-    """(B, 4, 4) from where the odometry has each carrier to where it is, in the world, so far."""
+    """(B, 4, 4) current correction of each carrier: from its odometry pose to its pose in the world."""
     _before: gtsam.NonlinearFactorGraph | None = None
-    """What is known of the last poses of the last window; None before the first."""
+    """Marginal on the last poses of the last window; None before the first."""
 
     def __post_init__(self) -> None:
         self.correction = np.tile(np.eye(4), (len(self.windows.setup.rig.trajectories), 1, 1))
 
     def corrected(self, odometry: Array) -> Array:
-        """(T, B, 4, 4) poses as the odometry has them, corrected by what is known so far."""
+        """(T, B, 4, 4) poses of the odometry with the current correction."""
         return self.correction @ odometry
 
     def graphs(self) -> Iterator[TrajectoryGraph]:
-        """Each window's people and poses, solved."""
+        """People and poses of each window, solved."""
         windows, setup = self.windows, self.windows.setup
         engine, last = setup.engine(windows.book), None
         for segment in segments(windows.frames, windows.cuts):
@@ -147,7 +147,7 @@ class _Pass:
                         yield graph
 
     def _rig(self) -> Rig:
-        """The rig as it is corrected so far."""
+        """The rig with the current correction."""
         rig = self.windows.setup.rig
         moved = [
             replace(each, wTb=correction @ each.wTb)
@@ -156,7 +156,7 @@ class _Pass:
         return replace(rig, trajectories=tuple(moved))
 
     def _solved(self, span: Span, last: int | None) -> TrajectoryGraph:
-        """A window's own frames, and the `last` one before them, whose poses are known."""
+        """Solve a window's own frames, and the `last` one before them, whose poses are known."""
         setup = self.windows.setup
         own = span.decided[span.start : span.stop]
         frames = np.array([*([] if last is None else [last]), *(frame.frame for frame, _ in own)])
@@ -180,7 +180,7 @@ class _Pass:
 
 
 def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """What a solved window knows of its last poses, each carrier by itself."""
+    """Marginal of a solved window on its last poses, each carrier separately."""
     both, values = gtsam.NonlinearFactorGraph(anchors), gtsam.Values()
     for factor in graph.of_poses():
         both.push_back(factor)
@@ -194,7 +194,9 @@ def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam
 
 
 def _smoothed(whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFactor]) -> tuple[Array, Array]:
-    """(T, B, 4, 4) the poses of all frames in one graph, from `poses` on, and their covariances (T, B, 6, 6)."""
+    """(T, B, 4, 4) the poses of all frames in one graph, starting at `poses`, and their covariances (T, B, 6,
+    6).
+    """
     graph, values, keys = gtsam.NonlinearFactorGraph(), gtsam.Values(), whole.keys()
     for key, pose in zip(keys.ravel().tolist(), poses.reshape(-1, 4, 4), strict=True):
         values.insert(key, gtsam.Pose3(pose))

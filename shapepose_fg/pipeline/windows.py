@@ -1,7 +1,7 @@
-"""Frames in, windows out: people are followed, and wait to be solved in windows of frames that overlap.
+"""From frames to windows: people are tracked, and wait to be solved in windows of frames that overlap.
 
-`Engine.follow` goes from (frames, state) to (windows, state): it is quick, and memory does not grow with the
-recording. Windows know nothing of each other, and are solved here or in other processes (`Setup.solve`).
+`Engine.follow` maps (frames, state) to (windows, state): it is quick, and memory does not grow with the recording.
+Windows are independent of each other, and are solved here or in other processes (`Setup.solve`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,66 +25,70 @@ from shapepose_fg.tracking.tracker import Tracker
 
 
 def window_stop(start: int, end: int, frames: int) -> int:
-    """Where the window that begins at `start` stops, of `frames` frames, in a segment that ends before `end`.
+    """The end of the window that begins at `start`, of `frames` frames, in a segment that ends before `end`.
 
-    The last takes up to half a window more: one of a few frames would know its people less well than the others.
+    The last one is longer by up to half a window: a window of a few frames would determine its people less well.
     """
     stop = start + frames
     return stop if stop + frames // 2 < end else end
 
 
 def near_border(times_s: Array, border_s: float, overlap_s: float) -> Mask:
-    """(T,) which frames, at `times_s` (T,), are so near to the border between two windows that both have them."""
+    """(T,) which frames, at `times_s` (T,), are so near to the border between two windows that both include
+    them.
+    """
     return np.abs(times_s - border_s) <= overlap_s
 
 
 @dataclass(frozen=True)
 class Span:
-    """Frames whose people are known, and wait to be solved; nothing else is needed for it."""
+    """Frames with assigned detections that wait to be solved."""
 
     decided: tuple[Decided, ...]
-    """The frames with their rows, and before and after them those that a window overlaps."""
+    """The frames with their rows, with those before and after that the window includes."""
     start: int
-    """The first of `decided` whose rows are to be returned."""
+    """Index of the first of `decided` whose rows are returned."""
     stop: int
-    """The one after the last."""
+    """Index after the last."""
     alone: bool = False
-    """Whether every frame is a recording of its own."""
+    """Whether every frame is solved separately."""
     rig: Rig | None = None
-    """The cameras, where these are not known beforehand: they move, and it is said as it comes where to."""
+    """The cameras, where they move and their poses arrive with the frames; None where they are known
+    beforehand."""
 
 
 @dataclass(frozen=True)
 class StreamState:
-    """What is carried from call to call."""
+    """State that is carried from call to call."""
 
     follow: FollowState
-    """The tracks, and the frames that are not decided."""
+    """The tracks, and the frames whose detections are not assigned yet."""
     decided: tuple[Decided, ...] = ()
-    """Frames that wait to be solved, and before them those that the next window overlaps."""
+    """Frames that wait to be solved, and before them those that the next window includes."""
     before: int = 0
-    """How many of `decided` have been returned already."""
+    """Number of frames of `decided` that have been returned already."""
 
 
 @dataclass(frozen=True)
 class Engine:
-    """From frames to windows whose people are known."""
+    """From frames to windows with tracked people."""
 
     tracker: Tracker
-    """Follows people; finds new ones."""
+    """Tracks people and finds new ones."""
     config: PipelineConfig
-    """What becomes of tracks, and how frames are cut into windows."""
+    """Settings of tracks and windows."""
 
     def start(self, next_id: int = 0) -> StreamState:
-        """Before the first frame, or after a cut; identities count from `next_id`."""
+        """State before the first frame, or after a cut; identities count from `next_id`."""
         return StreamState(FollowState(self.tracker.nobody(), next_id))
 
     def follow(
         self, state: StreamState, frames: Iterable[Input], *, last: bool = False
     ) -> tuple[list[Span], StreamState]:
-        """Take in `frames`: the windows that can be solved now, each by itself, in any process.
+        """Track people through `frames`; returns the windows that can be solved now, each separately, in any
+        process.
 
-        With `last` the recording ends, or is cut, behind them.
+        With `last` the recording ends, or is cut, after them.
         """
         following, decided = state.follow, list(state.decided)
         for frame in frames:
@@ -102,7 +106,7 @@ class Engine:
         return spans, StreamState(following, tuple(decided), before)
 
     def alone(self, frames: Iterable[Input]) -> Span:
-        """Frames that have nothing to do with each other, in one window because bodies are fitted fastest so."""
+        """Independent frames in one window, because bodies are fitted fastest together."""
         decided, people = list[Decided](), 0
         for frame in frames:
             decided.append(alone(self.tracker, frame, people))
@@ -110,7 +114,7 @@ class Engine:
         return Span(tuple(decided), 0, len(decided), alone=True)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
-        """Where the next window's own frames stop, and where it ends; None where there is too little."""
+        """The end of the next window's own frames, and of the window; None where there are too few frames."""
         stop = window_stop(before, len(decided), self.config.batch_frames)
         if stop < len(decided):
             end = self._overlap(decided, stop, 1)
@@ -119,16 +123,17 @@ class Engine:
         return (len(decided), len(decided)) if last and len(decided) > before else None
 
     def _overlap(self, decided: Sequence[Decided], at: int, direction: int) -> int:
-        """The frame `shared_s` before or after the border at `at`."""
+        """Index of the frame `shared_s` before or after the border at `at`."""
         times = np.array([frame.time_s.mean() for frame, _ in decided])
         near = near_border(times, times[min(at, len(times) - 1)], self.config.windows.shared_s)
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1
 
 
 def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: PipelineConfig) -> list[Span]:
-    """The parts of a span that must be solved anew, with another keyframe where a joint strays from its curve.
+    """The parts of a span that must be solved again, with a further keyframe where a joint deviates from its
+    curve.
 
-    `solved` are the rows of the span's keyframes, `between` has those that motion carries.
+    `solved` are the rows of the span's keyframes, `between` has those that were interpolated.
     """
     given, rows = [each for each, _ in span.decided], solved.observations
     number, time_s = np.array([each.frame for each in given]), np.array([each.time_s.mean() for each in given])

@@ -1,4 +1,4 @@
-"""Worker processes: the same work for many items, here or side by side, in order, with the same result.
+"""Worker processes: run one function on many items, here or in parallel, in order, with the same result.
 
 Everything is a `concurrent.futures.Executor`: this process (`Here`), processes of this machine (`Processes`, by
 loky, which need no importable `__main__`), or those of a Dask cluster (`pipeline/cluster.py`).
@@ -33,22 +33,22 @@ _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NU
 """Environment of worker processes: one thread each for linear algebra; loky must not restart a worker whose memory
 grows, because recordings differ in size."""
 _LOOK_S = 0.5
-"""Interval at which a worker looks whether the process that started it is alive, s."""
+"""Interval at which a worker checks whether the process that started it is alive, s."""
 
 
 @dataclass(frozen=True)
 class Pool(Generic[Shared]):
-    """Does the same work for many items by an executor, each time with what is `shared`."""
+    """Runs one function on many items in an executor, each time with `shared`."""
 
     executor: Executor
-    """Who does it."""
+    """The executor."""
     call: tuple[Any, ...]
-    """A function, and its first arguments; the work and the item are the last two."""
+    """A function and its first arguments; the last two are the work and the item."""
     under_way: Callable[[], float]
-    """How many items may be submitted at a time: enough that nobody waits, few enough to bound memory."""
+    """Maximum number of submitted items: enough to keep all processes busy, few enough to bound memory."""
 
     def submit(self, work: Callable[[Shared, Item], Result], item: Item) -> Future[Result]:
-        """`work(shared, item)`; it is done on return where there are no further processes."""
+        """Submit `work(shared, item)`; it is done on return where there are no further processes."""
         with naming_lost_work():
             return self.executor.submit(*self.call, work, item)
 
@@ -95,7 +95,7 @@ class Here(Executor):
 
 
 class Processes(Executor):
-    """An executor of further processes, which start at once, ignore Ctrl-C, and end with the one that made it."""
+    """An executor of further processes, which start at once, ignore Ctrl-C, and end with this process."""
 
     def __init__(self, count: int, initializer: Callable[..., object], *arguments: Any) -> None:
         """Each of `count` processes calls `initializer(*arguments)` first; it must be in an importable module."""
@@ -109,13 +109,13 @@ class Processes(Executor):
         return self._pool.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
-        """End the processes, whatever they are at: what is wanted of them has been waited for."""
+        """End the processes, also those that are busy."""
         self._pool.shutdown(wait=wait, kill_workers=True)
 
 
 @contextmanager
 def naming_lost_work() -> Iterator[None]:
-    """`WorkLost` where a process dies in the block."""
+    """Raise `WorkLost` where a process ends in the block."""
     try:
         yield
     except BrokenProcessPool as error:
@@ -137,18 +137,20 @@ def packed(shared: object) -> bytes:
 
 
 def suitable_workers(items: int, worth: int) -> int:
-    """One for each core that this process may use, but no more than pay: `worth` items each."""
+    """Number of workers for this many items, at most one per core that this process may use and one per `worth`
+    items.
+    """
     return max(1, min(cores(), items // worth))
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def _ctrl_c_blocked() -> Iterator[None]:
-    """Processes that start in the block do not get Ctrl-C, which a terminal sends to all: this one ends them."""
+    """Processes that start in the block ignore Ctrl-C, which a terminal sends to all: this process ends them."""
     # Python's own helper of such processes lets the signal through again when it starts: it has to run by then.
     resource_tracker.ensure_running()
     can_block = hasattr(signal, "pthread_sigmask")
@@ -161,25 +163,25 @@ def _ctrl_c_blocked() -> Iterator[None]:
 
 
 _shared: Any = None
-"""In a worker process: what all its work shares, or why it cannot be had here."""
+"""The shared data of a worker process, or the reason why it is missing."""
 
 
 def _begin(parent: int, initializer: Callable[..., object], *arguments: Any) -> None:
-    """What a process does first."""
+    """Initialise a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     initializer(*arguments)
 
 
 def _end_with(parent: int) -> None:
-    """End this process, whatever it is at, when the one that started it has ended, were it killed."""
+    """End this process, also if it is busy, when the one that started it has ended, even if killed."""
     while os.getppid() == parent:
         time.sleep(_LOOK_S)
     os._exit(1)
 
 
 def _keep(content: bytes) -> None:
-    """Unpack what all work shares; it was packed by this program a moment ago."""
+    """Unpack the shared data, which this program packed."""
     global _shared
     try:
         _shared = cloudpickle.loads(content)

@@ -7,7 +7,7 @@ import numpy as np
 from shapepose_fg.core.trust import Spell, Trust
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import Others, match
+from shapepose_fg.setup_check.fit import match
 
 _WORSE = 0.2
 """A camera is left out whose score is so much lower than it would be if it was right: it sees people 3 % of their
@@ -47,8 +47,7 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
 def _worse(given: Look, right: Look, view: int, frames: range) -> bool:
     """Whether a camera sees people of the others far from where it would if it was right."""
     others = right.others(view)
-    here = (others.frame >= frames.start) & (others.frame < frames.stop)
-    others = Others(others.frame[here], others.points[here])
+    others = others.rows((others.frame >= frames.start) & (others.frame < frames.stop))
     was, now = (
         match(others, look.seen_by(view, every_frame=True), look.camera(view)).score for look in (given, right)
     )

@@ -14,7 +14,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import triangulate
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q
+from shapepose_fg.setup_check.fit import TURN, Q, by_parameters, seen_by
 from shapepose_fg.setup_check.matching import median_over
 
 LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
@@ -62,13 +62,15 @@ class Residuals:
 
     @classmethod
     def of(cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index) -> "Residuals":
-        """Of what is `observed`. Weights are by how far a residual is from its median over the person's frames."""
+        """Make residuals of what is `observed`. Weights are by how far a residual is from its median over the
+        person's frames.
+        """
         xy, confidence, size = seen
         scale, lasting = np.nan_to_num(size, nan=1.0)[:, None, :, None], np.zeros_like(xy)
         for _ in range(4):
             structure = triangulate(xy - lasting, confidence, size, views, 4)
             used = (structure.weight > 0) & np.isfinite(structure.miss_px) & (structure.depth > 0)
-            away = (xy - lasting - _seen(structure.points, views)[0]) / scale
+            away = (xy - lasting - seen_by(structure.points, views)[0]) / scale
             away[~used] = np.nan
             for each in range(_count(person)):
                 mine = person == each
@@ -116,7 +118,7 @@ class Residuals:
         N, J, V = self.weight.shape
         points, root = self.points, np.sqrt(self.weight)[..., None, None]
         for _ in range(3):
-            projected, at, by_point = _seen(points, views)
+            projected, at, by_point = seen_by(points, views)
             r = (self.xy - projected)[..., None] * root
             A = (by_point @ views.cTw[:, :, :3] * root).reshape(N, J, 2 * V, 3)
             H = A.swapaxes(2, 3) @ A
@@ -126,11 +128,9 @@ class Residuals:
         there = self.weight[..., None] > 0
         middle = np.where(there, self.xy, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
         rows, bias = np.zeros((N, J, V, 2, V * (Q + 3) + 1)), V * Q
+        of_cameras = by_parameters(projected, at, by_point, views)
         for v in range(V):
-            of_camera = rows[:, :, v, :, v * Q : v * Q + Q]
-            of_camera[..., TURN] = np.cross(at[:, :, v, None], by_point[:, :, v])
-            of_camera[..., MOVE], of_camera[..., CENTRE] = by_point[:, :, v], np.eye(2)
-            of_camera[..., FOCAL] = (projected[:, :, v] - views.K[v, :2, 2])[..., None]
+            rows[:, :, v, :, v * Q : v * Q + Q] = of_cameras[:, :, v]
             rows[:, :, v, :, bias + 2 * v : bias + 2 * v + 2] = np.eye(2) * self.size_px[:, None, v, None, None]
             rows[:, :, v, :, bias + 2 * V + v] = self.xy[:, :, v] - middle[:, None, v]
         rows[..., -1:] = self.xy[..., None] - projected[..., None]
@@ -192,11 +192,3 @@ class Residuals:
 
 def _count(number: Index) -> int:
     return int(number.max(initial=-1)) + 1
-
-
-def _seen(points: Array, views: Views) -> tuple[Array, Array, Array]:
-    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and derivatives."""
-    at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
-    at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])
-    xy = np.einsum("vab,njvb->njva", views.K[:, :2], at / at[..., 2:])
-    return xy, at, (views.K[:, :2] - xy[..., None] * views.K[:, None, 2]) / at[..., 2, None, None]

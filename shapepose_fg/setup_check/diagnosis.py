@@ -3,7 +3,7 @@
 Duplicates, the people's build and the sizes of pictures are told without comparing places.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Axis, Camera, Rig
+from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.trust import BELIEVED, Trust
@@ -62,44 +62,42 @@ def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
 def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> bool:
     """Whether two cameras saw the same pixels; as the pictures were, with the bend of their lenses."""
     every = evidence.sightings
-    every = every.only(np.isin(every.frame, evidence.anchors))
-    one, other = (every.only(every.view == view) for view in (first, second))
+    every = every.rows(np.isin(every.frame, evidence.anchors))
+    one, other = (every.rows(every.view == view) for view in (first, second))
     if min(len(one), len(other)) < 5:
         return False
     i, j = same_frame(one.frame, other.frame)
-    raw = [_distorted(seen.xy, rig.cameras[view]) for seen, view in ((one, first), (other, second))]
-    distance = np.linalg.norm(raw[0][i] - raw[1][j], axis=-1)
+    raw = [rig.cameras[view].distort(seen.xy.reshape(-1, 2)) for seen, view in ((one, first), (other, second))]
+    distance = np.linalg.norm(raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1)
     there = ~np.isnan(distance)
     alike = (there & (distance < _SAME_PX)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
     alike &= there.sum(axis=1) >= 3
     return bool(len(np.unique(i[alike])) >= _SAME_SHARE * len(one))
 
 
-def _distorted(xy: Array, camera: Camera) -> Array:
-    seen = ~np.isnan(xy[..., 0])
-    raw = np.full_like(xy, np.nan)
-    raw[seen] = camera.distort(xy[seen])
-    return raw
-
-
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
     """Cameras whose videos, or pictures, are not of the calibrated size; `given` as `find_footage` takes it."""
-    found = []
-    for view, path in enumerate(find_footage(given, rig.names)[0]):
-        is_video = path.suffix.lower() in VIDEOS and path.is_file()
-        width, height = glance(path)[0] if is_video else open_footage(path).size
-        if (width, height) != rig.cameras[view].image_size:
-            found.append(Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(width), float(height)),)))
-    return tuple(found)
+    return _unlike(
+        {
+            name: glance(path)[0] if path.suffix.lower() in VIDEOS and path.is_file() else open_footage(path).size
+            for name, path in zip(rig.names, find_footage(given, rig.names)[0], strict=True)
+        },
+        rig,
+    )
 
 
 def detected_sizes(file: Path, rig: Rig) -> tuple[Finding, ...]:
     """Cameras that `detect` was told another calibrated size of, by the footage.json that it wrote."""
-    sizes = {each.name: each.placement.calibrated_size for each in read_used_footage(file)}
+    return _unlike({each.name: each.placement.calibrated_size for each in read_used_footage(file)}, rig)
+
+
+def _unlike(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> tuple[Finding, ...]:
+    """Cameras whose pictures have other `sizes`, by name, than the calibrated."""
+    found = [(view, sizes.get(each.name, each.image_size)) for view, each in enumerate(rig.cameras)]
     return tuple(
-        Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(sizes[each.name][0]), float(sizes[each.name][1])),))
-        for view, each in enumerate(rig.cameras)
-        if sizes.get(each.name, each.image_size) != each.image_size
+        Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(width), float(height)),))
+        for view, (width, height) in found
+        if (width, height) != rig.cameras[view].image_size
     )
 
 
@@ -191,23 +189,30 @@ class Diagnosis:
     """Which cameras a reconstruction is better without."""
 
 
-def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
-    """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
-    evidence = gather(detections, range(len(detections)) if frames is None else frames, len(rig))
+def put_right(detections: DetectionSequence, rig: Rig, frames: range) -> tuple[Look, Look, list[Finding]]:
+    """The set-up as it is given, the same with gross mistakes of cameras put right, and these mistakes."""
+    evidence = gather(detections, frames, len(rig))
     given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
     findings += _blind(given) + _stopped(given)
     look = given if evidence is given.evidence else replace(given, evidence=evidence)  # what it found stays
-    if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
-        return Diagnosis(tuple(findings), given, look)
-    rng = np.random.default_rng(0)
-    while len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
+    rng, enough = np.random.default_rng(0), len(rig) > 1 and len(look.sightings) >= MIN_SIGHTINGS
+    while enough and len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
         findings.append(change.finding)
         look = change.look
+    return given, look, findings
+
+
+def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
+    """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
+    frames = range(len(detections)) if frames is None else frames
+    given, look, findings = put_right(detections, rig, frames)
+    if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
+        return Diagnosis(tuple(findings), given, look)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
         findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
-        trust = trust_of(findings, given, look, range(len(detections)) if frames is None else frames)
+        trust = trust_of(findings, given, look, frames)
         return Diagnosis(tuple(findings), given, look, trust=trust)
     problem = Problem.of(look)
     remaining = lags(refined := replace(look, views=problem.relaxed()))
@@ -217,7 +222,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
             break
         view = max(late, key=lambda view: remaining[view].gain)
         before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
-        if abs(settled[0].lag[view]) > evidence.most_lag:  # it would run on: chance, and no offset
+        if abs(settled[0].lag[view]) > look.evidence.most_lag:  # it would run on: chance, and no offset
             break
         look, problem = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
@@ -230,7 +235,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
     findings += order or _of_people(build, rig)  # joints that are others say nothing of unit and up
-    trust = trust_of(findings, given, refined, range(len(detections)) if frames is None else frames)
+    trust = trust_of(findings, given, refined, frames)
     return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 
 
@@ -243,7 +248,7 @@ def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
             findings.append(found)
     if gone:
         seen = evidence.sightings
-        evidence = replace(evidence, sightings=seen.only(~np.isin(seen.view, list(gone))))
+        evidence = replace(evidence, sightings=seen.rows(~np.isin(seen.view, list(gone))))
     return findings, evidence
 
 

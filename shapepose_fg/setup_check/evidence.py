@@ -11,16 +11,16 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.pieces import add_view, project, solved
+from shapepose_fg.core.pieces import add_view, project, solved, triangulated
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.setup_check.fit import Others, Pinhole, match, possible_matches
+from shapepose_fg.setup_check.fit import Others, match, possible_matches
 from shapepose_fg.setup_check.matching import (
     GATE,
     Groups,
     Pairs,
+    Pinhole,
     Sightings,
-    centres_of,
     distances,
     followed,
     least_of_each,
@@ -39,7 +39,7 @@ ANCHORS = 100
 _WHOLE = 600
 """A recording of so many frames is looked at whole, for offsets in time."""
 _LAG_ANCHORS = 16
-"""Of a longer one the neighbours of so many frames are."""
+"""Number of frames of a longer recording whose neighbours are looked at."""
 MOST_LAG = 60
 """Largest offset in time that is looked for, frames; less in a short recording."""
 _MOST_PAIRS = 25_000
@@ -62,7 +62,7 @@ class Evidence:
     """(V,) in what part of these frames each camera shows the picture before once more."""
 
     def thinned(self, frames: int) -> "Evidence":
-        """The same with fewer frames that are looked at."""
+        """Return the evidence with fewer frames that are looked at."""
         return replace(self, anchors=self.anchors[:: max(1, len(self.anchors) // frames)])
 
 
@@ -86,7 +86,7 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():
         stopped[list(pictures.repeated(frame))] += 1 / len(wanted)
-    here = sightings.only(np.isin(sightings.frame, spread))
+    here = sightings.rows(np.isin(sightings.frame, spread))
     _, each = np.unique(here.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
@@ -95,14 +95,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
 
 
 def _other_side(skeleton: Skeleton) -> Index:
-    core = [skeleton.joints[joint] for joint in skeleton.core]
-    other = {"L": "R", "R": "L"}
-    return np.array(
-        [
-            core.index(name) if (name := other.get(each[0], "") + each[1:]) in core else n
-            for n, each in enumerate(core)
-        ]
-    )
+    core, mirror = skeleton.core, skeleton.mirror
+    return np.array([core.index(mirror[j]) if mirror[j] in core else n for n, j in enumerate(core)])
 
 
 @dataclass(frozen=True)
@@ -140,67 +134,43 @@ def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: 
     xy, prior = np.ascontiguousarray(xy), np.ascontiguousarray(prior)
     points = np.empty((*prior.shape[:2], 3))
     miss_px, depth, weight = (np.empty(prior.shape) for _ in range(3))
-    to_world = views.cTw[:, :, :3].swapaxes(1, 2) @ np.linalg.inv(views.K)
-    cameras = (views.K @ views.cTw, to_world, centres_of(views))
-    _triangulate(xy, prior, *cameras, steps, points, miss_px, depth, weight)
+    _triangulate(xy, prior, views.K @ views.cTw, views.focal[0], steps, points, miss_px, depth, weight)
     return Structure(points, xy, miss_px, depth, size, weight)
 
 
-@kernel("f4 f3 f3 f3 f2 i0 f3 f3 f3 f3")
+@kernel("f4 f3 f3 f1 i0 f3 f3 f3 f3")
 def _triangulate(
     xy: Array,
     prior: Array,
     cameras: Array,
-    to_world: Array,
-    centres: Array,
+    focal: Array,
     steps: int,
     points: Array,
     miss_px: Array,
     depth: Array,
     weight: Array,
 ) -> None:
-    """`triangulate` with K [R t] as `cameras` (V, 3, 4), from pixels to rays (V, 3, 3), and `centres` (V, 3)."""
-    A, b, x, ray, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    views = len(cameras)
+    """`triangulate` with K [R t] as `cameras` (V, 3, 4), and their `focal` lengths (V,)."""
+    A, b, x, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    views, room = len(cameras), np.empty(len(cameras))
     for p in range(prior.shape[0]):
         for j in range(prior.shape[1]):
-            # The point nearest to all rays d from c: sum of (1 - d d') x = sum of (1 - d d') c.
+            x[0] = x[1] = x[2] = math.nan
             seen = 0
-            for i in range(3):
-                b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
             for v in range(views):
-                weight[p, j, v] = prior[p, j, v]
-                if prior[p, j, v] > 0:
-                    seen += 1
-                    for i in range(3):
-                        ray[i] = to_world[v, i, 0] * xy[p, j, v, 0] + to_world[v, i, 1] * xy[p, j, v, 1]
-                        ray[i] += to_world[v, i, 2]
-                    length = math.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-                    along = (ray[0] * centres[v, 0] + ray[1] * centres[v, 1] + ray[2] * centres[v, 2]) / length
-                    for i in range(3):
-                        b[i] += centres[v, i] - ray[i] / length * along
-                        for k in range(3):
-                            A[i, k] += (1.0 if i == k else 0.0) - ray[i] * ray[k] / length**2
-            for i in range(3):
-                A[i, i] += 1e-12
+                seen += prior[p, j, v] > 0
             if seen >= 2:
-                solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], x)
-            else:
-                x[0] = x[1] = x[2] = math.nan
+                triangulated(cameras, focal, xy[p, j], prior[p, j], math.inf, math.inf, -math.inf, room, x)
             for step in range(steps + 1):
                 for i in range(3):
                     b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
                 for v in range(views):
                     u, w, z = project(cameras[v], x)
-                    depth[p, j, v], miss_px[p, j, v] = z, math.nan
-                    if step < steps:
-                        weight[p, j, v] = 0.0
-                    if not (z > 0 and prior[p, j, v] > 0):
-                        continue
-                    du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
-                    square = du * du + dw * dw
-                    miss_px[p, j, v] = math.sqrt(square)
-                    if step < steps:
+                    depth[p, j, v], miss_px[p, j, v], weight[p, j, v] = z, math.nan, 0.0
+                    if z > 0 and prior[p, j, v] > 0:
+                        du, dw = u - xy[p, j, v, 0], w - xy[p, j, v, 1]
+                        square = du * du + dw * dw
+                        miss_px[p, j, v] = math.sqrt(square)
                         weight[p, j, v] = prior[p, j, v] / (1 + prior[p, j, v] * square)
                         add_view(cameras[v], u, w, z, du, dw, weight[p, j, v], A, b)
                 if step < steps:
@@ -235,24 +205,24 @@ class Look:
         return Pinhole(self.views.K[view], self.views.cTw[view])
 
     def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Look":
-        """The same with other cameras in the place of some."""
+        """Return the look with some cameras replaced."""
         K, cTw = self.views.K.copy(), self.views.cTw.copy()
         for view, camera in cameras.items():
             K[view], cTw[view] = camera.K, camera.cTw
         return replace(self, views=replace(self.views, K=K, cTw=cTw))
 
     def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "Look":
-        """The same with other detections of one camera."""
+        """Return the look with other detections of one camera."""
         every = self.evidence.sightings
         mine = np.flatnonzero(every.view == view)
-        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.only(mine))
+        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
         xy[mine], confidence[mine] = new.xy, new.confidence
         return replace(
             self, evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence))
         )
 
     def later(self, view: int, frames: int) -> "Look":
-        """The same with one camera known to be late."""
+        """Return the look with one camera known to be late by so many frames more."""
         lag = self.lag.copy()
         lag[view] += frames
         return replace(self, lag=lag)
@@ -266,7 +236,7 @@ class Look:
     @cached_property
     def sightings(self) -> Sightings:
         """Those at the frames that are looked at."""
-        return self.shifted.only(np.isin(self.shifted.frame, self.evidence.anchors))
+        return self.shifted.rows(np.isin(self.shifted.frame, self.evidence.anchors))
 
     @cached_property
     def pairs(self) -> Pairs:
@@ -286,7 +256,7 @@ class Look:
     def seen_by(self, view: int, every_frame: bool = False) -> Sightings:
         """What one camera saw."""
         sightings = self.shifted if every_frame else self.sightings
-        return sightings.only(sightings.view == view)
+        return sightings.rows(sightings.view == view)
 
     def groups(self, without: tuple[int, ...] = ()) -> Groups:
         """People as they are found without some of the cameras."""
@@ -316,17 +286,17 @@ class Look:
     def beside_biases(self, view: int) -> float:
         """How well a camera fits the others' people, as `Match.score`, where the detector's errors last."""
         others, seen, camera = self.others(view), self.seen_by(view), self.camera(view)
-        person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw)
+        person, sighting, error = distances(others.frame, others.points, seen, camera)
         near = least_of_each(person, error)
         near = near[error[near] < 2 * GATE]
         person, sighting = person[near], sighting[near]
-        at = others.points[person] @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
-        away = (seen.xy[sighting] - at[..., :2] / at[..., 2:]) / seen.size_px[sighting][:, None, None]
+        away = seen.xy[sighting] - camera.project(others.points[person])[0]
+        away /= seen.size_px[sighting][:, None, None]
         who = followed(others.frame, others.points)[person]
         for each in np.unique(who).tolist():
             away[who == each] -= median_over(away[who == each])
         miss = np.linalg.norm(away, axis=-1)
-        left = np.maximum(1 - median_of(miss, ~np.isnan(miss)) / GATE, 0.0)
+        left = np.maximum(1 - median_of(miss) / GATE, 0.0)
         return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
 
     @property
@@ -349,6 +319,6 @@ class Look:
         """How well everything fits: 1 if every sighting is a person without error, 0 if none is anybody."""
         groups, structure = self.structure(steps=3)
         error = np.moveaxis(structure.miss_px / structure.size_px[:, None], 1, 2)
-        median = median_of(error, ~np.isnan(error))
+        median = median_of(error)
         worth = np.maximum(1 - median / GATE, 0.0)
         return float(worth[groups.member >= 0].sum() / max(len(self.sightings), 1))

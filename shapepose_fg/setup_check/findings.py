@@ -33,7 +33,7 @@ class Kind(StrEnum):
     CROWDED = "crowded"
     PICTURE_SIZE = "size of the pictures"
     BIASED = "biased"
-    """Of one person's detections, not of the set-up."""
+    """Bias of one person's detections, not a mistake of the set-up."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Finding:
 
 
 SURE = 0.95
-"""Of what has more probability nothing is said of it, nor of what else it may be."""
+"""Findings above this probability are reported without it, and without alternatives."""
 
 
 def one_of(found: Sequence[Finding]) -> Finding:

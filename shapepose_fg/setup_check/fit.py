@@ -10,11 +10,12 @@ from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import nearest_rotation
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, distances, same_frame
+from shapepose_fg.core.rows import Rows
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pinhole, Sightings, distances, same_frame
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
-"""Of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the calibration), the
-principal point (px), and the logarithm of the focal length."""
+"""Parameters of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the
+calibration), the principal point (px), and the logarithm of the focal length."""
 Q = len(PARAMETERS)
 TURN, MOVE, CENTRE, FOCAL, POSE = [0, 1, 2], [3, 4, 5], [6, 7], [8], [0, 1, 2, 3, 4, 5]
 _MOST_ZOOM = 5.0
@@ -32,26 +33,13 @@ CORNER = np.array([-0.5, -0.5])
 
 
 @dataclass(frozen=True)
-class Others:
+class Others(Rows):
     """The people that all cameras but some see."""
 
     frame: Index
     """(P,) frame of each person."""
     points: Array
     """(P, J, 3) joints, the calibration's unit; NaN where not placed."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """One camera without its lens."""
-
-    K: Array
-    """(3, 3)."""
-    cTw: Array
-    """(3, 4)."""
 
 
 Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
@@ -101,7 +89,7 @@ def likelihood(score: float, worth: float, freedom: int) -> float:
 
 def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Match:
     """Each sighting with the person nearest to it, where it is the nearest to that person too."""
-    person, sighting, error = distances(others.frame, others.points, seen, camera.K, camera.cTw, lag)
+    person, sighting, error = distances(others.frame, others.points, seen, camera, lag)
     best_of_person, best_of_sighting = np.full(len(others), np.inf), np.full(len(seen), np.inf)
     np.minimum.at(best_of_person, person, error)
     np.minimum.at(best_of_sighting, sighting, error)
@@ -152,20 +140,20 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 def centred_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     """The camera whose principal point lies where it sees `points` (N, 3) at `xy` (N, 2), median."""
-    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
-    if not (at[:, 2] > 0).all():
+    at, depth = camera.project(points)
+    if not (depth > 0).all():
         return None
     K = camera.K.copy()
-    K[:2, 2] += np.median(xy - at[:, :2] / at[:, 2:], axis=0)
+    K[:2, 2] += np.median(xy - at, axis=0)
     return Pinhole(K, camera.cTw)
 
 
 def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
     """The camera `scaled` by how much farther from `centre` (2,) than it says `points` (N, 3) are seen at `xy`."""
-    at = (points @ camera.cTw[:, :3].T + camera.cTw[:, 3]) @ camera.K.T
-    if not (at[:, 2] > 0).all():
+    at, depth = camera.project(points)
+    if not (depth > 0).all():
         return None
-    direction = at[:, :2] / at[:, 2:] - centre
+    direction = at - centre
     factor = float((direction * (xy - centre)).sum() / (direction**2).sum())
     return scaled(camera, factor, centre) if 0.1 < factor < 10 else None
 
@@ -181,9 +169,9 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
 def best_of(
     others: Others, seen: Sightings, camera: Pinhole, pairs: Sequence[tuple[Array, Array]], fitted: Fitted
 ) -> Pinhole | None:
-    """Of the cameras that fit one person exactly, the one that fits all people best."""
+    """Return the camera that fits all people best, of those that fit one person exactly."""
     step = max(1, len(others) // 40)
-    few = Others(others.frame[::step], others.points[::step])
+    few = others.rows(slice(None, None, step))
     tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
     score, best = max(
         ((match(few, seen, each).score, each) for each in tried), key=lambda pair: pair[0], default=(0, None)
@@ -206,42 +194,50 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
 
 def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
     """The camera, fitted robustly (Cauchy) to points (N, 3) seen at xy (N, 2)."""
-    ahead = points @ camera.cTw[2, :3] + camera.cTw[2, 3] > 0
+    ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
         return camera
-    points, xy, width_px = points[ahead], xy[ahead], width_px[ahead, None]
+    points, xy, width_px = points[ahead, None], xy[ahead], width_px[ahead, None]
 
-    def errors(camera: Pinhole) -> tuple[Array, Array]:
-        at = points @ camera.cTw[:, :3].T + camera.cTw[:, 3]
-        at[:, 2] = np.maximum(at[:, 2], 1e-9)
-        h = at @ camera.K.T
-        return at, (h[:, :2] / h[:, 2:] - xy) / width_px
+    def linearised(views: Views) -> tuple[float, Array, Array]:
+        at, place, by_point = seen_by(points, views)
+        error = (at[:, 0, 0] - xy) / width_px
+        cost = float(np.log1p(error**2).sum()) if (place[..., 2] > 0).all() else np.inf
+        return cost, error, by_parameters(at, place, by_point, views)[:, 0, 0][..., columns] / width_px[..., None]
 
-    def cost(error: Array) -> float:
-        return float(np.log1p(error**2).sum())
-
-    at, error = errors(camera)
+    views = Views(camera.K[None], camera.cTw[None])
+    cost, error, J = linearised(views)
     for _ in range(_STEPS):
-        by_point = (camera.K[:2] - (xy + width_px * error)[..., None] * camera.K[2]) / at[:, 2, None, None]
-        J = np.empty((len(at), 2, Q))
-        J[..., TURN] = np.cross(at[:, None], by_point)
-        J[..., 3:6], J[..., CENTRE] = by_point, np.eye(2)
-        J[..., FOCAL] = (camera.K[:2, :2] @ (at[:, :2] / at[:, 2:]).T).T[..., None]
-        J = J[..., columns] / width_px[..., None]
-        weight = 1 / (1 + error**2)
+        weight, step = 1 / (1 + error**2), np.zeros((1, Q))
         H = np.einsum("nij,ni,nik->jk", J, weight, J)
-        step = np.zeros((1, Q))
         step[0, columns] = -np.linalg.lstsq(H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12)[0]
         for part in (1.0, 0.25, 0.06):
-            new = changed(Views(camera.K[None], camera.cTw[None]), part * step)
-            tried = Pinhole(new.K[0], new.cTw[0])
-            new_at, new_error = errors(tried)
-            if cost(new_error) < cost(error):
-                camera, at, error = tried, new_at, new_error
+            tried = changed(views, part * step)
+            new = linearised(tried)
+            if new[0] < cost:
+                views, (cost, error, J) = tried, new
                 break
         else:
             break
-    return camera
+    return Pinhole(views.K[0], views.cTw[0])
+
+
+def seen_by(points: Array, views: Views) -> tuple[Array, Array, Array]:
+    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and the derivatives of
+    pixels by these places (N, J, V, 2, 3).
+    """
+    at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
+    at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])
+    xy = np.einsum("vab,njvb->njva", views.K[:, :2], at / at[..., 2:])
+    return xy, at, (views.K[:, :2] - xy[..., None] * views.K[:, None, 2]) / at[..., 2, None, None]
+
+
+def by_parameters(xy: Array, at: Array, by_point: Array, views: Views) -> Array:
+    """(N, J, V, 2, Q) derivatives of pixels by the cameras' `PARAMETERS`, where they are as `seen_by` says."""
+    J = np.empty((*xy.shape, Q))
+    J[..., TURN], J[..., MOVE] = np.cross(at[..., None, :], by_point), by_point
+    J[..., CENTRE], J[..., FOCAL] = np.eye(2), (xy - views.K[:, :2, 2])[..., None]
+    return J
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:

@@ -11,8 +11,16 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
-from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, Pinhole, independent, likelihood, match
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, least_of_each, miss_px, same_frame
+from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, independent, likelihood, match
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    MIN_JOINTS,
+    Pinhole,
+    Sightings,
+    least_of_each,
+    miss_px,
+    same_frame,
+)
 from shapepose_fg.setup_check.over_time import stories
 from shapepose_fg.setup_check.small import ONE, Problem, named, probable
 
@@ -43,14 +51,14 @@ class Lag:
     gain: float
     """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
     likely: float
-    """The same as the likelihood's logarithm."""
+    """Gain of the likelihood's logarithm."""
     agreement: float
     """The gain over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
     none, 0 without motion. Of the half of the frames in which it is less: an offset is in both halves, while
     in one of them people may come by chance to where they were."""
     followed: float
-    """The same of those alone who are seen near enough with and without it: with people who hide each other, more
-    are near by chance at some offset."""
+    """Agreement of people who are seen near enough with and without the offset: with people who hide each other,
+    more are near by chance at some offset."""
 
     @property
     def is_offset(self) -> bool:
@@ -75,7 +83,7 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
     others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
     worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
-    others = Others(others.frame[::step], others.points[::step])
+    others = others.rows(slice(None, None, step))
     still = _nearest(others, seen, camera, 0)
 
     def tried(lag: int) -> Lag:
@@ -107,7 +115,7 @@ class _Nearest:
 
 def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
     person, sighting = same_frame(others.frame, seen.frame - lag)
-    error = miss_px(others.points[person], seen.xy, sighting, camera.K, camera.cTw)
+    error = miss_px(others.points[person], seen.xy[sighting], camera)
     error /= seen.size_px[sighting][:, None]
     both = ~np.isnan(error)
     mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
@@ -149,15 +157,13 @@ def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Near
     return Lag(lag, gain, gain / ERROR * worth, agreement, followed)
 
 
-Fit = Callable[[Array, Array, Pinhole], Pinhole | None]
-
 _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
     Kind.INVERTED: lambda R, t: (R.T, -R.T @ t),
     Kind.TRANSPOSED: lambda R, t: (R.T, t),
     Kind.AXES: lambda R, t: (np.diag([1.0, -1.0, -1.0]) @ R, t * (1.0, -1.0, -1.0)),
 }
 """What a pose is after the usual misunderstandings of its file: of one camera, or of all."""
-_FITTED: tuple[tuple[Kind, Fit, list[int]], ...] = (
+_FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
     (Kind.PRINCIPAL_POINT, fit.centred_to, fit.CENTRE),
@@ -171,8 +177,8 @@ _FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 GOOD = 0.45
 """A camera that matches the others' people so well is where it is said to be, but for small errors."""
 GOOD_PAIR = 0.65
-"""Of two cameras more is asked, because rays have only to meet: sound pairs had 0.67 and more, most of those with
-one that was mirrored, or turned by 8 degrees half-way, less."""
+"""Score from which on two cameras fit each other; higher, because their rays have only to meet: sound pairs had
+0.67 and more, most of those with one that was mirrored, or turned by 8 degrees half-way, less."""
 GAIN, _LIKELY = 0.12, 10.0
 """What a change must bring of a camera's score, and of the likelihood's logarithm, to be named."""
 _EXPLAINED = 0.65

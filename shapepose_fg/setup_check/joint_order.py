@@ -13,9 +13,9 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.joint_names import keypoint_names
 from shapepose_fg.core.skeleton import SKELETONS, Skeleton
-from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
+from shapepose_fg.setup_check.matching import people_of
 
 _MOST_PEOPLE = 150
 """People that are compared, in pictures and in space; more tell nothing new."""
@@ -28,7 +28,7 @@ _GAIN, _SHARE = 0.02, 0.8
 an exchange gains up to 0.035 over the right order, in at most 0.7 of the frames; undoing the exchange of two
 joints gains 0.02 to 0.5."""
 _GAIN_2D, _SHARE_2D = 0.01, 0.85
-"""The same in pictures, where people are not placed in space, or badly."""
+"""Least gain and share of people in pictures, where people are not placed in space, or badly."""
 _OTHER_LAYOUT = 0.1
 """Least gain of a known layout, nats a pair; right ones gain 0.7 to 1.7, but for two that differ in two joints."""
 _FACING = 0.25
@@ -157,17 +157,9 @@ def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Ar
     """(N, K, 2) people in pictures at frames that are looked at, keypoint by keypoint, NaN where not seen."""
     names = keypoint_names(skeleton)
     place = np.array([names.index(joint) if joint in names else -1 for joint in skeleton.joints])
-    found = list[Array]()
-    anchors = look.evidence.anchors
-    for frame in anchors[:: max(1, len(anchors) // 30)].tolist():
-        seen = detections[frame]
-        for rows in group_people(seen):
-            rows = rows[place[seen.joint[rows]] >= 0]
-            if len(rows) >= len(names) // 3:
-                person = np.full((len(names), 2), np.nan)
-                person[place[seen.joint[rows]]] = seen.xy[rows]
-                found.append(person)
-    return _some(np.array(found).reshape(-1, len(names), 2))
+    frames = look.evidence.anchors[:: max(1, len(look.evidence.anchors) // 30)].tolist()
+    found = [people_of(detections[frame], place, len(names), max(1, len(names) // 3))[1] for frame in frames]
+    return _some(np.concatenate(found))
 
 
 def _some(people: Array) -> Array:

@@ -4,18 +4,17 @@ Nothing here has a unit: an error is a part of the person's own size in the pict
 wrong unit matches as well as the right one.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
-from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections, DetectionSequence
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.people_2d import group_people
 
@@ -26,7 +25,7 @@ _STATURE_PER_SPREAD = 3.4
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Sightings(Rows):
     """S people as single cameras saw them, J core joints each."""
 
     frame: Index
@@ -38,9 +37,6 @@ class Sightings:
     confidence: Array
     """(S, J) the detector's score; 0 where not seen."""
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
     @cached_property
     def size_px(self) -> Array:
         """(S,) how large a person is in the picture, about the height of one who stands, pixels."""
@@ -49,15 +45,28 @@ class Sightings:
     @classmethod
     def of(cls, detections: DetectionSequence, frames: Iterable[int]) -> "Sightings":
         """The 2D people of some `frames`, grouped by affinities of their own picture; the core joints only."""
-        parts = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
         joints = len(detections.skeleton.core)
-        none = cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints)))
-        names = ("frame", "view", "xy", "confidence")
-        return cls(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names))
+        none = Sightings(
+            np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints))
+        )
+        found = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
+        return Sightings.concatenate([none, *found])
 
-    def only(self, keep: Mask | Index) -> "Sightings":
-        """Some of the sightings."""
-        return Sightings(self.frame[keep], self.view[keep], self.xy[keep], self.confidence[keep])
+
+@dataclass(frozen=True)
+class Pinhole:
+    """One camera without its lens."""
+
+    K: Array
+    """(3, 3)."""
+    cTw: Array
+    """(3, 4)."""
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (..., 2) and depths (...) of `points` (..., 3) in the world."""
+        at = points @ (self.K @ self.cTw[:, :3]).T + self.K @ self.cTw[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return at[..., :2] / at[..., 2:], at[..., 2]
 
 
 def size_of(xy: Array) -> Array:
@@ -70,19 +79,27 @@ def size_of(xy: Array) -> Array:
     return np.asarray(np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0))
 
 
+def people_of(found: Detections, place: Index, count: int, least: int) -> tuple[Index, Array, Array]:
+    """The 2D people of one frame of whom `least` joints are seen: views (N,), pixels (N, K, 2) and scores (N, K).
+
+    K is the `count` of joints; pixels are NaN and scores 0 where not seen. `place` (J,) says where among the K
+    each of the detector's joints is, -1 for none.
+    """
+    groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found)]
+    groups = [rows for rows in groups if len(rows) >= least]
+    xy, confidence = np.full((len(groups), count, 2), np.nan), np.zeros((len(groups), count))
+    for person, rows in enumerate(groups):
+        xy[person, place[found.joint[rows]]] = found.xy[rows]
+        confidence[person, place[found.joint[rows]]] = found.confidence[rows]
+    return np.array([found.view[rows[0]] for rows in groups], dtype=np.intp), xy, confidence
+
+
 def _of_frame(found: Detections, frame: int, skeleton: Skeleton) -> Sightings:
     """The 2D people of one frame."""
     place = np.full(len(skeleton), -1)
     place[list(skeleton.core)] = np.arange(len(skeleton.core))
-    groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found) if len(rows) >= MIN_JOINTS]
-    groups = [rows for rows in groups if len(rows) >= MIN_JOINTS]
-    xy = np.full((len(groups), len(skeleton.core), 2), np.nan)
-    confidence = np.zeros(xy.shape[:2])
-    for person, rows in enumerate(groups):
-        xy[person, place[found.joint[rows]]] = found.xy[rows]
-        confidence[person, place[found.joint[rows]]] = found.confidence[rows]
-    view = np.array([found.view[rows[0]] for rows in groups], dtype=np.intp)
-    if len(groups) > _MOST_IN_A_PICTURE:
+    view, xy, confidence = people_of(found, place, len(skeleton.core), MIN_JOINTS)
+    if len(view) > _MOST_IN_A_PICTURE:
         surest = np.lexsort((-confidence.sum(axis=1), view))
         place_in_view = np.arange(len(view)) - np.searchsorted(view[surest], view[surest])
         keep = np.sort(surest[place_in_view < _MOST_IN_A_PICTURE])
@@ -101,16 +118,13 @@ _MIN_ANGLE = np.deg2rad(4.0)
 
 
 @dataclass(frozen=True)
-class Groups:
+class Groups(Rows):
     """P people: the sighting of each camera."""
 
     frame: Index
     """(P,) frame."""
     member: Index
     """(P, V) the sighting of each camera, -1 where it does not see the person."""
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 @dataclass(frozen=True)
@@ -212,10 +226,9 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
     focal, size = views.focal_px[sightings.view], sightings.size_px
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.maximum(half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None])
-    both = np.isfinite(half_gap)
-    error = np.where(both & ((s <= 0) | (t <= 0)), np.inf, error)
-    angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)), both)
-    median = np.where((both.sum(axis=1) >= MIN_JOINTS) & (angle > _MIN_ANGLE), median_of(error, both), np.inf)
+    error = np.where(np.isfinite(half_gap) & ((s <= 0) | (t <= 0)), np.inf, error)
+    angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)))
+    median = np.where(angle > _MIN_ANGLE, median_of(error, MIN_JOINTS), np.inf)
     points = centres[sightings.view[first]][:, None] + (on_a + on_b) / 2
     return median, points
 
@@ -229,7 +242,7 @@ def _others(sightings: Sightings, views: Views, members: Index, points: Array) -
         of_view = np.flatnonzero(sightings.view == view)
         beside = np.flatnonzero((sightings.view[members] != view).all(axis=1))
         person, sighting, error = distances(
-            frame[beside], points[beside], sightings.only(of_view), views.K[view], views.cTw[view]
+            frame[beside], points[beside], sightings.rows(of_view), Pinhole(views.K[view], views.cTw[view])
         )
         best = least_of_each(person, error)
         third[beside[person[best]], view] = of_view[sighting[best]]
@@ -238,18 +251,16 @@ def _others(sightings: Sightings, views: Views, members: Index, points: Array) -
 
 
 def distances(
-    frame: Index, points: Array, seen: Sightings, K: Array, cTw: Array, lag: int = 0
+    frame: Index, points: Array, seen: Sightings, camera: Pinhole, lag: int = 0
 ) -> tuple[Index, Index, Array]:
     """Median distance of each person's projection to each sighting of one camera in the same frame.
 
-    `points` (P, J, 3) are people at `frame` (P,), `seen` what the camera K, cTw saw, `lag` frames later. Returns
+    `points` (P, J, 3) are people at `frame` (P,), `seen` what the `camera` saw, `lag` frames later. Returns
     person (E,), sighting (E,) and error (E,), a part of the sighting's size.
     """
     person, sighting = same_frame(frame, seen.frame - lag)
-    error = miss_px(points[person], seen.xy, sighting, K, cTw)
-    both = ~np.isnan(error)
-    median = np.where(both.sum(axis=1) >= MIN_JOINTS, median_of(error, both), np.inf)
-    return person, sighting, median / seen.size_px[sighting]
+    error = miss_px(points[person], seen.xy[sighting], camera)
+    return person, sighting, median_of(error, MIN_JOINTS) / seen.size_px[sighting]
 
 
 def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
@@ -262,66 +273,28 @@ def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
 
 
 def least_of_each(key: Index, value: Array) -> Index:
-    """The row with the least `value` (N,) of each `key` (N,); the first of equal ones."""
-    key = key - key.min(initial=0)  # the first frame may have a number below 0
-    best = np.full(key.max(initial=-1) + 1, -1, dtype=np.intp)
-    _least_of_each(key, value, best)
-    return best[best >= 0]
+    """The row with the least `value` (N,) of each `key` (N,), by rising keys; the first of equal ones."""
+    order = np.lexsort((value, key))
+    return order[np.unique(key[order], return_index=True)[1]]
 
 
-@kernel("i1 f1 i1")
-def _least_of_each(key: Index, value: Array, best: Index) -> None:
-    """The row with the least `value` of each `key` into `best`, which is -1 everywhere."""
-    for row in range(len(key)):
-        if best[key[row]] < 0 or value[row] < value[best[key[row]]]:
-            best[key[row]] = row
-
-
-def miss_px(points: Array, xy: Array, sighting: Index, K: Array, cTw: Array) -> Array:
-    """(N, J) how far `points` (N, J, 3) are projected from the joints `xy` (S, J, 2) of their `sighting` (N,),
-    pixels; infinite behind the camera, NaN where nothing was seen.
+def miss_px(points: Array, xy: Array, camera: Pinhole) -> Array:
+    """(N, J) distance of projected `points` (N, J, 3) from the joints `xy` (N, J, 2), pixels; infinite behind the
+    camera, NaN where nothing was seen.
     """
-    miss = np.empty(points.shape[:2])
-    _miss_px(np.require(points, float, ["C", "W"]), np.require(xy, float, ["C", "W"]), sighting, K @ cTw, miss)
-    return miss
+    at, depth = camera.project(points)
+    miss = np.sqrt(np.square(at - xy).sum(axis=-1))
+    return np.where((depth <= 0) & ~np.isnan(xy[..., 0]), np.inf, miss)
 
 
-@kernel("f3 f3 i1 f2 f2")
-def _miss_px(points: Array, xy: Array, sighting: Index, M: Array, miss: Array) -> None:
-    """`miss_px` into `miss` (N, J), with M (3, 4) the camera's K [R t]."""
-    for n in range(len(miss)):
-        for j in range(miss.shape[1]):
-            x, y, z = points[n, j]
-            px, py = xy[sighting[n], j]
-            depth = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
-            dx = (M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]) / depth - px
-            dy = (M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]) / depth - py
-            behind = depth <= 0 and not math.isnan(px)
-            miss[n, j] = math.inf if behind else math.sqrt(dx * dx + dy * dy)
-
-
-def median_of(values: Array, valid: Mask) -> Array:
-    """(...) median of the valid values of the last axis, lower of the two middles; inf where there is none."""
-    median = np.empty(values.shape[:-1])
-    rows = np.where(valid, values, np.nan).reshape(median.size, values.shape[-1])
-    _medians(rows, median.reshape(-1))
-    return median
-
-
-@kernel("f2 f1")
-def _medians(rows: Array, median: Array) -> None:
-    """The median of each of the `rows` (N, J), without its NaN, by insertion; `rows` are used up."""
-    for n in range(len(rows)):
-        count = 0
-        for j in range(rows.shape[1]):
-            value, place = rows[n, j], count
-            if not math.isnan(value):
-                while place > 0 and rows[n, place - 1] > value:
-                    rows[n, place] = rows[n, place - 1]
-                    place -= 1
-                rows[n, place] = value
-                count += 1
-        median[n] = rows[n, (count - 1) // 2] if count > 0 else math.inf
+def median_of(values: Array, least: int = 1) -> Array:
+    """(...) median of the last axis without NaN, the lower of two middles; infinite with fewer than `least`
+    values.
+    """
+    ordered = np.sort(values, axis=-1)  # NaN last
+    count = (~np.isnan(values)).sum(axis=-1)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, axis=-1)[..., 0]
+    return np.where(count >= least, middle, np.inf)
 
 
 def median_over(values: Array) -> Array:

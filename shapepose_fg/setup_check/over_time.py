@@ -5,27 +5,27 @@ fits) is tried on all frames, and weighed against one turn for the whole recordi
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import POSE, TURN, Others, Pinhole, independent, likelihood, match
-from shapepose_fg.setup_check.matching import GATE, Sightings
+from shapepose_fg.setup_check.fit import POSE, TURN, Others, independent, likelihood, match
+from shapepose_fg.setup_check.matching import GATE, Pinhole, Sightings
 
 _PIECES = 12
 _LEAST_PEOPLE = 6
 """Fewer people of the others say nothing of a piece."""
-_RESTLESS = 0.03
-"""A camera is looked at closely if it sees people so far apart in two pieces, a part of their size: 5 cm."""
-_LOST, _THERE, _GOOD = 0.2, 0.2, 0.45
-"""Or if its score differs by the first; a piece says something from the second on (in crowds sound cameras come
-to little more), and below the third other turns than its neighbours' are tried."""
+_RESTLESS = 0.1
+"""A camera is looked at closely if its score differs by so much between pieces: people lie 3 cm farther off."""
+_THERE, _GOOD = 0.2, 0.45
+"""A piece says something from the first score on (in crowds sound cameras come to little more); below the second
+other turns than its neighbours' are tried."""
 _LEAST_DEG = 1.2
 """A smaller step or way is not told from a detector that errs otherwise on a person who turns round."""
 _SURE = 6.0
@@ -51,19 +51,30 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
     Each with the recording as if it had not, and how many parameters that took.
     """
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
-    if len(others) < 4 * _LEAST_PEOPLE or len(seen) < 4 * _LEAST_PEOPLE:
+    both = np.intersect1d(others.frame, seen.frame)
+    if min(len(others), len(seen)) < 4 * _LEAST_PEOPLE or len(both) == 0:
         return
-    pieces = _Pieces.of(others, seen, camera)
-    if not pieces.restless:
+    count = min(_PIECES, max(1, len(both) // _LEAST_PEOPLE))
+    ends = np.unique(np.quantile(both, np.linspace(0, 1, count + 1)).astype(np.intp))
+    ends[-1] += 1
+    spans = list(pairwise(ends.tolist()))
+    pieces = [_during(others, seen, *span) for span in spans]
+    matched = [match(*piece, camera) for piece in pieces]
+    enough = [n for n, each in enumerate(matched) if each.possible >= _LEAST_PEOPLE]
+    score = np.array([matched[n].score for n in enough])
+    if len(enough) < 3 or score.max() < _THERE or np.ptp(score) < _RESTLESS:
         return
-    turns, scores = pieces.turns(rng)
-    usable = (scores > _THERE) & pieces.told
+    turns, scores = _turns([pieces[n] for n in enough], camera, int(score.argmax()), rng)
+    usable = scores > _THERE
+    if usable.sum() < 3:
+        return
     worth = independent(others)
     before = likelihood(match(others, seen, camera).score, worth, 0)
     for columns in (TURN, POSE):
         lasting = match(others, seen, fit.refined(others, seen, camera, columns)).score
         before = max(before, likelihood(lasting, worth, len(columns)))
-    found = [told(pieces, turns, usable) for told in (_bumped, _drifted)] if usable.sum() >= 3 else []
+    middle = np.array([(sum(spans[n]) - 1) / 2 for n in enough])[usable]
+    found = _bumped(others, seen, camera, turns[usable]), _drifted(middle, turns[usable], both[0], both[-1])
     for finding, way, freedom in found:
         after = match(others, warped(seen, camera, way(seen.frame)), camera).score
         gain = likelihood(after, worth, freedom) - before
@@ -76,134 +87,67 @@ def _as_if_still(look: Look, view: int, way: Way) -> Look:
     return look.seeing(view, lambda seen: warped(seen, look.camera(view), way(seen.frame - look.lag[view])))
 
 
-def turned(camera: Pinhole, turn: Array) -> Pinhole:
+def _during(others: Others, seen: Sightings, first: float, last: float) -> tuple[Others, Sightings]:
+    """What is of some frames only."""
+    there, here = ((each.frame >= first) & (each.frame < last) for each in (others, seen))
+    return others.rows(there), seen.rows(here)
+
+
+def _turns(
+    pieces: list[tuple[Others, Sightings]], camera: Pinhole, best: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """(n, 3) the turn that fits each piece best, and (n,) its score; from the `best` piece to both ends, each from
+    the turn of the piece before it.
+    """
+    n = len(pieces)
+    turns, scores = np.zeros((n, 3)), np.zeros(n)
+    for k in [*range(best, n), *range(best - 1, -1, -1)]:
+        starts = [camera] if k == best else [camera, _turned(camera, turns[k - np.sign(k - best)])]
+        found = [fit.refined(*pieces[k], start, TURN) for start in starts]
+        if max(match(*pieces[k], each).score for each in found) < _GOOD:
+            sole = fit.best_of(*pieces[k], camera, list(fit.tries(*pieces[k], rng)), fit.turned_to)
+            found += [] if sole is None else [fit.refined(*pieces[k], sole, TURN)]
+        chosen = max(found, key=lambda each: match(*pieces[k], each).score)
+        turns[k], scores[k] = _turn_between(camera, chosen), match(*pieces[k], chosen).score
+    return turns, scores
+
+
+def _turned(camera: Pinhole, turn: Array) -> Pinhole:
     """The camera turned by a rotation vector (3,) of its own axes."""
     return Pinhole(camera.K, exp_so3(turn) @ camera.cTw)
 
 
-def turn_between(camera: Pinhole, other: Pinhole) -> Array:
+def _turn_between(camera: Pinhole, other: Pinhole) -> Array:
     """(3,) the rotation vector of what turns a camera to another."""
     return log_so3(other.cTw[:, :3] @ camera.cTw[:, :3].T)
 
 
-@dataclass(frozen=True)
-class _Pieces:
-    """One camera in pieces of the recording."""
-
-    others: Others
-    seen: Sightings
-    camera: Pinhole
-    edges: Array
-    """(n + 1,) frames at which pieces begin, and one after the last."""
-    score: Array
-    """(n,) of each piece, as the camera is given."""
-    shift: Array
-    """(n, 2) how far right and down people are seen (median), a part of their size; NaN where too few are."""
-    told: Mask
-    """(n,) whether there are people enough."""
-
-    @classmethod
-    def of(cls, others: Others, seen: Sightings, camera: Pinhole) -> "_Pieces":
-        both = np.intersect1d(others.frame, seen.frame)
-        count = min(_PIECES, max(1, len(both) // _LEAST_PEOPLE))
-        edges = (
-            np.unique(np.quantile(both, np.linspace(0, 1, count + 1)).astype(np.intp)) if len(both) > 0 else [0]
-        )
-        edges = np.array([*edges[:-1], edges[-1] + 1])
-        score, shift, told = [], [], []
-        for first, last in pairwise(edges):
-            few, mine = _during(others, seen, first, last)
-            found = match(few, mine, camera)
-            points, xy = few.points[found.person], mine.xy[found.sighting]
-            at = points @ (camera.K @ camera.cTw[:, :3]).T + camera.K @ camera.cTw[:, 3]
-            off = (xy - at[..., :2] / at[..., 2:]) / mine.size_px[found.sighting][:, None, None]
-            score.append(found.score)
-            enough = found.possible >= _LEAST_PEOPLE
-            told.append(enough)
-            many = len(found.person) >= _LEAST_PEOPLE
-            shift.append(np.nanmedian(np.nanmedian(off, axis=1), axis=0) if many else (np.nan, np.nan))
-        return cls(others, seen, camera, edges, np.array(score), np.array(shift), np.array(told, dtype=bool))
-
-    @property
-    def restless(self) -> bool:
-        """Whether pieces differ."""
-        score, shift = self.score[self.told], self.shift[self.told]
-        if len(score) < 3 or score.max() < _THERE:
-            return False
-        shift = shift[~np.isnan(shift[:, 0])]
-        way = np.ptp(shift, axis=0).max(initial=0.0) if len(shift) > 0 else 0.0
-        return bool(np.ptp(score) > _LOST or way > _RESTLESS)
-
-    @property
-    def middle(self) -> Array:
-        """(n,) the frames in the middle of the pieces."""
-        return (self.edges[:-1] + self.edges[1:] - 1) / 2
-
-    def turns(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """(n, 3) the turn that fits each piece best, and (n,) how well; each from the next one that fits."""
-        n = len(self.score)
-        turns, scores = np.zeros((n, 3)), np.zeros(n)
-        best = int(np.argmax(np.where(self.told, self.score, -1)))
-        for k in [*range(best, n), *range(best - 1, -1, -1)]:
-            near = k - 1 if k > best else k + 1
-            start = np.zeros(3) if k == best else turns[near]
-            few, mine = _during(self.others, self.seen, self.edges[k], self.edges[k + 1])
-            if not self.told[k]:
-                turns[k] = start
-                continue
-            tried = [self.camera, turned(self.camera, start)]
-            found = [self._fitted(few, mine, each) for each in tried[: 1 if k == best else 2]]
-            if max(score for score, _ in found) < _GOOD:
-                pairs = list(fit.tries(few, mine, rng))
-                sole = fit.best_of(few, mine, self.camera, pairs, fit.turned_to)
-                found += [] if sole is None else [self._fitted(few, mine, sole)]
-            scores[k], chosen = max(found, key=lambda pair: pair[0])
-            turns[k] = turn_between(self.camera, chosen)
-        return turns, scores
-
-    @staticmethod
-    def _fitted(others: Others, seen: Sightings, camera: Pinhole) -> tuple[float, Pinhole]:
-        new = fit.refined(others, seen, camera, TURN)
-        return match(others, seen, new).score, new
-
-
-def _during(others: Others, seen: Sightings, first: int, last: int) -> tuple[Others, Sightings]:
-    """What is of some frames only."""
-    here = (others.frame >= first) & (others.frame < last)
-    return Others(others.frame[here], others.points[here]), seen.only((seen.frame >= first) & (seen.frame < last))
-
-
-def _bumped(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Way, int]:
-    """One step from one turn to another, and what it has of parameters."""
-    others, seen, camera = pieces.others, pieces.seen, pieces.camera
-    where = np.flatnonzero(usable)
-    cost = []
-    for j in range(1, len(where)):
-        parts = turns[where[:j]], turns[where[j:]]
-        cost.append(sum(np.abs(each - np.median(each, axis=0)).sum() for each in parts))
-    j = int(np.argmin(cost)) + 1
-    before, after = np.median(turns[where[:j]], axis=0), np.median(turns[where[j:]], axis=0)
+def _bumped(others: Others, seen: Sightings, camera: Pinhole, turns: Array) -> tuple[Finding, Way, int]:
+    """One step from one turn to another, by the `turns` (n, 3) of pieces, and its number of parameters."""
+    splits = [(turns[:j], turns[j:]) for j in range(1, len(turns))]
+    split = min(splits, key=lambda parts: sum(np.abs(each - np.median(each, axis=0)).sum() for each in parts))
+    before, after = (np.median(each, axis=0) for each in split)
     rest = np.deg2rad(_LEAST_DEG)
     before, after = (np.where(np.linalg.norm(each) < rest, 0.0, 1.0) * each for each in (before, after))
     for _ in range(2):
         at = _step(others, seen, camera, before, after)
-        sides = []
-        for turn, first, last in ((before, -1, at), (after, at, np.iinfo(np.intp).max)):
-            few, mine = _during(others, seen, first, last)
-            if turn.any() and len(few) > 0 and len(mine) > 0:
-                new = fit.refined(few, mine, turned(camera, turn), TURN)
-                turn = turn_between(camera, new)
-            sides.append(turn)
-        before, after = sides
-    amount = fit.difference(turned(camera, after).cTw, turned(camera, before).cTw)[0]
+        before = _settled(*_during(others, seen, -1, at), camera, before)
+        after = _settled(*_during(others, seen, at, np.inf), camera, after)
+    amount = fit.difference(_turned(camera, after).cTw, _turned(camera, before).cTw)[0]
+    frames = (None, at) if np.linalg.norm(before) > np.linalg.norm(after) else (at, None)
+    finding = Finding(Kind.BUMPED, (), amount, frames=frames)
+    return (
+        finding,
+        lambda frame: np.where((frame < at)[:, None], before, after),
+        1 + 3 * int(before.any()) + 3 * int(after.any()),
+    )
 
-    def way(frame: Index) -> Array:
-        return np.where((frame < at)[:, None], before, after)
 
-    first_wrong = np.linalg.norm(before) > np.linalg.norm(after)
-    frames = (None, at) if first_wrong else (at, None)
-    freedom = 1 + 3 * int(before.any()) + 3 * int(after.any())
-    return Finding(Kind.BUMPED, (), amount, frames=frames), way, freedom
+def _settled(others: Others, seen: Sightings, camera: Pinhole, turn: Array) -> Array:
+    """(3,) a turn, other than none, fitted to some frames."""
+    if not turn.any() or min(len(others), len(seen)) == 0:
+        return turn
+    return _turn_between(camera, fit.refined(others, seen, _turned(camera, turn), TURN))
 
 
 def _step(others: Others, seen: Sightings, camera: Pinhole, before: Array, after: Array) -> int:
@@ -211,29 +155,25 @@ def _step(others: Others, seen: Sightings, camera: Pinhole, before: Array, after
     frames = np.unique(others.frame)
     worth = np.zeros((2, len(frames)))
     for row, turn in enumerate((before, after)):
-        found = match(others, seen, turned(camera, turn))
+        found = match(others, seen, _turned(camera, turn))
         place = np.searchsorted(frames, others.frame[found.person])
         worth[row] = np.bincount(place, 1 - found.error / GATE, minlength=len(frames))
     total = np.concatenate([[0], np.cumsum(worth[0])]) + np.concatenate([np.cumsum(worth[1][::-1])[::-1], [0]])
     return int(frames[min(int(np.argmax(total)), len(frames) - 1)])
 
 
-def _drifted(pieces: "_Pieces", turns: Array, usable: Mask) -> tuple[Finding, Way, int]:
-    """A turn that grows with time, and what it has of parameters."""
-    t, w = pieces.middle[usable], turns[usable]
-    first, last = float(pieces.edges[0]), float(pieces.edges[-1] - 1)
+def _drifted(t: Array, turns: Array, first: int, last: int) -> tuple[Finding, Way, int]:
+    """A turn that grows with time, by the `turns` (n, 3) of pieces at frames `t` (n,), and its number of
+    parameters.
+    """
     A = np.column_stack([np.ones(len(t)), t - first])
     weight = np.ones(len(t))
     for _ in range(5):
-        line = np.linalg.lstsq(A * weight[:, None], w * weight[:, None], rcond=None)[0]
-        off = np.linalg.norm(w - A @ line, axis=1)
+        line = np.linalg.lstsq(A * weight[:, None], turns * weight[:, None], rcond=None)[0]
+        off = np.linalg.norm(turns - A @ line, axis=1)
         weight = 1 / np.sqrt(1 + (off / np.deg2rad(0.5)) ** 2)
-
-    def way(frame: Index) -> Array:
-        return line[0] + (frame - first)[:, None] * line[1]
-
     amount = float(np.rad2deg(np.linalg.norm(line[1]) * (last - first)))
-    return Finding(Kind.DRIFTING, (), amount), way, 6
+    return Finding(Kind.DRIFTING, (), amount), lambda frame: line[0] + (frame - first)[:, None] * line[1], 6
 
 
 _PARTED, _LEAST_PART, _POOR = 0.3, 0.15, 0.5

@@ -3,7 +3,7 @@
 `check_setup` needs cameras and detections; `result_check` adds what a reconstruction says of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import Any
@@ -39,13 +39,13 @@ class CameraFigures:
     high_px: float | None
     """Nine of ten are nearer."""
     median_mm: float | None
-    """The same median as a length."""
+    """Median distance as a length, millimetres."""
     high_mm: float | None
     """Nine of ten are nearer."""
     left_out_px: float | None
     """Median distance to where the other cameras alone put the joint, pixels."""
     left_out_mm: float | None
-    """The same as a length."""
+    """Median distance to there as a length, millimetres."""
     left_out_matched: float
     """Share of the people seen by the others that the camera could match and does match."""
     late_frames: int
@@ -72,7 +72,7 @@ class SetupReport:
     findings: tuple[Finding, ...]
     """One after the other, gross mistakes first; none where nothing is wrong."""
     warnings: tuple[str, ...]
-    """The same in words, a sentence each."""
+    """The findings in words, a sentence each."""
     cameras: tuple[CameraFigures, ...]
     """By camera, as the set-up was given."""
     pairs: tuple[PairFigures, ...]
@@ -170,9 +170,8 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
         others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
-        out_px = miss_px(points, mine.xy, matched.sighting, camera.K, camera.cTw)
-        depth = points @ camera.cTw[2, :3] + camera.cTw[2, 3]
-        out_px = np.where(np.isfinite(out_px), out_px, np.nan)
+        depth = camera.project(points)[1]
+        out_px = miss_px(points, mine.xy[matched.sighting], camera)
         figures = CameraFigures(
             camera=name,
             people=int(seen[view]),
@@ -200,7 +199,7 @@ def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
 
 
 def quantile(values: Array, part: float) -> float | None:
-    """Of the finite values; None where there are none."""
+    """Return a quantile of the finite values; None where there are none."""
     values = values[np.isfinite(values)]
     return float(np.quantile(values, part)) if len(values) > 0 else None
 
@@ -217,13 +216,13 @@ _ROWS = 300
 _MOST_BETA = 5.0
 """A shape component so many standard deviations from the mean is no person's."""
 _SHARE = 0.1
-"""Of so many rows: fewer are single people that hardly any camera saw."""
+"""Share of rows from which on shapes are named: fewer are single people that hardly any camera saw."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
 """Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
 _MOST, _FEW = 0.5, 50
 """A camera of which less than this share of at least so many detections was used is named."""
 _LOST, _LOST_SHARE = 0.5, 0.1
-"""So many people a frame, and such a share of them, are missing before it is said."""
+"""Least number of people a frame, and least share of them, that are missing for a warning."""
 _LOOKED_AT = 200
 """Frames, spread over the recording, in which detections are counted for that."""
 _SHORT_S = 1.0
@@ -236,7 +235,7 @@ _REASONS = {
 }
 """Why detections that were given to people were not used."""
 _LEAST_USED = 0.1
-"""Of detections on Shelf, false candidates among them, most are somebody's."""
+"""Least share of detections that people explain; on Shelf, false candidates included, it is most."""
 _WORST = 2.0
 """A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
 _FAR_MM = 60.0
@@ -253,11 +252,11 @@ class Distances:
     """Median, and what nine of ten are below, pixels; None without any."""
     median_mm: float | None
     high_mm: float | None
-    """The same as lengths, millimetres."""
+    """Both as lengths, millimetres."""
 
     @classmethod
     def of(cls, px: Array, mm: Array) -> "Distances":
-        """Of all finite distances `px` and `mm`, arrays of one shape."""
+        """Summarise all finite distances `px` and `mm`, arrays of one shape."""
         finite = np.isfinite(px) & np.isfinite(mm)
         return cls(int(finite.sum()), *(quantile(each[finite], part) for each in (px, mm) for part in (0.5, 0.9)))
 
@@ -316,10 +315,10 @@ def result_check(
             if warnings
             else "Nobody was found; look with check-calibration whether cameras and detections fit"
         )
-    warnings += _shapes(people) + _speeds(people)
-    warnings += _too_many(people) or _clutter(uses) or _unused(uses) + _unseen(people, detections, rig, frames)
-    if len(report.findings) == 0:
-        warnings += _outlier(uses)
+    warnings += [*_shapes(people), *_speeds(people)]
+    chance = [*_too_many(people), *_clutter(uses)][:1]
+    warnings += chance or [*_unused(uses), *_unseen(people, detections, rig, frames)]
+    warnings += _outlier(uses) if len(report.findings) == 0 else ()
     return ResultCheck(report, uses, tuple(warnings))
 
 
@@ -383,23 +382,22 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
     return px, mm
 
 
-def _shapes(people: Reconstruction) -> list[str]:
+def _shapes(people: Reconstruction) -> Iterator[str]:
     """Bodies of a shape that no person has."""
     there = np.isfinite(people.betas).all(axis=1)
     largest = np.abs(people.betas[there]).max(axis=1, initial=0.0)
     far = largest > _MOST_BETA
-    if far.sum() == 0 or far.mean() < _SHARE:
-        return []
-    return [
-        f"{far.sum()} of {len(far)} bodies have a shape that nobody has (a component of {largest.max():.0f}"
-        " standard deviations); check the calibration's unit, and whether its poses are inverted"
-    ]
+    if far.sum() > 0 and far.mean() >= _SHARE:
+        yield (
+            f"{far.sum()} of {len(far)} bodies have a shape that nobody has (a component of {largest.max():.0f}"
+            " standard deviations); check the calibration's unit, and whether its poses are inverted"
+        )
 
 
-def _speeds(people: Reconstruction) -> list[str]:
+def _speeds(people: Reconstruction) -> Iterator[str]:
     """People who move as nobody does, where rows have identities."""
     if not people.run.get("configuration", {}).get("temporal", True):
-        return []
+        return
     hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
     order = np.lexsort((people.frame, people.person))
     x, t = people.joints[order][:, hips].mean(axis=1), people.time_s[order]
@@ -407,43 +405,37 @@ def _speeds(people: Reconstruction) -> list[str]:
     with np.errstate(divide="ignore", invalid="ignore"):
         speed = np.linalg.norm(np.diff(x, axis=0), axis=1)[follows] / np.diff(t)[follows]
     speed = np.sort(speed[np.isfinite(speed)])
-    if len(speed) < 2 * _PAIRS:
-        return []
-    fast = float(np.median(speed[-max(len(speed) // 10, 1) :]))
-    if fast < _FASTEST_M_S:
-        return []
-    rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
-    return [
-        f"people move at {fast:.0f} m/s, and nobody does: --fps is probably wrong ({rate:.0f} a second; a camera"
-        " gives 25 to 60), or frames are missing, or the calibration's unit is wrong"
-    ]
+    fast = float(np.median(speed[-max(len(speed) // 10, 1) :])) if len(speed) >= 2 * _PAIRS else 0.0
+    if fast >= _FASTEST_M_S:
+        rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
+        yield (
+            f"people move at {fast:.0f} m/s, and nobody does: --fps is probably wrong ({rate:.0f} a second; a"
+            " camera gives 25 to 60), or frames are missing, or the calibration's unit is wrong"
+        )
 
 
-def _too_many(people: Reconstruction) -> list[str]:
+def _too_many(people: Reconstruction) -> Iterator[str]:
     """Frames with more detections than people could make."""
     frames = sum(last - first for first, last in people.run.get("thinned_frames", {}).get("detections", []))
-    if frames == 0:
-        return []
-    return [
-        f"{frames} frames have more detections than people could make: who is who is chance there, and rows have"
-        f" the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
-    ]
+    if frames > 0:
+        yield (
+            f"{frames} frames have more detections than people could make: who is who is chance there, and rows"
+            f" have the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
+        )
 
 
-def _clutter(uses: Sequence[CameraUse]) -> list[str]:
+def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
     """Detections of which hardly any is a person's."""
     offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
-    if not 0 < used < _LEAST_USED * offered:
-        return []
-    return [
-        f"people explain {100 * used / offered:.1f} % of the detections, and nobody the rest: who is who may be"
-        " chance; ask the detector for surer ones only"
-    ]
+    if 0 < used < _LEAST_USED * offered:
+        yield (
+            f"people explain {100 * used / offered:.1f} % of the detections, and nobody the rest: who is who may"
+            " be chance; ask the detector for surer ones only"
+        )
 
 
-def _unused(uses: Sequence[CameraUse]) -> list[str]:
+def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
     """Cameras whose detections were mostly left out, and why."""
-    said = list[str]()
     for use in uses:
         if use.offered < _FEW or use.used >= _MOST * use.offered:
             continue
@@ -453,8 +445,7 @@ def _unused(uses: Sequence[CameraUse]) -> list[str]:
             if use.unused.get(NOBODY, 0) > use.offered / 2
             else ""
         )
-        said.append(f"{use.camera}: {use.used} of {use.offered} detections were used: {', '.join(why)}{cure}")
-    return said
+        yield f"{use.camera}: {use.used} of {use.offered} detections were used: {', '.join(why)}{cure}"
 
 
 def _unseen(people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]) -> list[str]:
@@ -499,16 +490,15 @@ def unseen(
     return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why} ({most} see most)"]
 
 
-def _outlier(uses: Sequence[CameraUse]) -> list[str]:
+def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
     """A camera that is much farther from the others than these are from each other."""
     lengths = np.array([use.left_out.median_mm for use in uses], dtype=np.float64)  # None is NaN
     if np.isfinite(lengths).sum() < 3:
-        return []
+        return
     worst = int(np.nanargmax(lengths))
     usual = float(np.nanmedian(np.delete(lengths, worst)))
-    if lengths[worst] < max(_WORST * usual, _FAR_MM):
-        return []
-    return [
-        f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras put its joints (median),"
-        f" they are {usual:.0f} mm from each other; look at its calibration and its pictures"
-    ]
+    if lengths[worst] >= max(_WORST * usual, _FAR_MM):
+        yield (
+            f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras put its joints"
+            f" (median), they are {usual:.0f} mm from each other; look at its calibration and its pictures"
+        )

@@ -17,7 +17,7 @@ from shapepose_fg.setup_check.biases import Marginal, Residuals
 from shapepose_fg.setup_check.evidence import Look, observed
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
-from shapepose_fg.setup_check.matching import Groups, followed
+from shapepose_fg.setup_check.matching import followed
 
 ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL, Kind.PRINCIPAL_POINT: CENTRE}
 """What one camera alone may have wrong."""
@@ -72,16 +72,17 @@ class Problem:
 
     @classmethod
     def of(cls, look: Look, given: Views | None = None) -> "Problem":
-        """Of people spread over the frames, against the look's own cameras or others."""
+        """Make the problem of people spread over the frames, against the look's own cameras or others."""
         groups, structure = look.structure(steps=2)
         who = followed(groups.frame, structure.points)
         step = max(1, -(-len(groups) // _MOST_PEOPLE))
-        frame, who = groups.frame[::step], who[::step]
+        groups, who = groups.rows(slice(None, None, step)), who[::step]
+        frame = groups.frame
         often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
         person = np.unique(np.where(often[who], who, len(often)), return_inverse=True)[1]
         ends = np.quantile(frame, np.arange(1, _PARTS) / _PARTS) if len(frame) > 0 else np.zeros(0)
         part = np.unique(np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True)[1]
-        seen = observed(Groups(frame, groups.member[::step]), look.sightings)
+        seen = observed(groups, look.sightings)
         return cls(Residuals.of(seen, look.views, person, part), frame, look.views if given is None else given)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""People around those whom a scene is about: recorded gestures without end, recorded walks past all the others."""
+"""Bystanders of a scene: looped recorded gestures, and recorded walks past everybody else."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,19 +25,19 @@ _STILL = (
     "bend over",
     "arms held high",
 )
-"""What people do who stay where they are, as the recordings name it."""
+"""Actions of people who stay in place, as the recordings name them."""
 _STILL_M, _WALK_M = 0.75, 2.5
-"""Who stays keeps within this; who walks goes farther."""
+"""Radius within which standing people stay, and distance that walking people exceed, m."""
 _TRIES = 4
-"""Ways that are tried, of which the best is walked."""
+"""Number of random paths, of which the best is used."""
 _DECISION_S = 0.1
-"""How often a walker looks up."""
+"""Interval between a walker's decisions, s."""
 _HORIZON_S = np.linspace(0.2, 2.0, 10)
-"""How far ahead a walker sees what the others will do."""
+"""Times ahead at which a walker predicts the others, s."""
 _TURNS = np.linspace(-1.9, 1.9, 15)
-"""Turns that are weighed, rad/s."""
+"""Turning rates that a walker considers, rad/s."""
 _PACES = np.array([0.15, 0.45, 0.75, 1.0])
-"""Speeds that are weighed, as shares of the walker's own."""
+"""Speeds that a walker considers, as shares of the walker's own."""
 
 
 def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
@@ -62,7 +62,7 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
 
 
 def _clips(mocap: Mocap, frames: int, without: frozenset[str]) -> Iterator[tuple[int, str, Array]]:
-    """Clips of so many frames, what is done in them, and where (T, 2) the pelvis is over the floor."""
+    """Clips of at least this many frames, their actions, and the pelvis' positions (T, 2) over the floor."""
     for index, (subject, action) in enumerate(zip(mocap.subjects, mocap.actions, strict=True)):
         if subject not in without and mocap.lengths[index] >= frames:
             start = int(mocap.arrays["seq_start"][index])
@@ -85,7 +85,9 @@ def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
 
 
 def stand(body: BodyModel, betas: Array, clip: Clip, frames: int, fps: float, start: int = 0) -> Performance:
-    """`clip` of somebody who stays, without end, by a body of shape `betas` (10,), its middle at the origin."""
+    """`clip` of a person who stays in place, looped, by a body of shape `betas` (10,), its middle at the
+    origin.
+    """
     clip = endless(clip.resampled(fps), frames, start)
     performed = perform(body, betas, clip)
     return performed.moved(-performed.joints[:, 0, :2].mean(axis=0) if frames > 0 else np.zeros(2))
@@ -96,8 +98,8 @@ def walk_along(
 ) -> Performance:
     """The walk of `clip` along `path` (T, 2) facing `heading` (T,), by a body of shape `betas` (10,).
 
-    The recorded steps are repeated and laid along the path, as many as its length takes: who goes slower
-    than the recording walks slower. `start` is the share of the loop of steps at which the walk begins.
+    The recorded steps are repeated and laid along the path, as many as its length needs: a slower person than the
+    recorded one takes slower steps. `start` is the share of the loop of steps at which the walk begins.
     """
     cycle, gain = _cycle(perform(body, betas, clip.resampled(fps)))
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])[: len(path)]
@@ -118,7 +120,7 @@ def walk_along(
 
 
 def _cycle(walk: Performance) -> tuple[Performance, float]:
-    """Double steps of a straight walk that can follow themselves, without their way along +x; its length."""
+    """Double steps of a straight walk that can be repeated, without the motion along +x; and its length."""
     count = len(walk)
     way = walk.joints[-1, 0, :2] - walk.joints[0, 0, :2]
     walk = walk.moved(np.zeros(2), -float(np.arctan2(way[1], way[0])))
@@ -142,7 +144,8 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
 
 
 Way = tuple[Array, Array]
-"""Where somebody walks (T, 2), metres, and faces (T,), radians from the x axis towards y, without whole turns."""
+"""Positions (T, 2), metres, and headings (T,), radians from the x axis towards y without whole turns, of a
+walker."""
 
 
 def way_through(
@@ -155,13 +158,13 @@ def way_through(
     distance_m: Array,
     half_room_m: float,
 ) -> Way:
-    """A way from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more."""
+    """A path from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more."""
     ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
     return max(ways, key=lambda way: comparable(_way_worth(way, others, distance_m)))
 
 
 def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
-    """How good a way is: first that no one is bumped into, then that it is close."""
+    """Score of a path: first that it touches no one, then that it is close."""
     if others.shape[1] == 0 or len(way[0]) == 0:
         return 0.0
     room = (np.linalg.norm(others - way[0][:, None], axis=-1) - distance_m).min(axis=1)
@@ -171,7 +174,7 @@ def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
 def _walk(
     others: Array, frames: int, rng: np.random.Generator, fps: float, speed: float, distance: Array, half: float
 ) -> Way:
-    """One try: at each decision the turn and pace whose next two seconds are best (dynamic window)."""
+    """One random path: each decision takes the turn and pace whose next two seconds are best (dynamic window)."""
     hold = max(1, round(_DECISION_S * fps))
     xy, heading, pace = _way_start(others, rng, half)
     goal = _way_goal(xy, rng, half)
@@ -199,14 +202,14 @@ def _walk(
 
 
 def _arcs(xy: Array, heading: float, turns: Array, speeds: Array) -> Array:
-    """Where (C, H, 2) each of C turns and speeds leads along the horizon; turns last for at most 0.8 s."""
+    """Positions (C, H, 2) along the horizon for C turns and speeds; turns last for at most 0.8 s."""
     step = np.diff(_HORIZON_S, prepend=0.0)
     angle = heading + turns[:, None] * np.minimum(_HORIZON_S - step / 2, 0.8)
     return xy + np.cumsum(along(angle) * (speeds[:, None] * step)[..., None], axis=1)
 
 
 def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array, float, float]:
-    """A place that is free, facing the middle, and the first pace."""
+    """A free position, the heading towards the middle, and the first pace."""
     spots = rng.uniform(-0.95 * half, 0.95 * half, (64, 2))
     if others.size > 0:
         early = others[: max(1, min(len(others), 20)) : 4]

@@ -1,9 +1,8 @@
 """Candidates of a simulated detector: errors that are correlated over time, false ones, part affinities.
 
-What a detector gets wrong in one frame it gets wrong in the next. The processes are stationary and run frame by
-frame from the first one; each frame has its own generator, made of the seed and the frame's number, so that
-skipping frames leaves the later ones as they are. Affinities are high inside a person, and where another's limb
-passes close by.
+A detector's errors in one frame continue in the next. The processes are stationary and run frame by frame from the
+first one; each frame has its own generator, made of the seed and the frame's number, so that skipping frames
+leaves the later ones as they are. Affinities are high inside a person, and where another's limb passes close by.
 """
 
 from dataclasses import dataclass
@@ -68,15 +67,15 @@ class Table:
 
 @dataclass(frozen=True)
 class FalseCandidates(Table):
-    """False candidates that are there now: F of them."""
+    """The false candidates of the present frame: F of them."""
 
     view: Index
     person: Index
-    """The person that it goes with, or -1."""
+    """(F,) index of the person that it moves with; -1 for none."""
     anchor: Index
-    """The joint that it keeps its distance to."""
+    """(F,) joint to which it keeps its distance."""
     joint: Index
-    """What it claims to be."""
+    """(F,) joint that it claims to be."""
     offset: Array
     """(F, 2) from the anchor in metres, or a place as a share of the image."""
     rank: Array
@@ -86,7 +85,7 @@ class FalseCandidates(Table):
 
 
 class FalseCandidateProcess:
-    """False candidates: some go along with a person, some stay where they are; some flicker, some last."""
+    """False candidates: some move with a person, some stay in place; some flicker, some last."""
 
     def __init__(
         self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int, rate: float
@@ -103,7 +102,7 @@ class FalseCandidateProcess:
         self._present_now: FalseCandidates | None = None
 
     def next(self, frame: int) -> FalseCandidates:
-        """Those of `frame`; to be called for every frame, in order."""
+        """The false candidates of `frame`; to be called for every frame, in order."""
         rng = np.random.default_rng([self._seed, frame, 1])
         if self._present_now is None:
             self._present_now = self._born(rng, self._present)
@@ -113,7 +112,7 @@ class FalseCandidateProcess:
         return self._present_now
 
     def _born(self, rng: np.random.Generator, rate: Array) -> FalseCandidates:
-        """Poisson counts of `rate` (3, 2): by how long they stay, near people and far from them."""
+        """Poisson counts of `rate` (3, 2): by duration, near people and far from them."""
         kind = np.repeat(np.arange(6), rng.poisson(rate).ravel())
         stays, far = self._stays[kind // 2], kind % 2 == 1
         count = len(kind)
@@ -132,28 +131,30 @@ class FalseCandidateProcess:
 
 
 def _root(correlation: Array) -> Array:
-    """What independent rows (..., 25) are multiplied with from the right to correlate so; rounding is forgiven."""
+    """Matrix that correlates independent rows (..., 25) when multiplied from the right; rounding errors are
+    tolerated.
+    """
     root = symmetric_root(correlation)
     return (root / np.linalg.norm(root, axis=1, keepdims=True)).T
 
 
 _A, _B = np.array(BODY_25.limbs).T
 _LEAST_LENGTH_PX = 8.0
-"""Limbs that are seen from their end count as long as this."""
+"""Minimum length of a limb in the image, pixels; for limbs seen along their axis."""
 
 
 @dataclass(frozen=True)
 class Candidates(Table):
-    """Candidates while they are made: D of them."""
+    """D candidates while they are generated."""
 
     view: Index
     joint: Index
     xy: Array
     confidence: Array
     owner: Mask
-    """(D, P) whose joint a candidate is; none's where it is false, two people's where two are one."""
+    """(D, P) people whose joint a candidate is; none where it is false, two where two joints merged."""
     reach_px: Array
-    """(D,) nearer than this to a better candidate of the same joint it is not seen as one of its own."""
+    """(D,) distance to a better candidate of the same joint below which it is not separate, pixels."""
 
 
 def affinities(
@@ -168,10 +169,10 @@ def affinities(
 ) -> tuple[Index, Array]:
     """Pairs (E, 2) of D candidates and their affinities (E,), those above 0.
 
-    `true_xy` (V, P, 25, 2) is where joints truly are, `captors` (2, V, P, 25) who stands before a missed joint and
-    has, or has not, captured it. A right pair's affinity goes with the lower of its confidences. A wrong pair's
-    goes with the detour: the distance of its wrong end from the right one, in limb lengths. `doubt` and `wrong`
-    are the knobs of `DetectorConfig`.
+    `true_xy` (V, P, 25, 2) are the true joints, `captors` (2, V, P, 25) the people in front of a missed joint who
+    captured it, or did not. A right pair's affinity correlates with the lower of its confidences. A wrong pair's
+    correlates with the detour: the distance of its wrong end from the right one, in limb lengths. `doubt` and
+    `wrong` are settings of `DetectorConfig`.
     """
     view, joint, owner = found.view, found.joint, found.owner
     first, second, limb = _pairs(view, joint, len(true_xy))
@@ -217,7 +218,7 @@ def _pairs(view: Index, joint: Index, views: int) -> tuple[Index, Index, Index]:
 
 
 def _detour(found: Candidates, near: Index, far: Index, true_xy: Array) -> Array:
-    """(E,) how far candidates `far` are from that joint of those who own `near`, in limb lengths, or inf."""
+    """(E,) distance of candidates `far` from that joint of the owners of `near`, in limb lengths, or inf."""
     if found.owner.shape[1] == 0:
         return np.full(len(near), np.inf)
     view, owner = found.view[near], found.owner[near]

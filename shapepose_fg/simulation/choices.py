@@ -1,4 +1,4 @@
-"""Choices that are the same on every processor."""
+"""Choices that are independent of the processor's rounding."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,8 +9,8 @@ _DECIMALS = 9
 
 
 def comparable(values: ArrayLike) -> Array:
-    """Values for comparisons, rounded: those that would be equal but for a processor's rounding are.
+    """Values rounded for comparisons: those that differ by a processor's rounding only become equal.
 
-    Motions that repeat themselves or are symmetrical give many such values. Of equals the first is chosen.
+    Periodic or symmetrical motions give many such values. Of equal ones the first is chosen.
     """
     return np.round(np.asarray(values, dtype=np.float64), _DECIMALS)

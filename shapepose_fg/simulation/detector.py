@@ -1,6 +1,6 @@
-"""A detector that errs as a real one does: from where people truly are to 2D joint candidates and part affinities.
+"""A simulated detector with realistic errors: from true joints to 2D joint candidates and part affinities.
 
-What it draws from was measured on real detections (`detector_statistics.py`, docs/simulation.md). A joint has a
+Its distributions were measured on real detections (`detector_statistics.py`, docs/simulation.md). A joint has a
 quality that is correlated over time: at the low end it is missed, above that its quality is its confidence, and
 its error has the size that errors of this confidence have.
 """
@@ -37,9 +37,9 @@ from shapepose_fg.simulation.visibility import (
 
 _MIRROR = np.array(BODY_25.mirror)
 _MIRROR_APART_M = 0.12
-"""Left and right are swapped only where they are this far from each other in the image."""
+"""Minimum distance between left and right in the image at which they are swapped, m."""
 _LARGEST_ERROR_M = 0.25
-"""Errors were measured up to here; what is farther is a miss and a false candidate."""
+"""Largest error that was measured, m; beyond it there is a miss and a false candidate."""
 
 _HIDDEN, _SEEN = 0.3, 0.7
 """Visible fraction below (above) which a joint counts as occluded (visible); linear in between."""
@@ -47,23 +47,23 @@ _HALF_LOST, _WHOLLY_LOST = 1.96, 2.80
 """Increases of the probit at which half, and four fifths, of the joints are missed of which one in 40 is missed
 otherwise."""
 _NEAR_M = 0.5
-"""False candidates nearer than this to somebody's joint were counted as that person's."""
+"""Distance from a person's joint within which false candidates were counted as that person's, m."""
 
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """How much the detector errs: 1 is as measured, 0 not at all, 2 twice as much."""
+    """Size of the detector's errors: 1 is as measured, 0 none, 2 twice as much."""
 
     noise: float = 1.0
     """Size of the errors of position."""
     misses: float = 1.0
     """Share of the joints that are not reported, up to all of them."""
     doubt: float = 1.0
-    """How far confidences, and affinities of right pairs, are below 1."""
+    """Deviation of confidences, and of affinities of right pairs, from 1."""
     false_candidates: float = 1.0
     """Number of false candidates."""
     swaps: float = 1.0
-    """Share of the joints that are called by their mirror's name."""
+    """Share of the joints that get the name of their mirror."""
     captures: float = 1.0
     """Share of the missed joints behind another person whose neighbours are joined to that person's joint."""
     merging: float = 1.0
@@ -71,11 +71,11 @@ class DetectorConfig:
     wrong_affinities: float = 1.0
     """Share of the wrong pairs that get an affinity."""
     offsets: KeypointOffsets | None = None
-    """Where it puts its joints, if not where the body has its keypoints: every detector has its own skeleton."""
+    """Offsets of its joints from those of the body: every detector has its own skeleton. None: no offsets."""
     statistics: DetectorStatistics = field(default_factory=measured, repr=False)
-    """What is meant by "as measured"."""
+    """The measured distributions."""
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
-    """How the depth buffer is read."""
+    """Settings of the visibility test."""
 
     def __post_init__(self) -> None:
         for name in _KNOBS:
@@ -87,11 +87,13 @@ class DetectorConfig:
 
     @classmethod
     def perfect(cls) -> "DetectorConfig":
-        """Reports every joint in the image exactly where it is, with confidence 1, and nothing else."""
+        """A detector that reports every joint in the image at its true place, with confidence 1, and nothing
+        else.
+        """
         return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values, for a record of a run; the statistics are told by their provenance."""
+        """The settings as plain values, for the record of a run; the statistics are named by their provenance."""
         knobs = {name: getattr(self, name) for name in _KNOBS}
         knobs |= {"offsets": None if self.offsets is None else self.offsets.as_dict()}
         return knobs | {"statistics": self.statistics.provenance, "visibility": asdict(self.visibility)}
@@ -111,11 +113,11 @@ def simulate(
 ) -> Recording:
     """Detect everybody in `scene`; the same seed gives the same bytes.
 
-    `frames` picks rising frame numbers, all by default. Errors last over time, so the detector runs through the
-    frames before and between them too (without looking): every frame comes out as it does in the whole recording.
-    A scene that is cut starts afresh, with errors as they are at any time. `workers` processes find out what is
-    visible, which is most of the work (1: this one does it); they change no byte. `progress` is told the frames
-    that are done, and all.
+    `frames` picks rising frame numbers, all by default. Errors are correlated over time, so that the detector also
+    runs through the frames before and between them, without visibility: every frame is the same as in the whole
+    recording. After a cut the errors start again, in their stationary distribution. `workers` processes compute
+    visibility, which is most of the work (1: this process); they change no byte. `progress` is called with the
+    number of finished frames, and of all.
     """
     config = DetectorConfig() if config is None else config
     scene = scene if config.offsets is None else scene.with_keypoint_offsets(config.offsets)
@@ -140,17 +142,17 @@ def simulate(
 
 
 class Detector:
-    """A detector that looks at one recording, frame after frame; its errors last."""
+    """A detector for one recording, frame after frame; its errors are correlated over time."""
 
     def __init__(self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0) -> None:
-        """Look at `people` people with the cameras of `rig`, `fps` frames a second."""
+        """Detect `people` people with the cameras of `rig`, `fps` frames a second."""
         self._rig, self._config, self._table, self._seed = rig, config, config.statistics, seed
         given = (len(rig), people, fps, config.statistics, seed)
         self._noise, self._false = NoiseProcess(*given), FalseCandidateProcess(*given, config.false_candidates)
         self._frame = 0
 
     def skip_to(self, frame: int) -> None:
-        """Let time pass until `frame` is the next one; ValueError if it has passed."""
+        """Advance the errors until `frame` is the next one; ValueError if it has passed."""
         if frame < self._frame:
             raise ValueError(f"frames must come in order: frame {frame} asked for, {self._frame} is next")
         while self._frame < frame:
@@ -159,9 +161,9 @@ class Detector:
             self._frame += 1
 
     def detect(self, joints: Array, visibility: Visibility, rig: Rig | None = None) -> Detections:
-        """The candidates of the next frame: BODY_25 `joints` (P, 25, 3), of which `visibility` is known.
+        """The candidates of the next frame: BODY_25 `joints` (P, 25, 3) with `visibility`.
 
-        `rig` is where the cameras are, if they move.
+        `rig` are the cameras at that time, if they move.
         """
         config, self._rig = self._config, self._rig if rig is None else rig
         noise, false = self._noise.next(self._frame), self._false.next(self._frame)
@@ -188,7 +190,7 @@ class Detector:
         noise: Array,
         rng: np.random.Generator,
     ) -> tuple[Candidates, Mask]:
-        """The joints of people that are reported, each with its error; and which they are, (V, P, 25)."""
+        """The reported joints of people, each with its error; and their mask (V, P, 25)."""
         table, config, sizes = self._table, self._config, self._rig.image_sizes
         seen = seen_from_the_front(visibility.seen, joints, self._rig.centres, table.facing)
         seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
@@ -246,7 +248,7 @@ class Detector:
         )
 
     def _worse(self, visibility: Visibility, seen: Array, noise: Array) -> Array:
-        """How much worse (V, P, 25) joints are found of people buried behind others, or lost, as a probit."""
+        """Increase (V, P, 25) of the probit of a miss for people who are buried behind others, or lost."""
         # What its own body hides is no worse off when others hide the rest.
         table, behind = self._table, visibility.hidden_by >= 0
         share = (behind & (visibility.seen < 0.5)).mean(axis=-1, keepdims=True)
@@ -260,7 +262,9 @@ class Detector:
     def _sigma_px(
         self, confidence: Array, seen: Array, hidden_as: Index, px_a_metre: Array, scale: Array
     ) -> Array:
-        """Sigmas (D,) of the errors of reported joints, px, whose tails are drawn by `scale` (D,), normal."""
+        """Standard deviations (D,) of the errors of reported joints, px; `scale` (D,), normal, makes the tails
+        heavier.
+        """
         table = self._table
         floor_m = table.floor_px / table.size_px_a_metre
         # What the grid adds is part of the measured sigma; people of other sizes get it anew.
@@ -276,7 +280,7 @@ class Detector:
     def _captors(
         self, reported: Mask, true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
     ) -> Index:
-        """(2, V, P, 25) who stands before a missed joint and captured it (`affinities`), or did not; -1: none."""
+        """(2, V, P, 25) people in front of a missed joint who captured it (`affinities`), or did not; -1: none."""
         table = self._table
         view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
         front = visibility.hidden_by[view, person, joint]
@@ -290,7 +294,7 @@ class Detector:
         return captors
 
     def _invented(self, false: FalseCandidates, true_xy: Array, depth: Array) -> Candidates:
-        """The false candidates of this frame, where they are now."""
+        """The false candidates of this frame, at their present positions."""
         table, focal_px = self._table, self._rig.focal_px
         near = false.person >= 0
         size = self._rig.image_sizes[false.view]
@@ -314,7 +318,9 @@ class Detector:
         return found.take(there)
 
     def _reach_px(self, probability: Array, height_px: Array) -> Array:
-        """How near (D,) to a better one of its joint a candidate is lost: logistic, in proportion to the image."""
+        """Distance (D,) to a better candidate of the joint within which one is lost: logistic, relative to the
+        image's size.
+        """
         table, drawn = self._table, np.clip(probability, 1e-6, 1 - 1e-6)
         reach = table.merge_px + table.merge_width_px * np.log(drawn / (1 - drawn))
         return self._config.merging * np.maximum(reach, 0.0) * height_px / table.merge_height_px
@@ -342,5 +348,5 @@ def _merge(found: Candidates) -> Candidates:
 
 
 def _between(hidden: Array, visible: Array, seen: Array) -> Array:
-    """From the value of a hidden joint to that of a visible one, by the share that is seen."""
+    """Interpolate from the value of a hidden joint to that of a visible one, by the visible share."""
     return hidden + (visible - hidden) * seen

@@ -1,4 +1,4 @@
-"""How a real detector errs, as tables measured on the Shelf recording (docs/simulation.md).
+"""Errors of a real detector, as tables measured on the Shelf recording (docs/simulation.md).
 
 The code that measures is `simulation/measurement` of commit 77ab725.
 """
@@ -36,15 +36,16 @@ class DetectorStatistics:
     buried_share: Array
     """(B,) shares of a person's joints in a view that other people hide."""
     buried: Array
-    """(B,) what they add to a miss and take from a confidence, as a standard normal (probit)."""
+    """(B,) increase of a miss's, and decrease of a confidence's, standard normal (probit) at these shares."""
     lost: Array
-    """(2,) share of the people in a view half, or four fifths, of whom is missed though no other hides them."""
+    """(2,) share of the people in a view half, or four fifths, of whose joints are missed though nobody hides
+    them."""
     lost_memory: Array
-    """(2, 2) as `error_memory`: how long that lasts."""
+    """(2, 2) share and time constant in seconds of a fast and a slow part of such losses."""
     lost_correlation: Array
-    """(25, 25) between a person's joints."""
+    """(25, 25) correlation of losses between a person's joints."""
     confidence: Array
-    """(G, 3, K) quantiles of the confidence of those that are."""
+    """(G, 3, K) quantiles of the confidence of reported joints."""
     knots: Array
     """(N,) confidences at which sigma and tail are given."""
     sigma_m: Array
@@ -52,54 +53,54 @@ class DetectorStatistics:
     tail: Array
     """(3, N) standard deviation of the logarithm of a sigma that changes: it makes tails heavier than Gaussian."""
     joint_scale: Array
-    """(G, 2) what sigma is multiplied with along x and y of the image."""
+    """(G, 2) factors on sigma along x and y of the image."""
     floor_px: float
-    """What the detector's grid adds at any size, part of `sigma_m`, pixels."""
+    """Contribution of the detector's grid to `sigma_m` at any size, pixels."""
     size_px_a_metre: float
-    """The median size."""
+    """Median size of a person in the image, pixels per metre."""
     facing: Array
-    """(5, 2) cosines between which nose, eyes and ears come into sight."""
+    """(5, 2) cosines between which nose, eyes and ears become visible."""
     error_memory: Array
     """(2, 2) share and time constant in seconds of a fast and a slow part of the errors; the rest is white."""
     confidence_memory: Array
     """(2, 2) share and time constant in seconds of a fast and a slow part of the variation of confidences and
     misses."""
     error_correlation: Array
-    """(25, 25) between the errors of a person's joints in one view."""
+    """(25, 25) correlation between the errors of a person's joints in one view."""
     confidence_correlation: Array
-    """(25, 25) between their confidences."""
+    """(25, 25) correlation between the confidences of a person's joints in one view."""
     swap: float
     """Share of the joints apart from their mirror that are reported as the mirror."""
     double: float
-    """Share of them that are reported under both names."""
+    """Share of these joints that are reported under both names."""
     double_m: float
-    """Sigma of each coordinate of the distance between the two."""
+    """Standard deviation of each coordinate of the distance between the two, m."""
     double_confidence: Array
     """(K,) quantiles of the confidence of the one with the wrong name."""
     capture_gap_m: Array
-    """(B,) distances from a hidden joint to the same joint of whoever hides it."""
+    """(B,) distances from a hidden joint to the same joint of the person who hides it, m."""
     capture: Array
-    """(B,) share of the missed ones that are found there."""
+    """(B,) share of the missed joints that are found there."""
     merge_px: float
     """Distance at which two people's same joints are found as one in half the cases, at `merge_height_px`."""
     merge_width_px: float
-    """How softly."""
+    """Width of that transition, pixels."""
     merge_height_px: float
-    """Height of the images in which that was measured."""
+    """Height of the images in which that was measured, pixels."""
     false_near: float
-    """False candidates near a person, for each person and view; joints under both names are none of them."""
+    """Number of false candidates near a person, per person and view, without duplicates of joints."""
     false_far: float
-    """False candidates elsewhere, in each view."""
+    """Number of false candidates elsewhere, per view."""
     false_near_m: Array
-    """(K,) quantiles of the distance of those near a person to the next joint."""
+    """(K,) quantiles of the distance of those near a person to the next joint, m."""
     false_joints: Array
-    """(K,) quantiles of the confidence of false candidates near a person."""
+    """(G,) share of the false candidates that claim to be each joint."""
     false_near_confidence: Array
-    """(K,) quantiles of the confidence of false candidates elsewhere."""
+    """(K,) quantiles of the confidence of false candidates near a person."""
     false_far_confidence: Array
-    """(K,)"""
+    """(K,) quantiles of the confidence of false candidates elsewhere."""
     false_memory: Array
-    """(2, 2) as `error_memory`: how long false candidates stay."""
+    """(2, 2) share and time constant in seconds of a short and a long duration of false candidates."""
     affinity_right: Array
     """(14, K) quantiles of the affinity of right pairs, by limb."""
     affinity_right_confidence: Array
@@ -117,11 +118,11 @@ class DetectorStatistics:
     affinity_nobody: Array
     """(B, K) quantiles of the affinity of those pairs."""
     provenance: str = "not known"
-    """Where they come from."""
+    """Origin of the tables."""
 
     @classmethod
     def read(cls, path: Path) -> "DetectorStatistics":
-        """From a file like the shipped one: an entry for each field."""
+        """Read a file like the shipped one, with an entry for each field."""
         content = read_json(path)
         tables: dict[str, Any] = {name: content[name] for name in cls.__dataclass_fields__}
         for name, table in tables.items():
@@ -139,7 +140,7 @@ class DetectorStatistics:
         return first + (second - first) * part
 
     def probability(self, table: Array, value: Array) -> Array:
-        """The inverse of `quantile`: how probable less than `value` (...,) is, tables (..., K)."""
+        """The inverse of `quantile`: the probability of less than `value` (...,), tables (..., K)."""
         at = np.clip((value[..., None] >= table).sum(axis=-1) - 1, 0, len(self.levels) - 2)
         low = np.take_along_axis(table, at[..., None], axis=-1)[..., 0]
         high = np.take_along_axis(table, at[..., None] + 1, axis=-1)[..., 0]

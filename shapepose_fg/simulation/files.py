@@ -18,7 +18,7 @@ from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, SequenceConfig, Split, sequence
 
 Format = Literal["association", "openpose"]
-"""What detections are written as."""
+"""Formats of simulated detections."""
 
 NAMES = ("demo", *SEQUENCES)
 """The built-in scene, and the interaction sequences that are made of recorded motions."""
@@ -26,7 +26,7 @@ NAMES = ("demo", *SEQUENCES)
 _OPENPOSE = "openpose"
 """The folder of OpenPose's folders."""
 _MOCAP = Path("data") / "cmu_mocap" / "cmu_smpl24.npz"
-"""Where the recorded motions are inside the folder of real recordings."""
+"""Path of the recorded motions inside the folder of real recordings."""
 
 
 def named_scene(
@@ -41,10 +41,10 @@ def named_scene(
     config: SequenceConfig | None = None,
     fps: float | None = None,
 ) -> Scene:
-    """The scene called `name`; InputError, one sentence, where an option is wrong or the motions are not there.
+    """The scene called `name`; InputError, one sentence, where an option is wrong or the motions are missing.
 
-    `people` and `seed` are the built-in scene's, which has 60 frames, or `frames` if that is more. A sequence
-    is what it is, or what `config` says; where only its first `frames` are wanted (0: all) the later segments are
+    `people` and `seed` are for the built-in scene, which has 60 frames, or `frames` if that is more. A sequence is
+    defined by its name, or by `config`; where only its first `frames` are wanted (0: all) the later segments are
     not made. `fps` are frames a second, by default 25 of the built-in scene and 30 of a sequence.
     """
     if name not in NAMES:
@@ -72,7 +72,7 @@ def truth_of(scene: Scene) -> Reconstruction:
     """Everybody in every frame of `scene`, row by row as `person` 0 to P - 1, frame 0 first.
 
     Joints and bodies are exact: covariances are zero and confidences one. Velocities and how joints are known are
-    not given: nothing says what was visible.
+    missing, because visibility is unknown.
     """
     T, P = scene.motion.transl.shape[:2]
     N = T * P
@@ -101,11 +101,12 @@ def check_output(scene: Scene, folder: Path, format: Format) -> None:
 def write_simulated(
     scene: Scene, detections: DetectionSequence, folder: Path, format: Format, **run: Any
 ) -> dict[str, Path]:
-    """Write cameras, detections and truth of a simulated recording into `folder`; returns what is where.
+    """Write cameras, detections and truth of a simulated recording into `folder`; returns a description of the
+    files.
 
     `rig.json`; `calibration.json` and `detection/<camera>.txt`, or `openpose/<camera>/`; and `truth/people.npz`,
-    apart so that a reconstruction that is saved into the same folder does not take its place. `run` goes into
-    `truth/run.json`, with the frames a second and the cuts: first frames of what follows one.
+    in a folder of its own so that a reconstruction that is saved into the same folder does not replace it. `run`
+    goes into `truth/run.json`, with the frame rate and the cuts: first frames of what follows one.
     """
     write_rig(scene.rig, folder / "rig.json")
     if format == "association":

@@ -1,7 +1,7 @@
-"""Puppets to poses: where pelvis, hands and feet are, turned into SMPL's joint rotations.
+"""Converts puppets to poses: from positions of pelvis, hands and feet to SMPL's joint rotations.
 
-A `Puppet` says where the ends of the body go; legs and arms are two-bone chains and are solved in closed
-form. All of it is batched over frames, for one person at a time.
+A `Puppet` has the ends of the body's limbs; legs and arms are two-bone chains and are solved in closed form. All
+of it is batched over frames, for one person at a time.
 """
 
 from dataclasses import dataclass
@@ -20,32 +20,32 @@ _PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18
 _KNEE_HINGE = np.array([1.0, 0.0, 0.0])
 _ELBOW_HINGE = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
 _REACH = 0.995
-"""A limb is never quite straight: the bend keeps the side on which the joint lies."""
+"""Largest extension of a limb, as a share of its length: its bend keeps the side on which the joint lies."""
 
 
 @dataclass(frozen=True)
 class Puppet:
-    """Where one person's pelvis, feet, hands and eyes are in T frames; world z up, metres and radians."""
+    """Pelvis, feet, hands and gaze of one person in T frames; world z up, metres and radians."""
 
     pelvis: Array
     """(T, 3) pelvis joint."""
     heading: Array
-    """(T,) direction that the pelvis faces, from the x axis towards the y axis."""
+    """(T,) heading of the pelvis, from the x axis towards the y axis."""
     lean: Array
     """(T, 3) angles of the trunk, summed over its three joints: forward, twist to the left, towards the right,
     rad."""
     ankles: Array
     """(T, 2, 3) ankle joints, left and right."""
     foot_heading: Array
-    """(T, 2) where the feet point."""
+    """(T, 2) headings of the feet."""
     foot_pitch: Array
-    """(T, 2) heel above toes."""
+    """(T, 2) pitch of the feet: heel above toes."""
     wrists: Array
     """(T, 2, 3) wrist joints, left and right, where `reach` is 1."""
     reach: Array
-    """(T, 2) 1 where the wrist follows `wrists`, 0 where the arm swings as it likes."""
+    """(T, 2) 1 where the wrist follows `wrists`, 0 where the arm swings freely."""
     swing: Array
-    """(T, 2) how far a free hand is in front of its resting place, metres."""
+    """(T, 2) distance of a free hand in front of its resting place, metres."""
     gaze: Array
     """(T, 3) point that the head turns to."""
 
@@ -123,7 +123,7 @@ def _turn_head(turned: Array, position: Array, gaze: Array) -> None:
 
 
 def _hand_target(puppet: Puppet, turned: Array, position: Array, bones: Array, side: int) -> Array:
-    """Where a wrist goes (T, 3): to its target, or to hang beside the hip and swing, or between the two."""
+    """Target of a wrist (T, 3): its own, or hanging beside the hip and swinging, or between the two."""
     shoulder, elbow, wrist = ARMS[side][1:]
     length = np.linalg.norm(bones[elbow]) + np.linalg.norm(bones[wrist])
     sign = (1.0, -1.0)[side]

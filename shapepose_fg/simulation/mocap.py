@@ -23,12 +23,12 @@ _OF_CLIP = "seq_start seq_len fps names subject action tier wrist_valid toe_vali
 _ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
 _ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
 _GLITCH_RAD_S = np.radians(900.0)
-"""No joint of a walker or dancer turns faster; a marker that jumps does."""
+"""Angular speed above which a marker has jumped, rad/s: no joint of a walker or dancer turns faster."""
 
 COLLARS, SHOULDERS = (13, 14), (16, 17)
 """Left and right in SMPL's order."""
 _SETTING = np.radians(30.0)
-"""Up to this elevation of the arm only the glenohumeral joint turns (Inman, Saunders and Abbott 1944)."""
+"""Elevation of the arm up to which only the glenohumeral joint turns (Inman, Saunders and Abbott 1944)."""
 _RISE = 0.2
 """Elevation of the clavicle for each radian of the arm's beyond `_SETTING`: 30 degrees with the arm overhead.
 
@@ -36,10 +36,10 @@ Overhead, a third of the arm's elevation is the shoulder blade's (1:2), and half
 half, at the outer end of the clavicle, hardly moves the shoulder's centre, and SMPL's tree has no joint for it.
 """
 _REST = np.radians(60.0)
-"""The arm's elevation at which the collar is as in the T-pose: the T-pose of a body file is made by turning the
-arms of one that stands with arms half raised, its collars stay."""
+"""Elevation of the arm at which the collar is as in the T-pose: body files' T-poses are made by turning the
+arms of a body that stands with arms half raised, and its collars stay."""
 _SWEEP = 0.22
-"""Radians by which the collar goes forward when the raised arm points forward, and back when it points back."""
+"""Rotation of the collar, rad, forward when the raised arm points forward, and back when it points back."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class Clip:
     name: str
     """Subject, trial and segment, as "60_01#0"."""
     subject: str
-    """Who was recorded."""
+    """Identifier of the recorded person."""
     action: str
-    """What is done, in words."""
+    """Action, in words."""
     rotations: Array
     """(T, 24, 3, 3) local rotations in SMPL's structure, y up."""
     pelvis: Array
@@ -94,17 +94,17 @@ class Mocap:
     names: tuple[str, ...]
     """(S,) names of the clips."""
     subjects: tuple[str, ...]
-    """(S,) who was recorded."""
+    """(S,) identifiers of the recorded people."""
     actions: tuple[str, ...]
-    """(S,) what is done."""
+    """(S,) actions."""
     lengths: NDArray[np.int64]
-    """(S,) frames of each."""
+    """(S,) numbers of frames."""
     tiers: NDArray[np.int64]
-    """(S,) how near to the recording: 0 its own skeleton, 1 and 2 retargeted."""
+    """(S,) closeness to the recording: 0 its own skeleton, 1 and 2 retargeted."""
     pairs: tuple[tuple[int, int], ...]
     """Clips of two people together: same frames, common origin."""
     arrays: dict[str, NDArray]
-    """What the file holds."""
+    """The arrays of the file."""
 
     def __len__(self) -> int:
         """Count of clips, S."""
@@ -165,7 +165,7 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
 
 
 def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
-    """What does not fit, and the cure."""
+    """Problems of the file, with cures."""
     missing = [name for name in _ARRAYS if name not in arrays]
     if missing:
         yield f"array {missing[0]!r} is missing; give motions in SMPL's structure"

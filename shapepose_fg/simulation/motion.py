@@ -1,7 +1,7 @@
-"""People who dance, walk and stand close to each other: motions made of footsteps and reaching hands.
+"""Synthetic motions of people who dance, walk and stand close to each other, from footsteps and reaching hands.
 
-No recorded motion is needed: each role says where pelvis, hands and eyes go (a `Puppet`), and `limbs.pose`
-turns that into SMPL's parameters. World z up, floor at z = 0, metres, radians.
+No recorded motion is needed: each role defines pelvis, hands and gaze (a `Puppet`), and `limbs.pose` converts that
+to SMPL's parameters. World z up, floor at z = 0, metres, radians.
 """
 
 from collections.abc import Callable
@@ -13,16 +13,16 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
 
 COUPLE, LOOP, WAVER = np.array([[-0.15, 0.0], [1.05, 0.0], [0.92, -0.1]])
-"""Where in a group the middle of the couple, of the walker's loop, and who waves are, metres."""
+"""Positions in a group of the couple's middle, of the walker's loop, and of the person who waves, metres."""
 _PADDING_S = 3.0
-"""Paths are known this long before the first and after the last frame, for the steps to come."""
+"""Duration for which paths are defined before the first and after the last frame, s, for the next steps."""
 _STANCE = 0.6
 """Share of a stride in which a foot stands."""
 _WIDTH_M = 0.19
-"""Between the feet."""
+"""Distance between the feet, m."""
 Path = Callable[[Array], tuple[Array, Array]]
-"""Where a pelvis is over the floor at times (...,), seconds: positions (..., 2), metres; headings (...,), radians
-without jumps of a whole turn."""
+"""Function from times (...,), seconds, to the pelvis over the floor: positions (..., 2), metres; headings
+(...,), radians without jumps of a whole turn."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class Motion:
 
     @classmethod
     def joined(cls, parts: "list[Motion]") -> "Motion":
-        """Motions of the same people one after the other."""
+        """Motions of the same people, one after the other."""
         names = ("global_orient", "body_pose", "transl")
         return cls(parts[0].betas, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def __getitem__(self, frames: slice) -> "Motion":
-        """Some consecutive frames."""
+        """The motion in some consecutive frames."""
         return Motion(self.betas, self.global_orient[frames], self.body_pose[frames], self.transl[frames])
 
     def __post_init__(self) -> None:
@@ -70,17 +70,18 @@ class Build:
         """`rest` (24, 3) are the joints in the T-pose, y up, facing +z; `floor` is y of the soles there."""
         self.rest, self.floor = rest, floor
         self.pelvis_m, self.ankle_m, self.shoulder_m = (float(rest[joint, 1] - floor) for joint in (0, 7, 16))
-        """Heights of these joints of who stands upright."""
+        """Heights of these joints of an upright body, metres."""
         hip, knee, ankle = rest[list(LEGS[0])]
         self.leg_m = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
         """Length of thigh and shank together."""
 
 
 def close_motion(betas: Array, builds: list[Build], frames: int, fps: float, rng: np.random.Generator) -> Motion:
-    """People of shapes `betas` (P, 10) in close motion, by fours: a couple dances, one walks through, one waves.
+    """People of shapes `betas` (P, 10) in close motion, in groups of four: a couple dances, one walks through, one
+    waves.
 
-    The first four are in the middle of the room, each further four in a corner of their own; who is left over
-    fills the first roles, and who would dance alone waves.
+    The first four are in the middle of the room, each further four in a corner of their own; remaining people fill
+    the first roles, and a person who would dance alone waves.
     """
     time = np.arange(frames) / fps
     puppets: list[Puppet] = []
@@ -101,7 +102,7 @@ def close_motion(betas: Array, builds: list[Build], frames: int, fps: float, rng
 
 
 def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generator) -> list[Puppet]:
-    """Two who face each other, hold both hands and turn around each other; one pair of hands goes up."""
+    """Two people who face each other, hold both hands and turn around each other; one pair of hands goes up."""
     turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.1)  # rad/s
     beat = rng.uniform(1.0, 1.15)  # s
     start = rng.uniform(-0.2, 0.2)
@@ -158,7 +159,7 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
 
 
 def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> Puppet:
-    """One who walks on a long loop around `centre` (2,), past the others, swinging the arms."""
+    """A person who walks on a long loop around `centre` (2,), past the others, swinging the arms."""
     speed = rng.uniform(1.0, 1.2)  # m/s
     half_axes = np.array([0.62, 1.15])
     lap = 2 * np.pi * np.sqrt((half_axes**2).mean()) / speed
@@ -186,7 +187,7 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
 
 
 def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator) -> Puppet:
-    """One who stays at `spot` (2,): waves with the right hand, then crouches and reaches down."""
+    """A person who stays at `spot` (2,): waves with the right hand, then crouches and reaches down."""
     clock = time + rng.uniform(-0.1, 0.1)
     waving, crouching = _bump(clock, -0.4, 1.75, period=2.8), _bump(clock, 1.2, 1.55, period=2.8)
 

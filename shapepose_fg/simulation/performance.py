@@ -1,4 +1,4 @@
-"""Recorded motions performed by bodies of any shape, on the floor of a room with z up; hands held stay held."""
+"""Recorded motions performed by bodies of any shape, on the floor of a room with z up; held hands stay held."""
 
 from dataclasses import dataclass, replace
 
@@ -16,19 +16,19 @@ from shapepose_fg.simulation.motion import Motion
 _FEET = (7, 8, 10, 11)
 """Ankles and balls of the feet, left and right."""
 _RELAXED_HAND = 0.25
-"""Radians by which the fingers of a hand that was not recorded are bent."""
+"""Bend of the fingers of a hand that was not recorded, rad."""
 _JUMP_M = 0.12
-"""Who rises this far above the floor around it has jumped; less is how recordings err."""
+"""Height above the floor around a person above which it is a jump, m; less is error of recordings."""
 _Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0]).as_matrix()
 _ARMS = ((13, 16, 18, 20, 22), (14, 17, 19, 21, 23))
 """Collar, shoulder, elbow, wrist, hand: left, right."""
 _HELD_M, _FREE_M = 0.17, 0.27
-"""Hands nearer than the first are held, farther than the second they are not: the recordings' limbs and those of
-drawn bodies leave 10 to 20 cm between hands that touched."""
+"""Distance between hands below which they are held, and above which they are not, m: the limbs of recordings
+and those of drawn bodies leave 10 to 20 cm between hands that touched."""
 _TOUCH_M = 0.07
 """Distance between the knuckles of two hands that hold each other."""
 _STRETCH = 0.995
-"""An arm is never quite straight."""
+"""Largest extension of an arm, as a share of its length."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Performance:
         return len(self.joints)
 
     def moved(self, xy: Array, turn_rad: float = 0.0) -> "Performance":
-        """Turned about the vertical through the origin, then shifted by `xy` (2,)."""
+        """The motion rotated about the vertical through the origin, then shifted by `xy` (2,)."""
         turn = turned_about("z", np.array([turn_rad]))[0]
         rotations = self.rotations.copy()
         rotations[:, 0] = turn @ rotations[:, 0]
@@ -91,10 +91,10 @@ class Figure:
 
 
 def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = None) -> Performance:
-    """`clip` as a body of shape `betas` (10,) does it: on the floor z = 0 of a room with z up; +z becomes -y.
+    """Perform `clip` with a body of shape `betas` (10,), on the floor z = 0 of a room with z up; +z becomes -y.
 
-    Steps are longer in the measure of the legs (`scale` overrides it, for who must stay together); collars
-    follow the arms, hands hang loosely, and the soles are on the floor, but for what is jumped.
+    Steps scale with the legs (`scale` overrides it, for people who must stay together); collars follow the arms,
+    hands hang loosely, and the soles are on the floor, except in jumps.
     """
     figure = Figure(body, np.asarray(betas, dtype=np.float64))
     ratio = figure.leg_m / clip.leg_m
@@ -110,7 +110,7 @@ def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = 
 
 
 def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, bend_toes: bool) -> Performance:
-    """Shift a person up and down, smoothly, so that the feet that carry are on the floor."""
+    """Shift a person up and down, smoothly, so that the supporting feet are on the floor."""
     joints, world = figure.joints(rotations, pelvis)
     if bend_toes:
         rotations = _toes_on_the_floor(rotations, joints, world, figure.lowest_sole(joints, world))
@@ -133,7 +133,7 @@ def together(betas: Array, performances: list[Performance], frames: int) -> Moti
 
 
 def _floor(lowest: Array, fps: float) -> Array:
-    """Height (T,) of the floor under somebody whose lowest point is at `lowest` (T,): smooth, blind for jumps."""
+    """Height (T,) of the floor under a person whose lowest point is at `lowest` (T,): smooth, without jumps."""
     if len(lowest) == 0:
         return lowest
     reach = 2 * max(1, round(0.3 * fps)) + 1
@@ -146,7 +146,7 @@ def _floor(lowest: Array, fps: float) -> Array:
 
 
 def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Array) -> Array:
-    """Toes that were not recorded stay flat where the heel rises and the ball of the foot is on the floor."""
+    """Keep unrecorded toes flat where the heel rises and the ball of the foot is on the floor."""
     bent = rotations.copy()
     for ankle, ball in ((7, 10), (8, 11)):
         pitch = np.arcsin(np.clip(-world[:, ankle, 2, 2], -1.0, 1.0))  # of the foot's +z, below the horizontal
@@ -157,7 +157,7 @@ def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Ar
 
 
 def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Performance, Performance]:
-    """Bring together hands of two people that are nearly together and stay so for a while, each half of the way.
+    """Bring together hands of two people that are nearly together for a while, each half of the way.
 
     Only shoulders and elbows turn: the elbow bends by the law of cosines, the shoulder turns the arm along the
     shortest arc. Each hand goes to the other's nearest one.
@@ -176,7 +176,7 @@ def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Perf
 
 
 def _pull(lead: Performance, follow: Performance, fps: float) -> Array:
-    """(T, 2, 2) how firmly each hand of the lead holds each of the follow's, 0 to 1, smooth in time."""
+    """(T, 2, 2) weights with which each hand of the lead holds each of the follow's, 0 to 1, smooth in time."""
     gap = np.linalg.norm(lead.joints[:, [22, 23], None] - follow.joints[:, None, [22, 23]], axis=-1)
     near = np.clip((_FREE_M - gap) / (_FREE_M - _HELD_M), 0.0, 1.0)
     nearest = np.exp(-gap / 0.02)

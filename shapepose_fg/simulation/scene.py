@@ -1,4 +1,4 @@
-"""People with known truth before calibrated cameras: the built-in scene of `demo` and the tests."""
+"""Scenes of people with ground truth and calibrated cameras; the built-in scene of `demo` and the tests."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +23,7 @@ _FEET = (19, 20, 21, 22, 23, 24)
 
 @dataclass(frozen=True)
 class Scene:
-    """Who stood where, exactly, and the cameras that looked on. World z up, floor at z = 0, metres."""
+    """The true people, and the cameras. World z up, floor at z = 0, metres."""
 
     rig: Rig
     """The cameras."""
@@ -34,9 +34,9 @@ class Scene:
     fps: float
     """Frames a second."""
     cuts: tuple[int, ...] = ()
-    """First frames of what follows a cut: there everybody may be somewhere else."""
+    """First frames after cuts, where everybody may be somewhere else."""
     clips: tuple[tuple[str, ...], ...] = ()
-    """Where people perform recordings: for each segment the name of each person's."""
+    """The name of each person's recording in each segment, where people perform recordings."""
 
     def __len__(self) -> int:
         """Count of frames, T."""
@@ -57,7 +57,7 @@ class Scene:
         return replace(self, body=self.body.with_keypoint_offsets(offsets))
 
     def part(self, span: range) -> "Scene":
-        """Some consecutive frames."""
+        """The scene in some consecutive frames."""
         # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
         segments = zip((0, *self.cuts), (*self.cuts, len(self)), self.clips, strict=False)
         clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
@@ -112,8 +112,8 @@ def ring_of_cameras(
 ) -> Rig:
     """Cameras on the walls around the room, 3 to 3.6 m from its middle and 1.9 to 2.7 m high, looking inward.
 
-    `distance_m`, `height_m` and `focal_px` are what they are drawn from; every second one is 0.3 m lower.
-    1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
+    `distance_m`, `height_m` and `focal_px` are the ranges that they are drawn from; every second one is 0.3 m
+    lower. 1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
     """
     image_size, cameras = (1280, 720), []
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.18, 0.18, count)) / count + 0.35

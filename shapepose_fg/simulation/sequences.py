@@ -1,7 +1,7 @@
 """Named interaction sequences around real two-person salsa takes, in a room that fills up.
 
-Takes 60/61_01 to _07 are for choosing settings ("tune"), _09 to _15 for reporting ("report"); whoever else is
-in the room comes from other subjects. Room of 4 x 4 m, world z up, floor at z = 0.
+Takes 60/61_01 to _07 are for choosing settings ("tune"), _09 to _15 for reporting ("report"); all other people
+come from other subjects. Room of 4 x 4 m, world z up, floor at z = 0.
 """
 
 import re
@@ -23,39 +23,39 @@ from shapepose_fg.simulation.performance import Figure, Performance, hold_hands,
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
 
 _TORSO = (0, 6, 9, 12)
-"""Pelvis, spine and neck: what no one else may come into."""
+"""Pelvis, spine and neck: joints that other people must keep away from."""
 _HALF_ROOM_M = 1.75
-"""Pelvises stay within this of the middle of the room, in x and in y."""
+"""Largest distance of pelvises from the middle of the room, in x and in y, m."""
 _LIMBS_M = 0.12
-"""No joint of who stands comes nearer than this to a joint of anybody else, where there is room for it."""
+"""Minimum distance of a standing person's joints from those of others, where there is room for it, m."""
 _TORSO_M = 0.2
-"""How near to these another's joint may come."""
+"""Minimum distance of another person's joint from these, m."""
 _MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
 """Pelvis and chest; elbows, wrists, hands, knees."""
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
-"""Places that are drawn for who stands and for a pair, and how many of them are looked at closely."""
+"""Number of places that are drawn for standing people and for pairs, and number of them that are tested."""
 _PACE_MPS = 1.35
-"""People walk no faster through a room full of others."""
+"""Maximum speed of walking people in the crowded room, m/s."""
 _ARM_M = 0.3
-"""Who walks keeps this far from others' limbs."""
+"""Distance of walking people from others' limbs, m."""
 
 
 @dataclass(frozen=True)
 class SequenceConfig:
-    """What a sequence is made of, and how hard it is."""
+    """Composition and difficulty of a sequence."""
 
     pairs: int = 1
     """Salsa pairs in the room at a time, 0 to 2."""
     standing: int = 1
-    """People who stand close and gesture."""
+    """Number of people who stand close and gesture."""
     walking: int = 1
-    """People who walk through, between and around."""
+    """Number of people who walk through, between and around."""
     close_m: float = 0.45
-    """Pelvises of people who do not dance together stay this far apart, or a little farther."""
+    """Minimum distance of the pelvises of people who do not dance together, m, or a little more."""
     segment_frames: int = 600
-    """Longest segment without a cut, at 30 frames a second."""
+    """Longest segment without a cut, frames at 30 Hz."""
     frames: int = 3000
-    """Length of the sequence."""
+    """Length of the sequence, frames at 30 Hz."""
     camera_distance_m: tuple[float, float] = (3.1, 3.6)
     """Range of the cameras' distances from the middle."""
     camera_height_m: tuple[float, float] = (2.0, 2.5)
@@ -63,9 +63,9 @@ class SequenceConfig:
     focal_px: tuple[float, float] = (860.0, 940.0)
     """Range of the cameras' focal lengths."""
     seed: int = 0
-    """Fixes everything that is drawn."""
+    """Seed of everything that is drawn."""
     without: frozenset[str] = frozenset()
-    """Subjects of recordings who are not among those who stand and walk; the dancers never are."""
+    """Subjects of recordings who are not among standing and walking people; the dancers never are."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.pairs <= 2 and self.standing >= 0 and self.walking >= 0):
@@ -80,17 +80,17 @@ class SequenceConfig:
 
 
 class Room:
-    """Who is in the room already, from one cut to the next."""
+    """The people in the room from one cut to the next."""
 
     def __init__(self, body: BodyModel, config: SequenceConfig, frames: int, fps: float, rng: np.random.Generator):
         self.body, self.config, self.frames, self.fps, self.rng = body, config, frames, fps, rng
         self.performed: list[Performance] = []
-        """The people, in the order in which they came."""
+        """The people, in order of arrival."""
         self.names: list[str] = []
         """The recordings that they perform."""
 
     def add_pair(self, betas: Array, pair: tuple[Clip, Clip]) -> None:
-        """Two who dance together: one factor for both, so that who holds hands still does."""
+        """Add two people who dance together, with one scale for both, so that held hands stay held."""
         legs = np.mean([Figure(self.body, shape).leg_m for shape in betas])
         scale = float(legs / np.mean([clip.leg_m for clip in pair]))
         two = hold_hands(
@@ -111,7 +111,7 @@ class Room:
             self._add(one, clip.name)
 
     def add_standing(self, betas: Array, clip: Clip) -> None:
-        """One who stays at a free spot close to the others, turned towards them."""
+        """Add a person who stays at a free spot close to the others, facing them."""
         one = stand(self.body, betas, clip, self.frames, self.fps, start=int(self.rng.integers(10_000)))
         faces = one.rotations[:, 0, :2, 2].mean(axis=0)
         spots = self.rng.uniform(-_HALF_ROOM_M, _HALF_ROOM_M, (_SPOTS, 2))
@@ -130,7 +130,7 @@ class Room:
         self._add(self._roomiest(placed)[0], clip.name)
 
     def add_walking(self, betas: Array, clip: Clip) -> None:
-        """One who walks through, between and around all who are there already."""
+        """Add a person who walks through, between and around all others."""
         middles, limbs = self.points(_MIDDLES), self.points(_LIMBS)
         speed = float(np.linalg.norm(clip.pelvis[-1] - clip.pelvis[0]) / len(clip) * clip.fps)
         path, heading = way_through(
@@ -147,7 +147,7 @@ class Room:
         self._add(walk, clip.name)
 
     def points(self, joints: tuple[int, ...]) -> Array:
-        """(T, P x joints, 2) where SMPL's `joints` of everybody are over the floor."""
+        """(T, P x joints, 2) positions of SMPL's `joints` of everybody over the floor."""
         if len(self.performed) == 0:
             return np.zeros((self.frames, 0, 2))
         return np.concatenate([p.joints[:, list(joints), :2] for p in self.performed], axis=1)
@@ -168,7 +168,7 @@ class Room:
         return turns, np.array([0.0, side]) + self.rng.normal(0.0, 0.2, (_PAIR_OPTIONS, 2))
 
     def _worth(self, two: list[Performance], turn: float, shift: Array) -> float:
-        """How well a pair is placed: inside the room, close to others, but not closer than allowed."""
+        """Score of a pair's place: inside the room, close to others, but not closer than allowed."""
         steps = np.concatenate([one.joints[::3, list(_MIDDLES), :2] for one in two], axis=1)
         steps = steps @ turned_about("z", np.array([turn]))[0, :2, :2].T + shift
         outside = float(np.maximum(np.abs(steps) - _HALF_ROOM_M, 0.0).max())
@@ -177,7 +177,7 @@ class Room:
         return 20.0 * min(spare, 0.0) - max(spare, 0.0) - 10.0 * outside
 
     def _roomiest(self, options: Iterable[list[Performance]]) -> list[Performance]:
-        """The first of the ways to place people that leaves all room enough, else that which leaves most."""
+        """The first of the options that leaves everybody enough room, else the one that leaves most."""
         best, most = [], -np.inf
         for placed in options:
             reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)
@@ -190,7 +190,7 @@ class Room:
         return best
 
     def _gap(self, one: Performance, other: Performance) -> float:
-        """How much more room two people leave each other than is asked for, metres; negative: less."""
+        """Distance of two people beyond the wanted one, metres; negative: less."""
         a, b = one.joints[::5], other.joints[::5]
         limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - _LIMBS_M
         trunks = clearance_m(a, b).min() - _TORSO_M
@@ -227,11 +227,11 @@ DANCERS = frozenset({"60", "61"})
 TAKES: dict[str, range] = {"tune": range(1, 8), "report": range(9, 16)}
 """Numbers of the takes of each split."""
 _APART_M = 1.3
-"""A take is used from where the dancers come nearer than this to where they part."""
+"""Distance of the dancers from which on, and up to which, a take is used, m."""
 _SHAPE_SPREAD = 0.8
-"""Standard deviation of the betas over people; a pair's two differ by less."""
+"""Standard deviation of the betas over people; those of a pair differ by less."""
 _IMAGE_PX_A_M = 259.0
-"""Everybody is as large in the image, whatever the cameras' distance."""
+"""Size of people in the image, pixels per metre, for any distance of the cameras."""
 
 
 def _from_afar(distance_m: float) -> dict[str, Any]:
@@ -251,7 +251,7 @@ SEQUENCES: dict[str, SequenceConfig] = {
     "crossing": SequenceConfig(pairs=1, standing=1, walking=4, seed=23, **_from_afar(10.0)),
     "crowd": SequenceConfig(pairs=2, standing=2, walking=2, seed=37, **_from_afar(7.0)),
 }
-"""A pair among three who stand and three who walk; mostly walkers, through and between; two pairs and others."""
+"""Sequences by name: a pair with three standing and three walking people; mostly walkers; two pairs and others."""
 
 
 def sequence(
@@ -268,9 +268,9 @@ def sequence(
 ) -> Scene:
     """Interaction sequence `name` of `SEQUENCES` from the takes of `split`, before `cameras` cameras.
 
-    `config` takes the place of the named one's; `frames` of its length. With `until` no segment
-    is made that begins at that frame or later: what there is of the recording is as in the whole one. ValueError
-    for an unknown name or split, or recordings without a take of that split.
+    `config` replaces that of the name; `frames` its length. With `until` no segment is made that begins at that
+    frame or later: the others are as in the whole recording. ValueError for an unknown name or split, or
+    recordings without a take of that split.
     """
     if name not in SEQUENCES or split not in TAKES:
         raise ValueError(
@@ -320,7 +320,7 @@ def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
 def _dances(
     mocap: Mocap, takes: list[tuple[int, int]], config: SequenceConfig, fps: float, rng: np.random.Generator
 ) -> Iterator[tuple[Clip, Clip]]:
-    """Segments of takes in a drawn order without end, each as long as may be without a cut at the most."""
+    """Endless segments of takes in random order, each as long as possible without a cut."""
     while True:
         drawn = [takes[index] for index in rng.permutation(len(takes))]
         segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]

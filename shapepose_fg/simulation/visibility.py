@@ -1,4 +1,4 @@
-"""Which joints a camera sees: the first of the posed surfaces on the rays to each joint, and whose skin it is."""
+"""Visibility of joints: the first surface on the rays to each joint, and the person that it belongs to."""
 
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 NOBODY, ITSELF, BORDER = -1, -2, -3
-"""What `Visibility.hidden_by` says where no other person is in front."""
+"""Codes of `Visibility.hidden_by` where no other person is in front."""
 
 _BONES = (
     "head neck+left_collar+right_collar right_shoulder+right_collar right_elbow right_wrist "
@@ -26,43 +26,45 @@ _BONES = (
     "left_ankle head head head head left_foot left_foot left_ankle right_foot right_foot right_ankle"
 ).split()
 """The own bones of each joint of BODY_25: SMPL's that begin there; face, toes and heels have their nearest. A
-collar has next to no skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
+collar has hardly any skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
 FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "LEar"))
-"""They lie on the skin, not inside a limb."""
+"""Joints of the face, which lie on the skin, not inside a limb."""
 
 _RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
-"""Where rays go around a joint, in units of the probe's radius."""
+"""Directions of rays around a joint, in units of the probe's radius."""
 
 FramePeople = tuple[Array, NDArray[np.float32]] | tuple[Array, NDArray[np.float32], Rig]
-"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres; where the cameras are then."""
+"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres; and the cameras' rig at
+that time."""
 AHEAD = 4
-"""Frames a worker that are under way: they are short work."""
+"""Number of frames per worker that are submitted ahead: each is little work."""
 FRAMES_WORTH_A_WORKER = 100
-"""A recording must have this many for each worker, or starting them takes longer than it saves."""
+"""Minimum number of frames per worker; with fewer, starting it takes longer than it saves."""
 
 
 @dataclass(frozen=True)
 class VisibilityConfig:
-    """How the depth buffer is drawn and read."""
+    """Settings of the depth buffer."""
 
     image_scale: float = 0.25
     """The buffer's resolution, as a share of the image's."""
     cell_m: float = 0.04
-    """Vertices of the surface this near to each other are one; 0 keeps all."""
+    """Size of cells within which vertices of the surface are merged, m; 0 keeps all."""
     probe_m: float = 0.03
-    """Radius around a joint in which rays are sent; 0 leaves the ray to the joint itself."""
+    """Radius around a joint in which rays are sent, m; 0 uses the ray to the joint only."""
     front_m: float = 0.02
-    """A surface is in front of a joint when it is nearer by more than this: skin on skin hides nothing."""
+    """Minimum distance of a surface in front of a joint that hides it, m: skin on skin hides nothing."""
     face_depth_m: float = 0.08
-    """The head itself hides nose, eyes and ears that are deeper under its first surface: on its other side."""
+    """Depth under the head's first surface, m, beyond which it hides nose, eyes and ears: they are on its other
+    side."""
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """How much of each joint each view sees, and what hides it."""
+    """Visible share of each joint in each view, and what hides it."""
 
     seen: Array
-    """(V, P, J) share of the rays to a joint that arrive, 0 to 1; 0 outside the image."""
+    """(V, P, J) share of the rays that reach a joint, 0 to 1; 0 outside the image."""
     in_image: Mask
     """(V, P, J) whether the joint projects into the image."""
     hidden_by: Index
@@ -72,14 +74,14 @@ class Visibility:
 
 @dataclass(frozen=True)
 class Skin:
-    """The surface that is drawn for every person, and which joints each part of it shows."""
+    """The surface that is drawn for every person, and the joints that belong to each part of it."""
 
     vertices: Index
-    """(M,) vertices of the body's mesh that are in use."""
+    """(M,) indices of the used vertices of the body's mesh."""
     faces: NDArray[np.int32]
     """(G, 3) triangles over those."""
     shows: Mask
-    """(M, J) whether a vertex is skinned to the joint's own bone or one next to it: by half its weight or more."""
+    """(M, J) whether at least half of a vertex's weight is on the joint's own bone or one next to it."""
 
     @classmethod
     def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
@@ -129,22 +131,22 @@ def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityC
 
 @dataclass(frozen=True)
 class VisibilityWorker:
-    """Finds what the cameras see of many frames: the same for all frames of a recording."""
+    """Computes the visibility in many frames of a recording."""
 
     rig: Rig
     """The cameras."""
     skin: Skin
     """The surface that is drawn."""
     config: VisibilityConfig
-    """How it is drawn and read."""
+    """Settings of the depth buffer."""
 
     def one(self, people: FramePeople) -> Visibility:
-        """What the cameras see of one frame."""
+        """Visibility in one frame."""
         joints, surfaces, *moved = people
         return see(moved[0] if len(moved) > 0 else self.rig, joints, surfaces, self.skin, self.config)
 
     def all(self, frames: Iterable[FramePeople], workers: int = 1) -> Generator[Visibility, None, None]:
-        """What the cameras see, frame after frame; in `workers` processes, or here if that is 1.
+        """Visibility frame after frame; in `workers` processes, or here if that is 1.
 
         Frames are taken from `frames` as they are needed. Close the iterator (`contextlib.closing`) to end the
         processes early. RuntimeError where one of them dies.
@@ -154,7 +156,9 @@ class VisibilityWorker:
 
 
 def facing(joints: Array, centres: Array) -> Array:
-    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the way out of the head and that to cameras (V, 3)."""
+    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the outward direction of the head and that to
+    cameras (V, 3).
+    """
     face = joints[:, FACE]
     outward = face - joints[:, FACE[3:]].mean(axis=1, keepdims=True)
     to_camera = centres[:, None, None] - face
@@ -163,7 +167,8 @@ def facing(joints: Array, centres: Array) -> Array:
 
 
 def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array) -> Array:
-    """`seen` (V, P, 25) where a face joint's share is less the more it faces away, whatever the depth buffer says.
+    """`seen` (V, P, 25) where a face joint's share decreases with its angle to the camera, whatever the depth
+    buffer says.
 
     `ramp` (5, 2) holds the cosines at which a face joint is wholly lost and wholly there.
     """
@@ -174,7 +179,7 @@ def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array)
 
 
 def _commonest(who: Index, counts: Mask) -> Index:
-    """The value of `who` (..., R) that comes most often among those that count; of equals, the first."""
+    """Mode (...,) of the values `who` (..., R) among those that count; of equally frequent ones, the first."""
     votes = ((who[..., :, None] == who[..., None, :]) & counts[..., None, :]).sum(axis=-1)
     best = np.where(counts, votes, 0).argmax(axis=-1)
     return np.take_along_axis(who, best[..., None], axis=-1)[..., 0]

@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.sides import hold, hold_now
-from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.tracker import Tracker, Tracks, mean_distance
 from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
 
 BLOCK_S = 3.0
@@ -114,8 +114,8 @@ def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
 
 
 def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bool) -> Chosen:
-    """The same people from their first detection on, where nobody was there before the `first` frame, and up to
-    their last one, where nothing follows the `last`: to be there unseen costs less at the ends than to appear.
+    """Shorten people to begin with their first detection, where nobody was there before the `first` frame, and up
+    to their last one, where nothing follows the `last`: to be there unseen costs less at the ends than to appear.
     """
     frame = np.arange(found.there.shape[1])
     seen = (found.candidate[chosen.hypothesis] >= 0).any(axis=(2, 3))
@@ -216,12 +216,6 @@ def _left_at(places: Array, times: Array, later_s: float) -> Array:
 
 
 def core_distance(places: Array, others: Array, skeleton: Skeleton) -> Array:
-    """(P, Q) mean distance of the core joints of people (P, J, 3) and others (Q, J, 3), metres.
-
-    Infinite where no joint is known of both.
-    """
+    """(P, Q) `mean_distance` of core joints alone."""
     core = list(skeleton.core)
-    distance = np.linalg.norm(places[:, None, core] - others[None, :, core], axis=-1)
-    known = np.isfinite(distance)
-    mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    return np.where(known.any(axis=-1), mean, np.inf)
+    return mean_distance(places[:, core], others[:, core])

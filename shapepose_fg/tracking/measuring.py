@@ -7,7 +7,8 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
+from shapepose_fg.core.pieces import ROBUST, project, triangulated
+from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
@@ -115,9 +116,7 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
                     _linearise(at, candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j])
                     _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
-            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, 0
-            for v in range(views):
-                seen_by[j] += inlier[j, v]
+            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, inlier[j].sum()
         tear(mean[a], trusted, seen_by, longest_m, parents, FARTHEST_M, above, way_m, count, too_long, torn)
         twice, most = 0, 0
         for j in range(joints):
@@ -130,11 +129,7 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
             elif core[j] and seen_by[j] >= 2:
                 twice += 1
         for v in range(views):
-            in_view = 0
-            for j in range(joints):
-                if core[j] and candidate[a, j, v] >= 0:
-                    in_view += 1
-            most = max(most, in_view)
+            most = max(most, (core & (candidate[a, :, v] >= 0)).sum())
         evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
 
 
@@ -147,7 +142,7 @@ def _apart_m(place, camera, focal, xy):
 
 @part
 def _mean_depth(mean, camera):
-    """Of the joints in front of a view."""
+    """Mean depth of a person's joints in front of a view, metres."""
     total, count = 0.0, 0
     for j in range(len(mean)):
         depth = project(camera, mean[j])[2]
@@ -165,18 +160,9 @@ def _linearise(place, candidate, sigma_px, cameras, focal, xy, numbers, L, g, in
         g[i] = L[i, 0] = L[i, 1] = L[i, 2] = 0.0
     for v in range(len(sigma_px)):
         inlier[v] = False
-        if sigma_px[v] == 0:
-            continue
-        (x, y, depth), d = project(cameras[v], place), candidate[v]
-        if not depth >= MIN_DEPTH_M:
-            continue
-        to_x, to_y = x - xy[d, 0], y - xy[d, 1]
-        squared = to_x * to_x + to_y * to_y
-        inlier[v] = np.sqrt(squared) < rho_m * focal[v] / (fixed_m if fixed_m > 0 else depth)
-        if inlier[v]:
-            weight = 1 / (sigma_px[v] * sigma_px[v])
-            weight *= robust_weight(robust, squared * weight / (width * width))
-            add_view(cameras[v], x, y, depth, to_x, to_y, weight, L, g)
+        if sigma_px[v] > 0:
+            of_view = place, cameras[v], focal[v], xy[candidate[v]], sigma_px[v]
+            inlier[v] = add_detection(*of_view, fixed_m, MIN_DEPTH_M, rho_m, False, robust, width, L, g)[0]
 
 
 @part

@@ -6,11 +6,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import Motion
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 
 LOST_M = 0.2
@@ -27,7 +27,7 @@ _FOLLOW_SIGMA_M = 0.05
 
 
 @dataclass(frozen=True)
-class JointStates:
+class JointStates(Rows):
     """States of A people's J joints, a Gaussian each: position and n - 1 derivatives (`factors.Motion`)."""
 
     mean: Array
@@ -49,18 +49,6 @@ class JointStates:
     def sigma_m(self) -> Array:
         """(A, J) standard deviation of the position, root mean square over the axes, metres."""
         return np.sqrt(np.trace(self.covariance[..., :3, :3], axis1=-2, axis2=-1) / 3)
-
-    def __len__(self) -> int:
-        return len(self.mean)
-
-    def rows(self, index: NDArray) -> "JointStates":
-        """Some of the people."""
-        return JointStates(self.mean[index], self.covariance[index])
-
-    @classmethod
-    def concatenate(cls, parts: Sequence["JointStates"]) -> "JointStates":
-        """The people of several."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("mean", "covariance")))
 
     @classmethod
     def at(cls, position: Array, sigma_m: Array, start: Sequence[float]) -> "JointStates":
@@ -137,26 +125,26 @@ def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after
     """F m and F P F^T + q Q of all joints, with F and Q (n, n) for each axis; `room` (2, S) is for work."""
     people, joints, size = mean.shape
     half, moving, core, order, parents = room[0], room[1], bones.core, bones.order, bones.parents
-    right, left = bones.hips[0], bones.hips[1]
+    right, left, velocity = bones.hips[0], bones.hips[1], np.empty(3)
     for a in range(people):
         # What nothing is known of stands still: it must not drift along a ray.
-        certain, vx, vy, vz = 1 / TRUSTED_M**2, 0.0, 0.0, 0.0
+        certain = 1 / TRUSTED_M**2
+        velocity[0] = velocity[1] = velocity[2] = 0.0
         for j in range(joints):
             if core[j]:
                 certainty = 1 / sigma(covariance[a, j]) ** 2
                 certain += certainty
-                vx += certainty * mean[a, j, 3]
-                vy += certainty * mean[a, j, 4]
-                vz += certainty * mean[a, j, 5]
+                for x in range(3):
+                    velocity[x] += certainty * mean[a, j, 3 + x]
         any_placed = False
         for j in range(joints):
             unseen, was_m = sigma(covariance[a, j]) > _FOLLOW_SIGMA_M, _across(covariance[a, j])
             for k in range(size):
                 moving[k] = mean[a, j, k]
             if unseen:
-                moving[3] = vx / certain + decay * (moving[3] - vx / certain)
-                moving[4] = vy / certain + decay * (moving[4] - vy / certain)
-                moving[5] = vz / certain + decay * (moving[5] - vz / certain)
+                for x in range(3):
+                    common = velocity[x] / certain
+                    moving[3 + x] = common + decay * (moving[3 + x] - common)
                 for k in range(6, size):
                     moving[k] *= decay
             for row in range(size):

@@ -18,8 +18,7 @@ def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, coun
     where it is `reach_m` farther than bones are long: nearer, whole bodies put it right.
     """
     joints, worst = len(trusted), 0
-    for j in range(joints):
-        torn[j] = False
+    torn[:] = False
     while worst >= 0:
         _judged_above(trusted, torn, longest_m, parents, above, way_m, count, too_long)
         for j in range(joints):

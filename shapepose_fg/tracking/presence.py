@@ -10,6 +10,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.pieces import project
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, limbs_of, tie
 
@@ -17,13 +18,14 @@ _PRICE = 0.4
 """What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
 the mean over a person's places, in seconds in which every joint is seen by every view."""
 _PRICE_HIDDEN = 0.05
-"""The same behind somebody else, and of a joint whose place is not known. With these a person is believed in of
-whom a fourth of what nobody hides has detections of their own. In simulated crowds of eight before three cameras
-(seeds 6101, 6104) joints that nobody hides have a detection in 76 of 100 places, those behind a limb in 20."""
+"""Price of a place behind somebody else, or of a joint whose place is not known. With these a person is believed
+in of whom a fourth of what nobody hides has detections of their own. In simulated crowds of eight before three
+cameras (seeds 6101, 6104) joints that nobody hides have a detection in 76 of 100 places, those behind a limb in
+20."""
 _LIMB_M = 0.12
 """A joint is hidden whose ray passes somebody's limb, or spine, this near."""
 _IN_FRONT_M = 0.15
-"""And is this much farther from the camera: nearer, which of them is in front is not known."""
+"""Minimum depth gap for an occlusion, metres; below it the order of two people is ambiguous."""
 _SURE_AFFINITY = 0.6
 """Mean affinity to the person's other detections from which on a detection counts wholly."""
 _ALONE = 0.5
@@ -49,7 +51,7 @@ hardly more, and a recording of half a second has no time to gather `LEAST_S` of
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Chosen(Rows):
     """K people and from when to when they are there, in the order in which they were chosen, best first."""
 
     hypothesis: Index
@@ -61,9 +63,6 @@ class Chosen:
     evidence_s: Array
     """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken
     off."""
-
-    def __len__(self) -> int:
-        return len(self.hypothesis)
 
     def during(self, frame: int) -> Mask:
         """(K,) who is there in a frame."""
@@ -224,7 +223,7 @@ class Account:
     begins: int
     """The first frame in which anything is seen."""
     ends: int
-    """And the last."""
+    """The last frame in which anything is seen."""
     least_s: float
     """Least evidence of a person, seconds."""
 
@@ -232,8 +231,8 @@ class Account:
     def of(
         cls, candidate: Whole, weight: Real, price: Real, there: Mask, counts: Index, lasts_s: Array
     ) -> "Account":
-        """Of detections `candidate` (H, T, J, V), of `counts` (T,) in each frame, with `weight` (H, T, J, V) and
-        `price` (H, T) of `weighed`.
+        """Make the account of detections `candidate` (H, T, J, V), of `counts` (T,) in each frame, with `weight`
+        (H, T, J, V) and `price` (H, T) of `weighed`.
         """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
         first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())

@@ -20,7 +20,7 @@ LEAST_PROBABILITY = 0.6
 """How probable it must be that somebody is there in a frame that stands alone: of those who have 0.6, six in ten
 are, in simulated crowds and in a real operating room alike."""
 _DOUBLE_M = 0.2
-"""Of two people there whose core joints are nearer in the mean, one goes: a pelvis is 20 cm deep."""
+"""Mean distance of core joints below which two people are one, metres: a pelvis is 20 cm deep."""
 
 
 def reassociate(
@@ -31,7 +31,7 @@ def reassociate(
     skeleton: Skeleton,
     least: float | None = None,
 ) -> Observations:
-    """The same rows with the detections around their `joints` (N, J, 3), known to `covariance` (N, J, 3, 3).
+    """Return the rows with the detections around their `joints` (N, J, 3), known to `covariance` (N, J, 3, 3).
 
     All views and people of a frame at once, one-to-one. Rows without any joint keep their place, without
     detections: motion carries them. Where frames stand alone people may go: those who have no joints, who are

@@ -125,7 +125,7 @@ class _Memory(dict[tuple[int, int], tuple[float, Array]]):
     """When a view saw a person last, seconds, and log probabilities (S,) of what it had exchanged."""
 
     def with_more(self, of: tuple[int, int], time_s: float, likelihood: Array) -> Array:
-        """(S,) the same after a frame with this log-likelihood (S,), which is kept."""
+        """(S,) log probabilities after a frame with this log-likelihood (S,), which is kept."""
         prior = _prior(len(likelihood))
         if of in self:
             last_s, before = self[of]
@@ -173,8 +173,8 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
             places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
             if len(places) > 0:
                 new = count + np.arange(len(places))
-                tracks = replace(tracks, time_s=time_s)
-                tracks, count = tracks.joined(tracker.at(places, new, 0 * new, time_s)), count + len(new)
+                others = tracker.at(places, new, 0 * new, time_s)
+                tracks, count = Tracks.concatenate([replace(tracks, time_s=time_s), others]), count + len(new)
                 seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton, memory)
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):

@@ -9,6 +9,7 @@ from annotated_types import Interval
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 
 _BONE_SIGMA_M = 0.015
@@ -36,7 +37,7 @@ class StitchingConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Trace:
+class Trace(Rows):
     """What stitching looks at, of the N solved rows of one track."""
 
     track: int
@@ -50,7 +51,7 @@ class Trace:
 
     @classmethod
     def of(cls, track: int, time_s: Array, joints: Array, skeleton: Skeleton) -> "Trace":
-        """Of solved rows with `joints` (N, J, 3)."""
+        """Make the trace of solved rows with `joints` (N, J, 3)."""
         core = list(skeleton.core)
         bone = np.array([(j, p) for j, p in enumerate(skeleton.parents) if j in core and p in core])
         known = np.asarray(np.isfinite(joints[:, core]).all(axis=-1))[..., None]
@@ -58,11 +59,11 @@ class Trace:
         length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
         return cls(track, time_s, centre, length)
 
-    @classmethod
-    def concatenate(cls, parts: Sequence["Trace"]) -> "Trace":
-        """The rows of several parts of a track, one after the other."""
-        names = ("time_s", "centre", "bones")
-        return cls(parts[0].track, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    @property
+    def build(self) -> Array:
+        """(B,) median length of each bone, metres; NaN where it is known in too few rows."""
+        enough = np.isfinite(self.bones).sum(axis=0) >= LEAST_ROWS
+        return np.where(enough, np.nanmedian(np.where(enough, self.bones, 0.0), axis=0), np.nan)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Ends:
     track: Index
     """(G,) identities."""
     time_s: Array
-    """(G, 2) of the first and the last row."""
+    """(G, 2) times of the first and the last row, seconds."""
     place: Array
     """(G, 2, 3) centre of the core joints there, metres."""
     bones: Array
@@ -80,23 +81,11 @@ class Ends:
 
     @classmethod
     def of(cls, traces: Iterable[Trace]) -> "Ends":
-        """Of tracks, of which one at a time is in memory."""
-        tracks, times, places, bones = [], [], [], []
-        for each in traces:
-            tracks.append(each.track)
-            times.append(each.time_s[[0, -1]])
-            places.append(each.centre[[0, -1]])
-            enough = np.isfinite(each.bones).sum(axis=0) >= LEAST_ROWS
-            median = np.full(each.bones.shape[1], np.nan)
-            median[enough] = np.nanmedian(each.bones[:, enough], axis=0)
-            bones.append(median)
-        count = len(tracks)
-        return cls(
-            np.array(tracks, dtype=np.intp),
-            np.array(times).reshape(count, 2),
-            np.array(places).reshape(count, 2, 3),
-            np.array(bones) if count > 0 else np.zeros((0, 0)),
-        )
+        """Summarise tracks, one of which at a time is in memory."""
+        rows = [(each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces]
+        if len(rows) == 0:
+            return cls(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0)))
+        return cls(*map(np.array, zip(*rows, strict=True)))
 
 
 def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:

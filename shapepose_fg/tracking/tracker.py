@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.body.fitting.fitter import BodyFitter
@@ -19,6 +18,7 @@ from shapepose_fg.core.bounds import Count, Seconds, Settings
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.proposal.nearby import Sight
@@ -57,13 +57,13 @@ class BodyScale:
     longest_m: Array
     """(J,) the longest distance of a joint to its parent on the skeleton, metres; the root's counts nothing."""
     density: Array
-    """(J,) of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
+    """(J,) density of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
     motion: Motion = CONSTANT_VELOCITY
     """How joints move."""
 
 
 @dataclass(frozen=True)
-class Tracks:
+class Tracks(Rows):
     """The people who are followed, of all worlds; arrays only, so that they can be saved."""
 
     time_s: float
@@ -83,25 +83,6 @@ class Tracks:
         shape, empty = (0, len(skeleton)), np.zeros(0, dtype=np.intp)
         joints = JointStates.at(np.zeros((*shape, 3)), np.zeros(shape), motion.start)
         return cls(-np.inf, empty, empty, joints, np.zeros(0))
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def rows(self, index: NDArray) -> "Tracks":
-        """Some of the tracks."""
-        return Tracks(
-            self.time_s, self.ids[index], self.world[index], self.joints.rows(index), self.evident_s[index]
-        )
-
-    def joined(self, others: "Tracks") -> "Tracks":
-        """These tracks and others, at the time of these."""
-        return Tracks(
-            self.time_s,
-            np.append(self.ids, others.ids),
-            np.append(self.world, others.world),
-            JointStates.concatenate([self.joints, others.joints]),
-            np.append(self.evident_s, others.evident_s),
-        )
 
 
 @dataclass(frozen=True)
@@ -187,8 +168,9 @@ class Tracker:
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
-            new = (own >= 0).sum(axis=2)[:, core] >= 2
-            new = (new.sum(axis=1) >= self.config.min_new_joints) & standing_apart(people.initial, there)
+            twice = (own >= 0).sum(axis=2)[:, core] >= 2
+            apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
+            new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
             theirs.append(own[new])
             there = np.concatenate([there, people.initial[new]])
@@ -206,9 +188,12 @@ class Tracker:
         return int(twice.sum()) >= self.config.min_new_joints
 
 
-def standing_apart(places: Array, others: Array) -> Mask:
-    """(P,) people at `places` (P, J, 3) who stand apart from all `others` (A, J, 3); NaN joints count nothing."""
+def mean_distance(places: Array, others: Array) -> Array:
+    """(P, Q) mean distance of the joints of people (P, J, 3) from those of others (Q, J, 3), metres.
+
+    Infinite where no joint is known of both.
+    """
     distance = np.linalg.norm(places[:, None] - others[None], axis=-1)
     known = np.isfinite(distance)
     mean = np.where(known, distance, 0.0).sum(axis=-1) / np.maximum(known.sum(axis=-1), 1)
-    return (mean > _APART_M).all(axis=1)
+    return np.where(known.any(axis=-1), mean, np.inf)

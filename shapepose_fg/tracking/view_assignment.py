@@ -141,9 +141,9 @@ def _assign(
     for a in range(people_count):
         for j in range(joints):
             gate_m[a, j] = 0.0 if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
-            reach_m[a, j] = _REACH_M if lost[a, j] or sight.swings[j] else max(gate_m[a, j], OVERLAP_M)
             for v in range(views):
                 before[a, j, v] = -1
+            reach_m[a, j] = _REACH_M if lost[a, j] or sight.swings[j] else max(gate_m[a, j], OVERLAP_M)
     begins, person, detection, distance_m, score, possible = near
     count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
     if count > len(person):

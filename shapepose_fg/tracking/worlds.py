@@ -28,7 +28,7 @@ _SEARCH_S = 0.3
 are sought among all detections. In a world that lacks somebody the others take that person's detections, so new
 people are sought in all of them: crowds before three cameras gain two to six people of a hundred."""
 _TWINS_S = 0.1
-"""So often it is looked whether two worlds have become one, seconds."""
+"""Interval between checks for worlds that have become one, seconds."""
 _RESTART_S = 1.3
 """Whoever was chosen is followed again from a frame in each so many seconds."""
 _ROUNDS = 2
@@ -75,7 +75,7 @@ class Hypotheses:
 
     @cached_property
     def account(self) -> Account:
-        """The same as evidence."""
+        """The hypotheses as evidence."""
         return Account.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
 
     def __len__(self) -> int:
@@ -104,7 +104,7 @@ class Seed:
     forwards: bool = True
     """Whether they are followed forwards."""
     backwards: bool = True
-    """And backwards."""
+    """Whether they are followed backwards."""
     births: bool = True
     """Whether others are sought beside them."""
 
@@ -151,10 +151,7 @@ def lasting(times_s: Array) -> Array:
     """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for
     one.
     """
-    if len(times_s) < 2:
-        return np.ones(len(times_s))
-    step = np.diff(times_s)
-    return (np.append(step[:1], step) + np.append(step, step[-1:])) / 2
+    return np.gradient(times_s) if len(times_s) > 1 else np.ones(len(times_s))
 
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
@@ -250,7 +247,7 @@ def _follow(
         tracks = replace(tracks, time_s=time_s)
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
-            tracks, candidate = tracks.joined(own), np.concatenate([candidate, theirs])
+            tracks, candidate = Tracks.concatenate([tracks, own]), np.concatenate([candidate, theirs])
         if abs(time_s - looked_s) < _TWINS_S:
             continue
         looked_s = time_s
@@ -272,7 +269,7 @@ def _follow(
                 )
                 log.add(t, new, theirs)
                 born.append((world, Seed(t, new, theirs, births=False), new.ids))
-                tracks, candidate = tracks.joined(new), np.concatenate([candidate, theirs])
+                tracks, candidate = Tracks.concatenate([tracks, new]), np.concatenate([candidate, theirs])
     return born
 
 

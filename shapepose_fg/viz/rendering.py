@@ -1,4 +1,4 @@
-"""What a camera sees of triangle meshes: one z-buffer for visibility and for pictures.
+"""Renders triangle meshes into a camera: one z-buffer for visibility and for pictures.
 
 Pixels follow OpenCV: the centre of the first pixel is (0, 0). A surface nearer than `NEAR_M` is not drawn.
 """
@@ -15,11 +15,11 @@ from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.camera import Camera
 
 NEAR_M = 0.05
-"""Faces with a corner nearer than this are dropped, metres: nothing is clipped."""
+"""Depth below which faces with a corner are dropped, m: nothing is clipped."""
 _FAR_M = 100.0
-"""Faces beyond this are not drawn by OpenCV, metres."""
+"""Depth beyond which OpenCV draws no faces, m."""
 _NUMBER = np.float32(2.0**-20)
-"""What a vertex counts as colour: OpenCV takes colours of 0 to 1, and float32 holds these exactly."""
+"""Colour step per vertex number: OpenCV takes colours of 0 to 1, and float32 holds these exactly."""
 _FLAT = (
     cv2.TriangleRasterizeSettings()
     .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
@@ -34,7 +34,7 @@ class Surface:
     depth: NDArray[np.float32]
     """(H, W) depth along the optical axis, metres; inf where the ray meets nothing."""
     face: NDArray[np.int32]
-    """(H, W) index of the face that is met; -1 where there is none."""
+    """(H, W) index of the visible face; -1 where there is none."""
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:
@@ -73,8 +73,8 @@ def first_surface_at(
 ) -> tuple[NDArray[np.float32], Index]:
     """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
 
-    The vertex is the first corner of the face that is met. inf and -1 where nothing is. The same picture as
-    `rasterise` makes, in half the time. At most 2**20 points.
+    The vertex is the first corner of the visible face. inf and -1 where nothing is. Equal to the picture of
+    `rasterise`, in half the time. At most 2**20 points.
     """
     width, height = camera.image_size
     # In double precision: what a product in single precision rounds depends on the processor, and moves edges.
@@ -108,7 +108,7 @@ def _as_opengl(points: Array, camera: Camera) -> NDArray[np.float32]:
 
 
 class _Canvas(threading.local):
-    """The picture that a thread draws into, again and again: fresh memory takes a third of the time of drawing."""
+    """Reused buffers of a thread: new memory takes a third of the time of drawing."""
 
     def __init__(self) -> None:
         self._colour = self._depth = np.empty(0, dtype=np.float32)
@@ -128,7 +128,7 @@ _canvas = _Canvas()
 
 @lru_cache(maxsize=4)
 def _numbers(count: int) -> NDArray[np.float32]:
-    """(N, 3) the number of each vertex as its colour."""
+    """(N, 3) colours that encode the numbers of vertices."""
     number = np.zeros((count, 3), dtype=np.float32)
     number[:, 0] = np.arange(count, dtype=np.float32) * _NUMBER
     return number

@@ -243,8 +243,9 @@ def test_priors_are_calibrated_on_bodies_from_the_priors(people):
     assert 2.3 < squared.mean() < 3.6
     assert 1.9 < np.median(squared) < 2.8
     by_joint = np.median(squared, axis=0)
-    # Wrists are given twice the variance that these bodies, whose angles are Gaussian, would need.
-    assert (by_joint > 1.0).all() and (by_joint < 4.0).all()
+    # Wrists are given twice the variance that these bodies, whose angles are Gaussian, would need: 1.18, three
+    # standard errors of 160 rows are 0.32; with twice as much again 0.6.
+    assert (by_joint > 0.8).all() and (by_joint < 4.0).all()
 
 
 @pytest.mark.slow
@@ -256,7 +257,7 @@ def test_priors_are_calibrated_for_hidden_joints(fitter, people, hidden):
     fit = fitter.fit(make_targets(people[1], without=joints))
     index = list(joints)
     squared = mahalanobis((fit.prior_xyz - people[0])[fit.ok][:, index], fit.prior_covariance[fit.ok][:, index])
-    assert 1.0 < np.median(squared) < 3.5
+    assert 0.8 < np.median(squared) < 3.5
     assert squared.mean() < 6  # swinging limbs are not Gaussian: the tail is heavier
 
 

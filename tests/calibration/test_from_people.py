@@ -198,7 +198,7 @@ def test_lenses_by_their_field_of_view(tmp_path):
     for fields, size, said in (
         (["90"], None, "camera left: nothing says how large its pictures are; pass --image-size"),
         (["3"], (640, 480), "--field-of-view 3: must be 5 to 150 degrees"),
-        (["up=60"], (640, 480), "no such camera; give one of left right"),
+        (["up=60"], (640, 480), "there is no camera 'up'; there are left right"),
         (["left=60"], (640, 480), "camera right has none"),
     ):
         with pytest.raises(InputError, match=said):
@@ -211,7 +211,7 @@ def test_lenses_by_a_photo(tmp_path):
     for name in ("left_json", "right_json"):
         (tmp_path / name).mkdir()
     exif = image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 28
+    exif[0x8769] = {0xA405: 28}
     image.new("RGB", (400, 300)).save(tmp_path / "phone.jpg", exif=exif)
     image.new("RGB", (400, 300)).save(tmp_path / "bare.jpg")
     (tmp_path / "torn.jpg").write_bytes((tmp_path / "phone.jpg").read_bytes()[:40])

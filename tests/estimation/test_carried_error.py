@@ -6,11 +6,12 @@ import gtsam
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.estimation.carried_error import carried_covariance
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise
 
 CONFIG = ObservationConfig(kernel="none")
 POSE = gtsam.Pose3(gtsam.Rot3.Ypr(0.7, 0.2, -0.1), np.array([1.0, -0.5, 0.3]))
@@ -39,7 +40,7 @@ def added(rig: Rig, people: np.ndarray) -> np.ndarray:
     observations, sigmas = seen(rig, people)
     views = Views.of(rig, np.zeros((len(people), len(rig))))
     evidence = linearise(observations, sigmas, people, views, CONFIG)
-    nothing = Message(np.zeros(people.shape), np.zeros((*people.shape, 3)))
+    nothing = JointTargets(np.zeros(people.shape), np.zeros((*people.shape, 3)))
     return carried_covariance(evidence, nothing, sigmas, views, CONFIG)
 
 

@@ -120,7 +120,9 @@ def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
         xy = np.tile(seen.xy, (4, 1)) + rng.normal(0, 2, (4 * len(seen), 2))
         confidence = np.tile(seen.confidence, 4) * np.repeat([1.0, 0.99, 0.98, 0.97], len(seen))
         view, joint = np.tile(seen.view, 4), np.tile(seen.joint, 4)
-        frames.append(replace(seen, view=view, joint=joint, xy=xy, confidence=confidence, place=None))
+        frames.append(
+            replace(seen, view=view, joint=joint, xy=xy, confidence=confidence, place=None, mirrored=None)
+        )
     recording = Recording(BODY_25, frames)
     thinned = ThinnedFrames(recording, scene.rig, config.candidates)
     assert all(thinned.is_thinned(frame) for frame in range(3))

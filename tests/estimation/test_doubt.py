@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
 
 PLAIN = ObservationConfig(kernel="none", rho_2d_m=1.0)
 NAMES = ("RWrist",)
@@ -31,7 +32,7 @@ def evidence_of(rig, probability, away_m):
 
 def spread_of(rig, probability, away_m):
     observations, sigmas, evidence, views = evidence_of(rig, probability, away_m)
-    nobody = Message(np.full((1, 1, 3), np.nan), np.zeros((1, 1, 3, 3)))
+    nobody = JointTargets(np.full((1, 1, 3), np.nan), np.zeros((1, 1, 3, 3)))
     spread = association_spread(observations, sigmas, evidence, nobody, views, PLAIN)
     return evidence.points[0, 0], spread[0, 0]
 

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
 from shapepose_fg.estimation.joint_step import solve_between, solve_joints
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import WindowGraph
 
@@ -34,7 +35,7 @@ def test_the_kernel_and_the_graph_agree(five_cameras, two_people, kernel, moving
     roots = rng.normal(0, 10, (*two_people.shape, 3))
     pulled = roots @ roots.mT + 100 * np.eye(3)
     pulled[:, NOWHERE] = 0.0
-    body = Message(two_people + rng.normal(0, 0.05, two_people.shape), pulled)
+    body = JointTargets(two_people + rng.normal(0, 0.05, two_people.shape), pulled)
 
     between = solve_between(seen, sigmas, views, evidence, body, config)
     motion = MotionModel.load(BODY_25.joints, config.motion, config.law)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factors import joint_key, moving_projection_factors, project_with_jacobian, velocity_key
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
@@ -14,7 +15,6 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import velocities
-from shapepose_fg.estimation.linearisation import Message
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import carried_to_frames, leads
 from shapepose_fg.estimation.window_graph import WindowGraph
@@ -122,7 +122,7 @@ def test_a_window_places_joints_at_the_frames_time(five_cameras, moving, shutter
     def solved(observations: Observations, views: Views) -> WindowGraph:
         T, J, V = observations.confidence.shape
         graph = WindowGraph(observations, np.full((T, J, V), 1.0), views, EstimatorConfig(), motion)
-        nothing = Message(np.zeros((T, J, 3)), np.zeros((T, J, 3, 3)))
+        nothing = JointTargets(np.zeros((T, J, 3)), np.zeros((T, J, 3, 3)))
         graph.solve(np.ones((T, J, V), bool), nothing, nothing, observations.initial + 0.003)
         assert graph.failure == ""
         return graph
@@ -170,9 +170,7 @@ def out_of_step(scene, sub: int, places: list[int]) -> tuple[Recording, Recordin
 
 @pytest.mark.slow
 def test_cameras_out_of_step_are_as_good_as_in_step():
-    """Dancers at 8 Hz by four cameras up to 94 ms apart: 19.3 mm against 18.4 in step, and 21.2 where it is
-    ignored.
-    """
+    """Dancers at 8 Hz by four cameras up to 94 ms apart: 7 % more than in step at most, ignored 11 or more."""
     sub, places = 8, [0, 6, 2, 4]
     scene = built_in_scene(seed=4, people=2, cameras=4, frames=24 * sub, fps=8.0 * sub)
     in_step, apart = out_of_step(scene, sub, places)
@@ -191,4 +189,4 @@ def test_cameras_out_of_step_are_as_good_as_in_step():
     best = error(in_step, FrameTimes(frame_s), frame_s)
     timed = error(apart, FrameTimes(frame_s[:, None] + lead_s), meant)
     ignored = error(apart, FrameTimes(frame_s), meant)
-    assert timed < 1.1 * best < 1.12 * best < ignored
+    assert timed < 1.1 * best and timed < 0.97 * ignored

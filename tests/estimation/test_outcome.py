@@ -149,7 +149,7 @@ def evidence(points, sigma_m) -> ViewEvidence:
     """Views that put joints exactly at `points` (N, J, 3), known to `sigma_m` (N, J); infinite: not at all."""
     information = message(sigma_m).information
     none = np.zeros((*np.shape(sigma_m), 1))
-    return ViewEvidence(points, none > 0, none, information, np.zeros_like(points), points, np.asarray(sigma_m))
+    return ViewEvidence(points, none > 0, none, information, np.zeros_like(points))
 
 
 def body_at(joints, sigma_m, ok=True) -> BodyFit:

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from factors import isotropic, joint_key
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig
+from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph, add_factors
@@ -48,10 +49,10 @@ def graphs(rig, truth, xy, frames=1) -> list[WindowGraph]:
 
 def solve(people: list[WindowGraph], truth) -> None:
     T = len(people[0])
-    nothing = Message(np.full((T, 25, 3), np.nan), np.zeros((T, 25, 3, 3)))
-    said = Message(np.repeat(truth[:, None], T, axis=1), np.tile(np.eye(3) / 0.03**2, (len(people), T, 25, 1, 1)))
+    nothing = JointTargets(np.full((T, 25, 3), np.nan), np.zeros((T, 25, 3, 3)))
+    information = np.tile(np.eye(3) / 0.03**2, (T, 25, 1, 1))
     for number, person in enumerate(people):
-        of_views = Message(said.xyz[number], said.information[number]) if T > 1 else nothing
+        of_views = JointTargets(np.repeat(truth[number][None], T, axis=0), information) if T > 1 else nothing
         person.prepare(np.ones((T, 25, 5), bool), of_views, nothing, np.repeat(truth[number][None], T, axis=0))
     for person in people:
         if person is person.ties.people[0]:

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from factors import DEFAULT_WIDTH_SIGMA, split_key
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
-from shapepose_fg.estimation.linearisation import Message, ObservationConfig
+from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
@@ -30,11 +31,11 @@ def person(five_cameras, two_people) -> tuple[NDArray[np.float64], NDArray[np.fl
     return two_people[0], xy + rng.normal(0, 6.0, xy.shape), rng.uniform(4.0, 12.0, xy.shape[:2])
 
 
-def message(known, xyz, covariance) -> Message:
-    """What is said of the joints of `known` (..., J); the rest may be NaN."""
+def message(known, xyz, covariance) -> JointTargets:
+    """What is said of the joints of `known` ([T,] J); the rest may be NaN."""
     information = np.zeros(np.shape(covariance))
     information[known] = np.linalg.inv(covariance[known])
-    return Message(np.array(xyz), information)
+    return JointTargets(np.reshape(xyz, (-1, 25, 3)), information.reshape(-1, 25, 3, 3))
 
 
 def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowGraph:
@@ -69,8 +70,7 @@ class OneFrame:
         self.body = message(pulled, mean, covariance)
 
     def solve(self, initial):
-        body = Message(self.body.xyz[None], self.body.information[None])
-        return self.window.solve(self.inlier[None], body, body, initial[None])[0]
+        return self.window.solve(self.inlier[None], self.body, self.body, initial[None])[0]
 
     def covariance(self):
         return state_covariances([self.window])[0][0][0]
@@ -256,7 +256,7 @@ def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_camer
         observed = np.tile(xy, (frames, 1, 1, 1)), np.tile(sigmas, (frames, 1, 1))
         config = WindowGraphConfig(weight_2d=weight, max_iterations=1)
         window = window_of(five_cameras, *observed, config, kernel, range(frames))
-        none = Message(np.zeros((frames, 25, 3)), np.zeros((frames, 25, 3, 3)))
+        none = JointTargets(np.zeros((frames, 25, 3)), np.zeros((frames, 25, 3, 3)))
         window.solve(observed[1] > 0, none, none, np.tile(truth, (frames, 1, 1)))
         values = gtsam.Values()
         for key in window.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
@@ -436,8 +436,7 @@ def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_ca
     graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
     pulled = np.arange(25) == 4
     body = message(pulled, truth + 0.1, np.tile(0.01**2 * np.eye(3), (25, 1, 1)))
-    whole = Message(body.xyz[None], body.information[None])
-    asked = np.ones((1, *sigmas.shape), dtype=bool), whole, whole, truth[None]
+    asked = np.ones((1, *sigmas.shape), dtype=bool), body, body, truth[None]
     plain = graph.window.solve(*asked).copy()
     np.testing.assert_array_equal(graph.window.solve(*asked, pulled[None]), plain)
     assert np.linalg.norm(plain[0, 4] - truth[4]) > 0.02, "it is pulled"

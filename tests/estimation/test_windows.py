@@ -145,7 +145,7 @@ def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, tw
     np.testing.assert_allclose(solve_window(observations, *asked).joints, truth, atol=0.03)
 
 
-@pytest.mark.parametrize("views_left", [0, 1])
+@pytest.mark.parametrize("views_left", [0, *slow(1)])
 def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras, two_people, views_left):
     """From frame 5 on no view sees the first wrist, or one does: it drifts towards what the body says without it,
     aside or along the ray. With `keep_limbs` it goes towards the body's joint, and its forearm gets its length
@@ -348,7 +348,7 @@ def test_joints_tied_to_each_other_get_the_body_without_any_of_their_targets(
     assert {WRIST, OTHER_WRIST} in fitter.without and set() in fitter.without
 
 
-@pytest.mark.parametrize("temporal", [True, False])
+@pytest.mark.parametrize("temporal", [True, *slow(False)])
 def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_people, temporal):
     observations, _ = walk
     bad = (observations.track == 1) & (observations.frame == 4)

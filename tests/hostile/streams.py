@@ -56,7 +56,7 @@ def photo(kind: str) -> Prepare:
         from PIL import Image
 
         told = Image.Exif()
-        told.get_ifd(0x8769)[0xA405] = 28
+        told[0x8769] = {0xA405: 28}
         name = {"JPEG": "a.jpg", "PNG": "a.png", "TIFF": "a.tif"}[kind]
         Image.new("RGB", (8, 6), (seed % 256, 2, 3)).save(folder / name, kind, exif=told.tobytes())
         (folder / "detections" / "c").mkdir(parents=True)

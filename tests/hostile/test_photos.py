@@ -33,7 +33,7 @@ def bomb(side: int, exif: bytes = b"") -> bytes:
 
 def exif(focal: object) -> bytes:
     found = Image.Exif()
-    found.get_ifd(0x8769)[0xA405] = focal
+    found[0x8769] = {0xA405: focal}
     return found.tobytes()
 
 

@@ -161,7 +161,7 @@ def test_footage_that_is_not_found_is_named(tmp_path):
     for given, problem in (
         ([str(tmp_path / "none")], "there is no such folder"),
         ([f"{folder}/cam1.mp4"], "this is one file"),
-        (["cam9=x.mp4", "cam1=y.mp4"], "no camera 'cam9'; it has cam1 cam2"),
+        (["cam9=x.mp4", "cam1=y.mp4"], "no camera 'cam9'; there are cam1 cam2"),
         ([f"cam1={folder}/cam1.mp4"], "nothing is given for camera cam2; add --videos cam2=PATH"),
         (["cam1=x.mp4", "cam1=y.mp4"], "camera cam1 is given twice"),
         (["cam1=x.mp4", "cam2=y.mp4"], "x.mp4: there is no such file or folder"),

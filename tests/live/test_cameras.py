@@ -8,7 +8,6 @@ import pytest
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.online import OnlineReconstructor
-from shapepose_fg.live.views import joined
 
 FPS = 10.0
 
@@ -50,7 +49,7 @@ def test_a_camera_that_falls_silent_is_named_and_comes_back(five_cameras, steps)
 def test_a_frozen_camera_is_left_out_while_it_repeats_itself(five_cameras, steps):
     frames = [steps(n) for n in range(16)]
     still = frames[4].only(frames[4].view == 1)
-    frames[5:9] = [joined([each.only(each.view != 1), still]) for each in frames[5:9]]
+    frames[5:9] = [Detections.joined([each.only(each.view != 1), still]) for each in frames[5:9]]
     used = []
     said, _, people = run(
         five_cameras, frames, lambda live: used.append((live._state.slots[-1].given.detections.view == 1).any())
@@ -97,7 +96,7 @@ def test_a_camera_that_sees_one_of_five_people_or_somebody_else_agrees(five_came
     others = [two_people[:1] + np.array([x, y, 0.0]) for x, y in ((0.9, 0.9), (-0.9, 0.9), (0.2, -0.9))]
     places, watch = np.concatenate([two_people, *others]), CameraWatch.of(len(five_cameras))
     every, one = seen_exactly(five_cameras, places), seen_exactly(five_cameras, two_people[:1])
-    few = joined([every.only(every.view != 2), one.only(one.view == 2)])
+    few = Detections.joined([every.only(every.view != 2), one.only(one.view == 2)])
     apart_m = watch.compared(few, places, five_cameras, 0.1).apart_m
     assert (apart_m < 0.005).all()
     # A fifth of the detections are of the one who is known.

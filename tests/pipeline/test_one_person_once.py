@@ -37,8 +37,16 @@ def twice(found: Detections, again: np.ndarray) -> Detections:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("temporal", [True, False], ids=["over time", "frame by frame"])
-@pytest.mark.parametrize("how", ["in all views", "in some views", "in some frames", "at random"])
+@pytest.mark.parametrize(
+    ("how", "temporal"),
+    [
+        ("in all views", True),
+        ("in some views", True),
+        ("in some frames", True),
+        ("at random", True),
+        ("at random", False),
+    ],
+)
 def test_people_whom_a_detector_finds_twice_are_there_once(scene, how, temporal):
     rng, frames = np.random.default_rng(0), list[Detections]()
     for number, found in enumerate(simulate(scene)):

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-UNREAD = {"shapepose_fg/estimation", "shapepose_fg/setup_check", "shapepose_fg/tracking"}
-"""Folders in which docstrings may still continue another one. A folder without any has to leave the list."""
 CONTINUES = r"\s*(\([^)]*\)(,? or )?)*[,;:]?\s*(and|of|or(?! \()|so|the same|likewise)\b"
 """Shapes, "(V,) or (N, V)" say, and the first words of a docstring that is understood only after another one."""
 
@@ -29,26 +27,13 @@ def continuing(text: str) -> Iterator[tuple[int, str]]:
                 yield node.lineno, docstring
 
 
-@pytest.fixture(scope="module")
-def places() -> dict[str, list[str]]:
-    """Places of the docstrings that continue another one, by folder."""
-    found: dict[str, list[str]] = {}
+def test_docstrings_stand_alone() -> None:
+    found = []
     for top in ("shapepose_fg", "factors", "scripts"):
         for file in sorted((ROOT / top).rglob("*.py")):
-            parts = file.relative_to(ROOT).parts[:-1]
             for line, text in continuing(file.read_text(encoding="utf-8")):
-                place = f"{file.relative_to(ROOT)}:{line}: {text.strip().splitlines()[0]}"
-                found.setdefault("/".join(parts[:2]), []).append(place)
-    return found
-
-
-def test_docstrings_stand_alone(places: dict[str, list[str]]) -> None:
-    found = [place for folder, each in places.items() if folder not in UNREAD for place in each]
+                found.append(f"{file.relative_to(ROOT)}:{line}: {text.strip().splitlines()[0]}")
     assert found == [], "say what it is, in a sentence that needs no other docstring"
-
-
-def test_list_of_unread_folders_shrinks(places: dict[str, list[str]]) -> None:
-    assert UNREAD - places.keys() == set(), "these folders are clean: take them off UNREAD"
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frames", [3, -8, 15])
+@pytest.mark.parametrize("frames", [3, -15])
 def test_a_late_camera_is_named_with_its_frames(recording, room, frames):
     found = only_finding(delayed(recording, 1, frames), room)
     assert (found.kind, found.cameras) == (Kind.LATE, (1,))
@@ -107,8 +107,7 @@ def test_one_person_s_bias_is_not_the_camera_s(recording, room, people, right, d
 
 
 @pytest.mark.parametrize("of", ["joint", *slow("person and joint", "one view", "size")])
-@pytest.mark.parametrize("largest", [0.12, *slow(0.04)])
-def test_a_detector_s_biases_accuse_no_camera(recording, room, people, of, largest):
+def test_a_detector_s_biases_accuse_no_camera(recording, room, people, of, largest=0.12):
     """Of 2 % of the size or more, by joint and view: a joint is always seen beside where it is."""
     shape, rng = (3, 25, 5), np.random.default_rng(0)
     bias, larger = np.zeros((*shape, 2)), np.zeros((3, 1, 5, 1))
@@ -140,8 +139,7 @@ def test_real_detectors_accuse_no_camera(shared_data, shared_cases):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pixels", [100.0, 25.0])
-def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, pixels):
+def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, pixels=25.0):
     found = only_finding(recording, shifted(room, 3, pixels, 0.0))
     assert (found.kind, found.cameras) == (Kind.PRINCIPAL_POINT, (3,))
     np.testing.assert_allclose(found.shift_px, [(-pixels, 0.0)], atol=5)
@@ -291,8 +289,8 @@ def test_shelf_says_nothing_and_its_mistakes_are_named(shared_data):
     rig = read_rig(shared_data / "shelf" / "calibration.json")
     recording = read_detections(shared_data / "shelf", rig)
     assert diagnose(recording, rig).findings == ()
-    for frames in (range(110), range(120)):  # somebody comes back to where they were a second ago
-        assert diagnose(recording, rig, frames).findings == ()
+    # Somebody comes back to where they were a second ago.
+    assert diagnose(recording, rig, range(110)).findings == ()
     # Some here; all of them take minutes (docs/evaluation.md).
     recording = Recording(BODY_25, [recording[frame] for frame in range(120)])
     wanted = {"turned 5": 2, "late 6 to 10 frames": 1, "exchanged": 3}

@@ -104,16 +104,17 @@ def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Sce
 @pytest.mark.slow
 @pytest.mark.slow
 def test_pairs_are_close_and_others_keep_their_distance(real: dict[tuple[str, Split], Scene]):
+    together = []
     for (name, _), scene in real.items():
         pairs, gaps = SEQUENCES[name].pairs, hip_gaps(scene)
-        for first in range(0, 2 * pairs, 2):
-            # As recorded: 0.2 to 0.8 m but for a turn away or an open hold.
-            assert 0.3 < np.median(gaps[:, first, first + 1]) < 0.8
-            assert gaps[:, first, first + 1].min() > 0.12
-            assert (gaps[:, first, first + 1] < 1.0).mean() > 0.8
+        together += [gaps[:, first, first + 1] for first in range(0, 2 * pairs, 2)]
         others = unrelated(scene, pairs)
         assert others.min() >= 0.35
         assert np.median(others.min(axis=1)) < 1.0  # and yet somebody is within arm's reach
+    # As recorded: 0.2 to 0.8 m but for a turn away or an open hold. Two who do not dance together: 1.3 m and more,
+    # a fifth of the time within 1 m.
+    assert all(gaps.min() > 0.12 and gaps.max() < 2.0 for gaps in together)
+    assert 0.3 < np.median(together) < 0.8 and np.less(together, 1.0).mean() > 0.8
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def test_uneven_times_and_missing_frames_do_not_matter(followed, five_cameras, w
     assert len(rows) == 2 * len(kept) and all(len(own) == 1 for own in tracks.values())
 
 
-@pytest.mark.parametrize("fps", [1, 2, 3, 4])
+@pytest.mark.parametrize("fps", [1, *slow(2, 3), 4])
 def test_few_frames_a_second_cost_nobody_the_first_ones(followed, five_cameras, seen_exactly, two_people, fps):
     """Five frames of evidence are more than a second: who stands there from the first frame on has all rows."""
     frames = [seen_exactly(five_cameras, two_people)] * 12

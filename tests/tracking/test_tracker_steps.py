@@ -9,7 +9,7 @@ from factors import CONSTANT_VELOCITY
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
-from shapepose_fg.tracking.tracker import Tracks, standing_apart
+from shapepose_fg.tracking.tracker import Tracks, mean_distance
 
 CORE = list(BODY_25.core)
 HIP, SHOULDER, ELBOW, WRIST = (BODY_25.index(name) for name in ("MidHip", "RShoulder", "RElbow", "RWrist"))
@@ -111,9 +111,9 @@ def test_four_core_joints_that_two_views_see_may_be_somebody(tracker):
 def test_a_new_person_stands_apart_from_all_tracks(two_people, beside_m, apart):
     new = two_people[:1] + np.array([0.0, beside_m, 0.0])
     new[0, WRIST:] = np.nan  # joints that are not placed count nothing
-    assert standing_apart(new, two_people).tolist() == [apart]
-    assert standing_apart(new, two_people[1:]).tolist() == [True]
-    assert standing_apart(new, two_people[:0]).tolist() == [True]
+    assert (mean_distance(new, two_people) > 0.25).all() == apart
+    assert mean_distance(new, two_people[1:]) > 0.25
+    assert mean_distance(new, two_people[:0]).shape == (1, 0)
 
 
 def test_new_joints_are_known_to_4_cm_and_unplaced_ones_are_lost(tracker, two_people):

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.body.fitting.fitter import BodyFit
-from shapepose_fg.body.fitting.fitter import Rows as FitRows
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.kernels.bodies import linearised
 from shapepose_fg.body.kernels.rows import Linear, Priors, Rows, Work
@@ -21,6 +20,7 @@ from shapepose_fg.body.kernels.solving import known, solved
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.rows import Rows as FitRows
 
 SETTLED = 1e6
 """Precision of a beta that other rows of the same person have settled."""

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets, Rows
+from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.compiled import kernel, part
+from shapepose_fg.core.rows import Rows
 
 _ROUNDING = 1e-4
 """Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""

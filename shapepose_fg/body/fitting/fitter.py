@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 from annotated_types import Interval
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.bounds import Factor, Metres, RepeatsOrNone, Seconds, Settings
+from shapepose_fg.core.rows import Rows
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -81,28 +82,6 @@ STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
 """Type of arrays that hold any `FitStatus`; NumPy would cut longer texts off in a type inferred from one."""
 
 
-class Rows:
-    """Arrays of one length."""
-
-    def __len__(self) -> int:
-        return len(next(iter(vars(self).values())))
-
-    def rows(self, index: Any) -> Self:
-        """The rows `index` (R,)."""
-        return type(self)(*(value[index] for value in vars(self).values()))
-
-    def put(self, index: Any, other: Self) -> None:
-        """Write the rows of `other` over the rows `index` (R,)."""
-        for name, values in vars(self).items():
-            values[index] = vars(other)[name]
-
-    def with_rows(self, index: Any, other: Self) -> Self:
-        """Return a copy whose rows `index` (R,) are those of `other`."""
-        changed = type(self)(*(value.copy() for value in vars(self).values()))
-        changed.put(index, other)
-        return changed
-
-
 @dataclass(frozen=True)
 class JointTargets(Rows):
     """Where the joints of B people (rows: people, frames or both) should be, and how surely."""
@@ -123,6 +102,25 @@ class JointTargets(Rows):
             raise ValueError(f"information must be {(*xyz.shape, 3)} like xyz, got {information.shape}")
         object.__setattr__(self, "xyz", xyz)
         object.__setattr__(self, "information", information)
+
+    @classmethod
+    def solved(cls, joints: Array, covariance: Array) -> "JointTargets":
+        """Targets at `joints` (B, J, 3), metres, known to `covariance` (B, J, 3, 3); none where either is NaN."""
+        known = np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
+        information = np.zeros(covariance.shape)
+        information[known] = np.linalg.inv(covariance[known])
+        return cls(np.where(known[..., None], joints, 0.0), (information + information.mT) / 2)
+
+    @property
+    def known(self) -> Mask:
+        """(B, J) joints that have a target."""
+        return np.asarray(self.information.any(axis=(2, 3)))
+
+    def where(self, chosen: Mask, times: float = 1.0) -> "JointTargets":
+        """The targets of the `chosen` (B, J) joints, their information `times` this number; none for others."""
+        chosen = chosen & self.known
+        information = np.where(chosen[..., None, None], self.information * times, 0.0)
+        return JointTargets(np.where(chosen[..., None], self.xyz, 0.0), information)
 
     def larger(self, size: Array) -> "JointTargets":
         """Return the targets with people and world scaled by `size` (B,)."""

@@ -228,7 +228,7 @@ class SmplFitter(BodyFitter):
         """
         wider, evidence, chunks = self._spread[:, None, None], passes.evidence, passes.chunks(_CHUNK)
         whole = [part for part, index in zip(parts, chunks, strict=True) if index[0] < len(rows)]
-        found = JointPosterior.joined(whole)
+        found = JointPosterior.concatenate(whole)
         unseen = np.all(evidence.information == 0, axis=(-1, -2))[..., None, None]
         prior_xyz, prior_covariance = found.xyz.copy(), found.covariance.copy()
         for part, index in zip(parts[len(whole) :], chunks[len(whole) :], strict=True):

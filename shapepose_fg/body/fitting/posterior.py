@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.body.fitting.energy import Evaluated, Held
-from shapepose_fg.body.fitting.fitter import Rows
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.rows import Rows
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,6 @@ class JointPosterior(Rows):
     def of(cls, body: Evaluated) -> "JointPosterior":
         """From bodies whose systems hold the joints that are asked for."""
         return cls(body.free, body.xyz, body.covariances()[0], body.squared, body.left)
-
-    @classmethod
-    def joined(cls, parts: "list[JointPosterior]") -> "JointPosterior":
-        """The rows of all, in order."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def pooled_betas(alone: Array, precision: Array, pool: Index, votes: Mask, held: Held) -> Array:

@@ -113,7 +113,7 @@ def status_of(
 
 
 def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None:
-    """What is going to be done, and where to look at it."""
+    """Print what will be done, and where it can be followed."""
     place = "here" if here else f"at {scheduler.address}"
     print(f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True)
     if scheduler.processes == 0:

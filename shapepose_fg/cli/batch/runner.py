@@ -194,7 +194,7 @@ class Leader:
 
 
 _tell: Connection
-"""In a leader: the connection to the process that started it."""
+"""Connection of a leader to the process that started it."""
 
 
 def _tell_by(tell: Connection) -> None:

@@ -1,4 +1,4 @@
-"""recordings.toml: which recordings an archive has, and what is wanted of each."""
+"""recordings.toml: the recordings of an archive, and the options of each."""
 
 import re
 from dataclasses import dataclass, fields, replace
@@ -13,10 +13,10 @@ from shapepose_fg.io.config import config_from
 from shapepose_fg.io.validation import describe
 
 LOG = "log.txt"
-"""What was said about a recording, in its folder."""
+"""Name of the log in a recording's folder."""
 _NAME = re.compile(r"\w[\w.-]{0,99}")
 _MOST = 10_000
-"""Recordings of one table."""
+"""Maximum number of recordings in a table."""
 _PATHS = ("calibration", "detections", "project", "config", "body", "timestamps", "shapes")
 _CURE = "docs/batch.md describes the table"
 
@@ -26,15 +26,15 @@ class Entry:
     """One recording of the table."""
 
     name: str
-    """What it is called; its results go into a folder of that name."""
+    """Name of the recording, and of the folder of its results."""
     request: Request
-    """What is wanted of it."""
+    """Options of the recording."""
     after: str | None = None
-    """The recording whose people's shapes it begins with, so that it has to wait for it."""
+    """The recording whose people's shapes it starts with, and which it therefore waits for."""
 
 
 def read_table(path: Path) -> list[Entry]:
-    """The recordings of a table, in its order.
+    """Read the recordings of a table, in its order.
 
     Paths are relative to the table's folder and do not lead out of it, unless they are absolute. InputError that
     names the file, the recording and the cure.
@@ -69,7 +69,7 @@ def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
 
 
 def _check_names(names: list[str], path: Path) -> None:
-    """Refuse names that are no folders' names, or the same one on some systems."""
+    """Refuse names that no folder can have, or that are equal on some systems."""
     seen = {"batch.json": "batch.json"}
     for name in names:
         if _NAME.fullmatch(name) is None:
@@ -130,7 +130,7 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
 
 
 def asked(request: Request) -> dict[str, Any]:
-    """What is wanted, as plain values: equal where the same is wanted."""
+    """The options as plain values: equal for equal requests."""
     default, found = Request(), {}
     for name in (field.name for field in fields(request)):
         value = getattr(request, name)

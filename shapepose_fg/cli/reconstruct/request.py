@@ -1,4 +1,4 @@
-"""What a reconstruction is asked for, by the command line or in a table of recordings."""
+"""The options of a reconstruction, from the command line or a table of recordings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from shapepose_fg.pipeline.config import PipelineConfig
 
 OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, CLOCKS, "report.html")
-"""The files that are left in the folder of results."""
+"""The files in the folder of results."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ProjectOptions, TimeOptions):
-    """One recording, and what is wanted of it: the options of `shapepose-fg reconstruct`, by their names."""
+    """One recording, and the options of `shapepose-fg reconstruct` for it, by their names."""
 
     project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections, settings; adds TRC, C3D.")
     preset: Preset | None = preset_option(None)
@@ -59,7 +59,7 @@ class Request(ProjectOptions, TimeOptions):
     check: bool = option(RESULT, "Whether cameras and detections fit.", True, "--check/--no-check")
 
     def rig(self) -> "Rig":
-        """The cameras, rolling shutters as `readout` says where the calibration says nothing of them."""
+        """The cameras, with `readout` for rolling shutters where the calibration has none."""
         from shapepose_fg.core.camera import LONGEST_READOUT_S
 
         found = super().rig()
@@ -78,14 +78,14 @@ class Request(ProjectOptions, TimeOptions):
 
 @dataclass(frozen=True)
 class Prepared:
-    """A request whose places are known, and whose options are sound."""
+    """A request with known paths and valid options."""
 
     request: Request
-    """What is asked for; cameras, detections and times are those of the project where it is of one."""
+    """The request; cameras, detections and times are those of the project if there is one."""
     project: "Pose2SimProject | None"
-    """The project that it is of."""
+    """The project that it belongs to; None where there is none."""
     calibration: Path
-    """The cameras' file."""
+    """Path of the calibration."""
     detections: Path
     """The folder of detections."""
     output: Path
@@ -93,12 +93,12 @@ class Prepared:
 
     @property
     def skeleton(self) -> "str | DeclaredJoints | None":
-        """The detector's joints as the user says, else as the project does."""
+        """The detector's joints as the user states, else as the project does."""
         declared = None if self.project is None else self.project.joints
         return self.request.skeleton or declared
 
     def settings(self) -> "PipelineConfig":
-        """The settings; InputError where they do not go with the rest."""
+        """The settings; InputError where they contradict other options."""
         from shapepose_fg.io.config import read_config
         from shapepose_fg.pipeline.config import PipelineConfig
 
@@ -121,13 +121,13 @@ class Prepared:
         return found
 
     def span(self, count: int, first: int = 0) -> range:
-        """The frames that are wanted of a recording of `count`, in which nobody is seen before the `first`."""
+        """The wanted frames of a recording of `count`, in which nobody is seen before the `first`."""
         if self.project is not None and self.request.frames is None:
             return self.project.span(count)
         return frame_range(self.request.frames, count, first)
 
     def cuts(self, count: int) -> tuple[int, ...]:
-        """The cuts, if a recording of `count` frames can have them."""
+        """The cuts; InputError where a recording of `count` frames cannot have them."""
         from shapepose_fg.core.frame_times import check_cuts
 
         try:
@@ -140,9 +140,10 @@ class Prepared:
 
 
 def prepare(request: Request, output: Path | None, tell: Callable[..., None] = note) -> Prepared:
-    """Find a request's places, and look at its options, before any large file is read.
+    """Find a request's paths, and check its options, before any large file is read.
 
-    `tell` is given what a project's files were taken to be. InputError where something is missing or wrong.
+    `tell` receives notes on how a project's files were interpreted. InputError where something is missing or
+    wrong.
     """
     from shapepose_fg.io.recording import times_beside
 

@@ -1,4 +1,4 @@
-"""The work of `shapepose-fg reconstruct`: a run that is kept as it goes, and what is made of it at its end."""
+"""The work of `shapepose-fg reconstruct`: a run that can be resumed, and its output."""
 
 import hashlib
 import json
@@ -48,25 +48,25 @@ from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 @dataclass(frozen=True)
 class Ended:
-    """What came of a recording that was reconstructed; plain data, which processes tell each other."""
+    """Summary of a reconstructed recording; plain data, which processes exchange."""
 
     frames: int
-    """How many frames were reconstructed."""
+    """Number of reconstructed frames."""
     rows: int
-    """Rows of people.npz."""
+    """Number of rows of people.npz."""
     people: int | None
-    """How many there are over time; None frame by frame."""
+    """Number of people over time; None frame by frame."""
     warnings: tuple[str, ...]
-    """What looks wrong with cameras and detections."""
+    """Problems of cameras and detections."""
 
 
 def carry_out(
     known: Prepared, execution: Execution, *, resume: bool = False, restart: bool = False, overwrite: bool = False
 ) -> Ended:
-    """Reconstruct what is asked for into its folder, and say how it went.
+    """Execute a request, write the results into its folder, and print a summary.
 
     `resume`, `restart` and `overwrite` are the command's options; `execution` without `progress` shows a bar.
-    InputError, one sentence, for what cannot be used; `Stopped`, with where it stands, on Ctrl-C or a request to
+    InputError, one sentence, for invalid input; `Stopped`, with the state of the run, on Ctrl-C or a request to
     end.
     """
     output = known.output
@@ -111,8 +111,8 @@ def carry_out(
 
 
 def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
-    """The request with the times of cameras that were started by hand, from the people, in synchronised.csv beside
-    the results; those that are there already where they are `kept`, of a run that goes on.
+    """The request with the times of cameras that were started by hand, estimated from people, in
+    synchronised.csv beside the results; existing times where they are `kept`, of a resumed run.
     """
     asked, file = known.request, known.output / CLOCKS
     if not asked.synchronise:
@@ -128,7 +128,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
 
 
 def _about_moving(task: Task) -> list[str]:
-    """What is not done, and which pictures are not used, because cameras move."""
+    """Notes on what is left out, and which pictures are not used, because cameras move."""
     rig, (_, times, _) = task.rig, task.whole()
     if not rig.moves:
         return []
@@ -158,9 +158,9 @@ def _about_moving(task: Task) -> list[str]:
 
 @contextmanager
 def _recording_folder(folder: Path) -> Iterator[Path]:
-    """Where what the cameras saw is kept while the block runs: in files, because it may be larger than memory.
+    """A folder for the detections while the block runs: in files, because they may be larger than memory.
 
-    What a killed run left there is removed.
+    The remains of a killed run are removed.
     """
     shutil.rmtree(folder, ignore_errors=True)
     try:
@@ -174,20 +174,20 @@ class _Run:
     """A reconstruction into a folder, whose input is read and checked."""
 
     task: Task
-    """What is to be reconstructed."""
+    """The arguments of the reconstruction."""
     recording: DetectionTable
-    """The detections of it, as they were read."""
+    """The detections as they were read."""
     known: Prepared
-    """What was asked for."""
+    """The request."""
     inputs: dict[str, str]
     """Checksums of the files that were read."""
     execution: Execution
-    """What runs it."""
+    """How it is executed."""
     report: SetupReport | None
-    """What looks wrong with cameras and detections; None where that is not asked."""
+    """Problems of cameras and detections; None where they were not checked."""
 
     def begun(self) -> dict[str, Any]:
-        """All that the result depends on, as plain values: equal for a run that goes on."""
+        """Everything that the result depends on, as plain values: equal for a resumed run."""
         task, asked, skeleton = self.task, self.known.request, self.recording.skeleton
         frames, times, cuts = task.whole()
         return {
@@ -207,9 +207,9 @@ class _Run:
         }
 
     def carried_out(self, *, resume: bool, restart: bool) -> Ended:
-        """Reconstruct, and leave the results in the folder; `carry_out` says what is raised.
+        """Reconstruct, and write the results into the folder; raises as `carry_out` does.
 
-        Whatever stops it, what is done is kept there, and the next call with `resume` goes on.
+        If interrupted, the finished part is kept there, and the next call with `resume` continues.
         """
         output = self.known.output
         if not (output / manifest.PARTS).is_dir():
@@ -230,7 +230,7 @@ class _Run:
             raise InputError(f"{what}; {self._standing()}") from None
 
     def _finished(self, kept: InFolder) -> Ended:
-        """The reconstruction, its files, and what is said of it."""
+        """The reconstruction, its files, and its summary."""
         asked, output, rig, frames = (
             self.known.request,
             self.known.output,
@@ -297,7 +297,7 @@ class _Run:
         )
 
     def _written(self, result: Assembly, people: Reconstruction, rig: Rig, every: int) -> list[str]:
-        """Report and files for other programs are left; what there is now."""
+        """Write the report and files for other programs; returns their paths and notes."""
         output, project = self.known.output, self.known.project
         files = ["people.npz", "run.json", *(["observations.npz"] if len(result) > 0 else []), CAMERAS]
         written = [str(output / name) for name in files]
@@ -317,7 +317,7 @@ class _Run:
         return written
 
     def _standing(self) -> str:
-        """How far a run that was stopped has come, and how to go on."""
+        """The state of an interrupted run, and how to resume it."""
         output, count = self.known.output, len(self.task.whole()[0])
         try:
             done = manifest.frames_done(output)
@@ -327,7 +327,7 @@ class _Run:
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
-    """The people that `file` knows, on the body in use; none where there is no such file yet."""
+    """The people in `file`, for the body model in use; none where there is no such file yet."""
     model = fingerprint(BodyModel.default() if body is None else BodyModel.load(body))
     if file.exists():
         return SubjectShapes.load(file, model)
@@ -336,5 +336,5 @@ def _known_people(file: Path, body: Path | None) -> SubjectShapes:
 
 
 def _digest(value: Any) -> str:
-    """sha256 of plain values and arrays."""
+    """SHA-256 of plain values and arrays."""
     return hashlib.sha256(json.dumps(value, default=plain).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""What `shapepose-fg reconstruct` says at its end: who was found, how well it went, and what looks wrong."""
+"""The summary that `shapepose-fg reconstruct` prints at its end: people, quality, and problems."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from shapepose_fg.setup_check.report import check_setup as check_detections
 from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
-"""Whoever is less probable is named."""
+"""Probability below which people are listed."""
 _KNOWN_WORDS = {
     "seen": "seen by two views",
     "weak": "seen by one or weakly",
@@ -31,7 +31,7 @@ _KNOWN_WORDS = {
 
 
 def check_setup(known: Prepared, task: Task) -> SetupReport:
-    """Whether cameras, detections and, of a project, videos fit."""
+    """Check whether cameras, detections and, for a project, videos fit each other."""
     frames, sizes = task.whole()[0], ()
     used = known.detections / FOOTAGE
     if used.is_file():
@@ -48,10 +48,10 @@ def check_setup(known: Prepared, task: Task) -> SetupReport:
 def summary_table(
     result: Assembly, people: Reconstruction, task: Task, seconds: float, *, unchecked: bool
 ) -> Table:
-    """What was reconstructed, how well it went, and how long it took.
+    """Summary of a reconstruction: people, quality, and times.
 
-    `people` are rows of the `result` of `task` that say how sure the joints are. Of an `unchecked` one it also
-    says whether cameras see more people.
+    `people` are rows of the `result` of `task` with covariances of joints. For an `unchecked` one it also states
+    whether cameras see more people.
     """
     run, counts, span, cameras = result.run, result.counts(), task.whole()[0], len(task.rig)
     per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
@@ -101,7 +101,9 @@ def summary_table(
 
 
 def _doubtful(run: dict[str, Any]) -> str:
-    """Who is less probable than `_SURE`; without identities how many rows; empty where all are."""
+    """People with a probability below `_SURE`; without identities the number of rows; empty where there are
+    none.
+    """
     said = run.get("probability", [])
     if isinstance(said, dict):
         count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
@@ -111,13 +113,13 @@ def _doubtful(run: dict[str, Any]) -> str:
 
 
 def _frames_words(spans: list[list[int]]) -> str:
-    """In which frames, as far as there is room: run.json has all."""
+    """The frames in words, as far as there is room: run.json has all."""
     told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
     return f" (frames {' '.join(told)}{' ...' * (len(spans) > 4)})" if told else ""
 
 
 def _joints(count: dict[str, int], people: Reconstruction) -> str:
-    """How the joints are known, as shares, and how sure they are, as words."""
+    """How joints are known, as shares, and their standard deviations, in words."""
     total = max(sum(count.values()), 1)
     shares = [f"{100 * count[how] / total:.1f} % {word}" for how, word in _KNOWN_WORDS.items() if count[how] > 0]
     variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3
@@ -127,7 +129,7 @@ def _joints(count: dict[str, int], people: Reconstruction) -> str:
 
 
 def show_check(checked: ResultCheck) -> None:
-    """How far each camera is from the result, and on stderr what looks wrong."""
+    """Print the distance of each camera from the result, and on stderr the problems."""
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))

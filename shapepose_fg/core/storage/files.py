@@ -1,4 +1,4 @@
-"""Files, read within bounds and with one clear error, and written whole or not at all."""
+"""Reads files within bounds and with one clear error, and writes them whole or not at all."""
 
 import codecs
 import glob
@@ -17,13 +17,14 @@ from typing import Any, BinaryIO
 from shapepose_fg.core.errors import InputError
 
 SMALL, MIDDLE, LARGE = 2**20, 2**26, 2**32
-"""Bytes that a file may have: settings and tables of a few lines; cameras, or one frame; a recording."""
+"""Maximum size of a file, bytes: settings and tables of a few lines; cameras, or one frame; a recording."""
 PIECE = 2**20
-"""Bytes that are read at a time where a file may be larger than memory."""
+"""Number of bytes that are read at a time where a file may be larger than memory."""
 _MOST_DEPTH = 64
-"""Lists in lists and objects in objects: no format goes a fifth as deep."""
+"""Maximum depth of nested lists and objects: no format has a fifth of it."""
 _MOST_DOTS = 100
-"""Dots in a line of TOML: the parser takes the square of a dotted key's parts."""
+"""Maximum number of dots in a line of TOML: the parser's time grows with the square of the parts of a dotted
+key."""
 _LONG_NUMBER = re.compile(r"\d{19}")
 _BROKEN_OFF = re.compile(r"(-|\.|[eE][+-]?|tr?u?|fa?l?s?|nu?l?)?\s*")
 """What is left of a JSON text that ends within a number or a word, or between two values."""
@@ -62,7 +63,7 @@ def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> No
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder / name`; InputError where a link there leads out of the folder, in which nothing is written then."""
+    """`folder / name`; InputError where a link there leads out of the folder, so that nothing is written there."""
     place = folder / name
     try:
         stays = place.resolve().is_relative_to(folder.resolve())
@@ -74,7 +75,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
-    """What is in the file at `path`; InputError as of `open_regular`, and where it has more than `most` bytes."""
+    """Content of the file at `path`; InputError as in `open_regular`, and where it has more than `most` bytes."""
     with open_regular(path, most=most) as stream:
         content = stream.read(most + 1)
     _check_size(path, len(content), most)
@@ -124,7 +125,7 @@ def _empty(path: Path) -> InputError:
 def read_json(path: Path, *, most: int = LARGE) -> Any:
     """Value of the JSON file at `path`; InputError that names the line, also for a key that occurs twice.
 
-    NaN and Infinity are let through as floats: who checks the values names their key.
+    NaN and Infinity are accepted as floats: validation of the values names their key.
     """
     return parse_json(read_text(path, most=most), path)
 
@@ -143,7 +144,7 @@ def parse_json(text: str, path: Path | str) -> Any:
 
 
 def not_text(path: Path, byte: int) -> InputError:
-    """The error of a file whose `byte` is none of UTF-8 text."""
+    """The error for a file that is not UTF-8 text at `byte`."""
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
 
 
@@ -185,10 +186,10 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
 
 
 def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
-    """`value`, parsed from `path`, if its lists and objects are not absurdly deep.
+    """`value`, parsed from `path`; InputError if its lists and objects are nested too deep.
 
-    With `numbers`, also if its whole numbers have 64 bits: longer ones fit no float and no array, and take the
-    square of their length to print.
+    With `numbers`, also if its integers have more than 64 bits: these fit no float and no array, and the time to
+    print them grows with the square of their length.
     """
     waiting: list[tuple[tuple[Any, ...], Any]] = [((), value)]
     while len(waiting) > 0:
@@ -225,9 +226,9 @@ def write_together(
     files: Mapping[Path, Callable[[BinaryIO], object]],
     check: Callable[[Mapping[Path, Path]], object] = lambda _: None,
 ) -> None:
-    """`write_atomically` of several files in order, none of which is put in place before all are complete.
+    """`write_atomically` for several files in order, none of which is put in place before all are complete.
 
-    And before `check`, which is told under which name each is complete, has returned.
+    Before that, `check` is called with the temporary names of the complete files.
     """
     temporary: dict[Path, Path] = {}
     try:
@@ -256,9 +257,9 @@ def write_together(
 
 
 def user_cache(what: str) -> Path:
-    """The folder of the user's cache for `what` this program keeps; below XDG_CACHE_HOME where that is set.
+    """The folder of the user's cache for `what`; below XDG_CACHE_HOME where that is set.
 
-    It need not be there, nor writable: a container's user of any number has no home.
+    It may not exist, or not be writable: the user of a container may have no home.
     """
     home = os.path.expanduser("~")  # noqa: PTH111
     base = os.environ.get("XDG_CACHE_HOME") or f"{home if home != '~' else ''}/.cache"
@@ -275,7 +276,7 @@ def sweep(folder: Path, name: str | None = None) -> None:
 
 
 _PART = ".part"
-"""What temporary files end with."""
+"""Suffix of temporary files."""
 
 
 @contextmanager
@@ -290,7 +291,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def unique_keys(pairs: list[tuple[str, Any]], path: Path | str) -> dict[str, Any]:
-    """An object's members, if no key occurs twice: JSON itself would keep the last one in silence."""
+    """An object's members; InputError if a key occurs twice, of which JSON itself would keep the last."""
     members: dict[str, Any] = {}
     for key, value in pairs:
         if key in members:

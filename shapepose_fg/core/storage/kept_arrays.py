@@ -1,4 +1,4 @@
-"""Named sets of arrays that are kept while a run goes on: in memory, or as files that survive the process."""
+"""Named sets of arrays that are kept during a run: in memory, or as files that survive the process."""
 
 import hashlib
 import json
@@ -21,21 +21,21 @@ Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
 ANEW = "begin that run anew with --restart"
-"""What to do where a set is damaged."""
+"""Cure for a damaged set."""
 _SAID = {"about", "arrays", "sha256"}
-"""What a file says of itself: what is to be said about the set, digests of the arrays, and one of all this."""
+"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all this."""
 _ALIGNED = 64
-"""Bytes; arrays begin at multiples of it."""
+"""Alignment of arrays, bytes."""
 
 
 class KeptArrays:
-    """Sets of arrays, each under a name, with what is to be said about it as plain values; here in memory.
+    """Sets of arrays, each under a name, with plain values about it; kept in memory.
 
-    That of a set that is dropped goes back to the system at once.
+    The memory of a set that is dropped is returned to the system at once.
     """
 
     lasting = False
-    """Whether they outlive this process."""
+    """Whether the arrays outlive this process."""
 
     def __init__(self) -> None:
         self._sets: dict[str, tuple[Arrays, Any]] = {}
@@ -49,11 +49,11 @@ class KeptArrays:
         self._sets[name] = (_mapped(arrays), about)
 
     def drop(self, name: str) -> None:
-        """Forget a set, if there is one."""
+        """Remove a set, if there is one."""
         self._sets.pop(name, None)
 
     def about(self, name: str) -> Any:
-        """What is said about a set."""
+        """The plain values about a set."""
         return self._sets[name][1]
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
@@ -65,7 +65,7 @@ class KeptArrays:
         return list(self._sets[name][0])
 
     def place(self, name: str) -> str:
-        """Where a set is, in words."""
+        """Description of the place of a set."""
         return name
 
     def columns(self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
@@ -81,7 +81,9 @@ InMemory = KeptArrays
 
 
 def _mapped(arrays: Arrays) -> Arrays:
-    """Copies in a mapping of their own. Freed between others, the allocator's would stay with the process."""
+    """Copies in a memory mapping of their own, which is released at once; the allocator's memory would stay in
+    use.
+    """
     starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values())]).tolist()
     if starts[-1] == 0:
         return {key: array.copy() for key, array in arrays.items()}
@@ -105,7 +107,7 @@ class InFolder(KeptArrays):
     lasting = True
 
     def __init__(self, folder: Path, run: str = "") -> None:
-        """`run` is the run that they are of: files of another one are refused."""
+        """`run` is the run that they belong to: files of another one are refused."""
         self.folder, self.run = folder, run
         self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
@@ -141,14 +143,14 @@ class InFolder(KeptArrays):
         return self.folder / f"{name}{_SUFFIX}"
 
     def _seal(self, name: str, said: Mapping[str, str]) -> str:
-        """The digest of all that a file says but for its arrays, whose own digests are in it."""
+        """The digest of all metadata of a file; its arrays have their own digests in it."""
         return hashlib.sha256(json.dumps([self.run, name, said["about"], said["arrays"]]).encode()).hexdigest()
 
     @contextmanager
     def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
-        """A file of arrays, of which what is said, and the array `key`, are as they were written.
+        """Open a file of arrays, whose metadata, and the array `key`, are verified by their digests.
 
-        What is wrong with it, now or when it is read, is an InputError.
+        Damage, found now or when it is read, is an InputError.
         """
         file = self._file(name)
         try:

@@ -22,9 +22,10 @@ _WRITTEN_BYTES = 1 << 20
 _LEVEL = 1
 """Level of compression: half the time of zlib's usual 6 for files that are 3 % larger."""
 _SMALL_BYTES = 2**28
-"""Arrays of a small file may be so large together, however well they are packed: columns of NaN pack 1000 to 1."""
+"""Maximum total size of the arrays of a small file, bytes, whatever their compression: NaN compresses 1000 to
+1."""
 _MOST_PACKED = 50
-"""Those of a larger one this much larger than the file; measured coordinates hardly pack at all."""
+"""Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
 _BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
 """Bytes of the rows that are unpacked at a time, and of those that are skipped at a time."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -37,7 +38,7 @@ class Pieces:
     dtype: np.dtype[Any]
     """The type of its values."""
     shape: tuple[int, ...]
-    """Its whole shape."""
+    """Shape of the whole array."""
     pieces: Callable[[], Iterable[NDArray[Any]]]
     """The pieces in order; can be asked for several times."""
 
@@ -52,7 +53,7 @@ class Pieces:
         return np.concatenate(pieces) if len(pieces) > 0 else np.zeros(self.shape, dtype=self.dtype)
 
     def blocks(self) -> Iterator[bytes]:
-        """Its bytes in C order; ValueError where the pieces do not make up the shape."""
+        """Bytes of the array in C order; ValueError where the pieces do not make up the shape."""
         length, waiting = 0, b""
         for piece in self.pieces():
             if piece.shape[1:] != self.shape[1:]:
@@ -88,10 +89,11 @@ def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> 
 
 
 def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray[Any]]:
-    """Those arrays of an `.npz` file that are called one of `names`; InputError with the `cure` where that fails.
+    """Read the arrays of an `.npz` file whose names are among `names`; InputError with the `cure` where that
+    fails.
 
-    Of the file's other members nothing is read. An array takes memory only after its size, as zip and NumPy's
-    header say it, was found to be one that the file can hold.
+    Other members of the file are not read. An array takes memory only after its size, from the headers of zip and
+    NumPy, was found to be one that the file can hold.
     """
     with NpzFile(file, names, cure) as opened:
         return {name: opened.array(name) for name in opened.names}
@@ -147,7 +149,7 @@ class NpzFile(ExitStack):
             return self._member(name).shape
 
     def row_bytes(self, name: str) -> int:
-        """What a row of an array takes in memory."""
+        """Size of a row of an array in memory, bytes."""
         with self._telling():
             return self._member(name).row_bytes
 
@@ -186,10 +188,7 @@ class NpzFile(ExitStack):
         if name not in self._open:
             info = self._members[name]
             stream = self.enter_context(self._archive.open(info))
-            version = npy.read_magic(stream)
-            if version not in _HEADERS:
-                raise ValueError(f"{info.filename} is of NumPy's format {version}, 1.0 and 2.0 are read")
-            shape, fortran, dtype = _HEADERS[version](stream)
+            shape, fortran, dtype = read_npy_header(stream)
             if dtype.kind not in "biufU":
                 raise ValueError(f"{info.filename} holds {dtype}, neither numbers nor text")
             if stream.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
@@ -209,6 +208,17 @@ class NpzFile(ExitStack):
             raise InputError(
                 f"{self.file}: cannot be read as an .npz file without pickled objects ({reason}); {self._cure}"
             ) from None
+
+
+def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether in Fortran's order, and type of an array in NumPy's format; its numbers follow in the stream.
+
+    ValueError for other versions of the format than 1.0 and 2.0; NumPy raises many others for a damaged header.
+    """
+    version = npy.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"it is of NumPy's format {version}, 1.0 and 2.0 are read")
+    return _HEADERS[version](stream)
 
 
 def _go_to(stream: IO[bytes], place: int) -> None:

@@ -1,4 +1,4 @@
-"""The folder that results are written into: tried before the long work and not after, and one run's at a time."""
+"""The folder of results: tested before a long run instead of after it, and locked for one run at a time."""
 
 import os
 import tempfile

@@ -1,5 +1,6 @@
-"""Tables of arrays: what each column holds is said once, in the type of its field, and checked wherever one is
-made: `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
+"""Tables of arrays whose columns are declared in the types of fields and checked whenever a table is created.
+
+For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
 
 from collections.abc import Sequence
@@ -14,28 +15,28 @@ from numpy.typing import NDArray
 from shapepose_fg.core.storage.npz import Pieces
 
 _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
-"""Kinds of NumPy types that may stand for a column's own kind: whole and real numbers, text, yes and no."""
+"""Kinds of NumPy types that are accepted for a column's own kind: integers, floats, text, booleans."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """What an array of a table holds."""
+    """Axes, type, unit and bounds of an array of a table."""
 
     axes: str
-    """Its axes, apart by spaces: a letter is a length that is the same in all columns of a table, N counts
+    """Axes, separated by spaces: a letter is a length that is the same in all columns of a table, N counts
     rows."""
     dtype: Any = np.float64
     """The type of its values."""
     unit: str = ""
     """The unit of its values, where they have one."""
     most: float = np.inf
-    """The largest magnitude in a file, beyond which no result goes and products of it are no numbers."""
+    """Largest magnitude in a file; no result exceeds it, and products of larger numbers overflow."""
     missing: Any = None
-    """What it holds where it is not given, as in files of earlier versions; None where it must be given."""
+    """Value of a column that is not given, as in files of earlier versions; None where it must be given."""
     codes: type[Enum] | None = None
-    """What its codes mean, counted from 0."""
+    """Meanings of the codes, counted from 0."""
     stored: Any = None
-    """The type in files, where that is another."""
+    """Type in files, where it is another."""
 
     @property
     def has_rows(self) -> bool:
@@ -48,7 +49,7 @@ class Column:
         return tuple(int(axis) if axis.isdecimal() else axis for axis in self.axes.split())
 
     def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
-        """Its shape where letters have these lengths."""
+        """Shape of the array where letters have these lengths."""
         return tuple(sizes.get(each, 0) if isinstance(each, str) else each for each in self._lengths)
 
     def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
@@ -159,14 +160,14 @@ class Table:
             column.check_range(name, getattr(self, name))
 
     def columns(self) -> dict[str, Pieces]:
-        """What a file holds: rows, what they share, and what their codes mean."""
+        """The arrays of a file: rows, shared columns, and meanings of codes."""
         stored = {name: column.stored for name, column in columns_of(type(self)).items()}
         own = {name: Pieces.of(getattr(self, name), stored[name]) for name in (*self.ROWS, *self.shared())}
         return own | {name: Pieces.of(words) for name, words in self.meanings().items()}
 
     @classmethod
     def meanings(cls) -> dict[str, NDArray[np.str_]]:
-        """What codes mean, as the arrays that make a file readable: `gate_names` for the column `gate`."""
+        """Meanings of codes, as the arrays that make a file readable: `gate_names` for the column `gate`."""
         coded = {name: column.codes for name, column in columns_of(cls).items() if column.codes is not None}
         return {f"{name}_names": code_names(codes) for name, codes in coded.items()}
 

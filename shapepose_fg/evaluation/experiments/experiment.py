@@ -1,4 +1,4 @@
-"""What an experiment is: cases that are measured one by one, and a table whose rows pool their figures."""
+"""An experiment: cases that are measured one by one, and a table whose rows pool their figures."""
 
 import json
 import re
@@ -14,19 +14,19 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
 
 Figures = dict[str, Any]
-"""What a case measured: numbers and texts by name, None where there is nothing to measure; JSON holds them."""
+"""Figures of a case: numbers and texts by name, None where there is nothing to measure; JSON holds them."""
 
 _POOLED = {"mean": np.average, "least": np.min, "most": np.max, "sum": np.sum}
 
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement, which can be done without the others."""
+    """One independent measurement."""
 
     name: str
-    """Unlike that of the experiment's other cases."""
+    """Name, unique in the experiment."""
     measure: Callable[[], Figures]
-    """Does it. Nothing is computed before it is called."""
+    """Function that measures. Nothing is computed before it is called."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ class Column:
     """A column of the table."""
 
     heading: str
-    """What stands above it."""
+    """Heading of the column."""
     figure: str
-    """Which figure of the cases it shows."""
+    """Name of the figure that it shows."""
     decimals: int = 1
-    """Digits after the point."""
+    """Number of digits after the point."""
     pool: Literal["mean", "least", "most", "sum"] = "mean"
-    """What is made of the figures of a row's cases. Shares of joints of a class are weighted by their count."""
+    """How the figures of a row's cases are combined. Shares of joints of a class are weighted by their count."""
 
     def cell(self, cases: Sequence[Figures]) -> str:
-        """What stands in a row of these cases; a dash where none has the figure."""
+        """Text in a row of these cases; a dash where none has the figure."""
         those = [case for case in cases if case.get(self.figure) is not None]
         values = [case[self.figure] for case in those]
         if len(values) == 0 or isinstance(values[0], str):
@@ -65,15 +65,15 @@ class Experiment:
     """A table of the documents."""
 
     name: str
-    """That of its marks in the documents."""
+    """Name of its marks in the documents."""
     rows: Mapping[str, Sequence[Case]]
-    """What a row is called, and the cases whose figures it pools; a case may be in several rows."""
+    """Name of each row, and the cases whose figures it combines; a case may be in several rows."""
     columns: Sequence[Column]
-    """The table's columns but for the first, which has the names of the rows."""
+    """Columns of the table after the first, which has the names of the rows."""
 
     @property
     def cases(self) -> list[Case]:
-        """Every case once, in the order in which they are measured. ValueError for two of one name."""
+        """Every case once, in the order of measurement. ValueError for two with one name."""
         every = list({id(case): case for row in self.rows.values() for case in row}.values())
         if len({case.name for case in every}) < len(every):
             raise ValueError(f"{self.name}: two cases have one name: {sorted(case.name for case in every)}")
@@ -85,7 +85,7 @@ class Experiment:
         return replace(self, rows={label: row for label, row in rows.items() if len(row) > 0})
 
     def table(self, figures: Mapping[str, Figures]) -> list[str]:
-        """The lines of Markdown that the figures of all cases, by name, make."""
+        """The lines of a Markdown table from the figures of all cases, by name."""
         lines = [
             f"| | {' | '.join(column.heading for column in self.columns)} |",
             "|---" * (1 + len(self.columns)) + "|",
@@ -99,10 +99,10 @@ class Experiment:
 def measured(
     experiment: Experiment, folder: Path, *, afresh: bool = False, told: Callable[[str], None] = print
 ) -> tuple[dict[str, Figures], float]:
-    """The figures of every case by name, and the seconds that all of them took, whenever that was.
+    """The figures of every case by name, and the total time in seconds, over interruptions.
 
-    Each case has a file in `folder`: a run that was stopped goes on, but for one that begins `afresh`. InputError
-    for a file that has no figures.
+    Each case has a file in `folder`: an interrupted run is resumed, unless it begins `afresh`. InputError for a
+    file that has no figures.
     """
     figures, seconds = dict[str, Figures](), 0.0
     for case in experiment.cases:

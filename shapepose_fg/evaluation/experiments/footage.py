@@ -1,4 +1,4 @@
-"""Real footage: Shelf by its annotation, and by cameras that are left out."""
+"""Experiments on real footage: Shelf by its annotation, and by cameras that are left out."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +21,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 
 QUICK = range(20)
-"""Frames of a recording that a quick run takes."""
+"""Frames of a recording in a quick run."""
 SHELF_FPS = 25.0
 SHELF_COLUMNS = columns(
     *((f"actor {actor + 1}", f"actor_{actor + 1}", 2) for actor in ACTORS), ("Avg", "average", 2),
@@ -32,11 +32,12 @@ ZHANG = {
     "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
     "Zhang et al. 2020, without time": (96.34, 92.11, 96.13, 94.86),
 }
-"""The strongest other method: what its results on these frames and detections score, actors 1 to 3 and Avg."""
+"""The best other method: scores of its published results on these frames and detections, actors 1 to 3 and
+average."""
 
 
 def shelf_footage(folder: Path) -> tuple[Rig, DetectionTable]:
-    """Shelf from its folder in the repository of Zhang et al. 2020. InputError where it is not that."""
+    """Shelf from its folder in the repository of Zhang et al. 2020. InputError for other folders."""
     rig = read_rig(folder / "calibration.json")
     return rig, read_detections(folder, rig)
 
@@ -51,7 +52,7 @@ def _reconstructed(
 
 
 def shelf(scale: Scale) -> Experiment:
-    """PCP of ours, of steps of it, and of others on the whole recording."""
+    """PCP of our method, of its steps, and of others on the whole recording."""
     rows = dict[str, list[Case]]()
     if (folder := scale.recording("shelf")) is not None and not scale.quick:
         rows = {name: [Case(name, partial(_scores, folder, name))] for name in _SHELF}
@@ -62,7 +63,9 @@ def shelf(scale: Scale) -> Experiment:
 
 
 def views(scale: Scale) -> Experiment:
-    """Shelf solved without each of its cameras: what it saw against the 95 % regions of the rest."""
+    """Shelf solved without each of its cameras, whose detections are compared with the 95 % regions of the
+    rest.
+    """
     rows = {}
     if (folder := scale.recording("shelf")) is not None:
         names = shelf_footage(folder)[0].names
@@ -77,7 +80,7 @@ def _ours(folder: Path, mode: str) -> Reconstruction:
 
 
 def _bodies(folder: Path) -> People:
-    """The joints of the bodies in place of those of the graphs."""
+    """The joints of the bodies instead of those of the graphs."""
     people = _ours(folder, "frame by frame")
     return replace(people, joints=body_joints(people))
 
@@ -87,7 +90,7 @@ _SHELF: dict[str, Callable[[Path], People]] = {
     "**shapepose-fg, without time**": partial(_ours, mode="frame by frame"),
     "(ours) bodies' joints": _bodies,
 }
-"""What is measured on Shelf."""
+"""Measurements on Shelf."""
 
 
 @cache

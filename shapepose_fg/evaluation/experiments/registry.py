@@ -1,4 +1,4 @@
-"""Every experiment there is, in the order of the documents."""
+"""All experiments, in the order of the documents."""
 
 from collections.abc import Iterator
 
@@ -10,5 +10,5 @@ _EVERY = (footage.shelf, scenes.in_time, scenes.held_back, scenes.who_is_there, 
 
 
 def experiments(scale: Scale) -> Iterator[Experiment]:
-    """Those whose data are there."""
+    """The experiments whose data are available."""
     return (found for make in _EVERY if len((found := make(scale)).cases) > 0)

@@ -24,11 +24,11 @@ SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
     "report": {"salsa": (108, 618), "crossing": (0, 726), "crowd": (0, 826)},
     "tune": {"salsa": (0, 564), "crossing": (0, 564), "crowd": (241, 900)},
 }
-"""Where the segments of the named sequences without a cut begin; each has 300 frames."""
+"""First frames of the segments of the named sequences without a cut; each has 300 frames."""
 RECORDINGS = ("shelf", "cmu_mocap")
-"""Folders of recordings and of recorded motions that experiments are of."""
+"""Folders of the recordings and of the recorded motions for experiments."""
 QUICK_FRAMES = 4
-"""Frames of a scene that a quick run takes."""
+"""Number of frames of a scene in a quick run."""
 
 
 @dataclass(frozen=True)
@@ -38,25 +38,25 @@ class Segment:
     name: str
     """`salsa`, `crossing` or `crowd`; `demo` is the built-in scene."""
     span: range
-    """Which frames of it."""
+    """Frames of the scene."""
     split: Split = "report"
-    """Whose recorded motions."""
+    """Split of the recorded motions."""
     cameras: int = 6
-    """Views."""
+    """Number of views."""
     seed: int = 0
     """Seed of the detector's errors, and of the built-in scene."""
     people: int = 4
     """Number of people in the built-in scene; a sequence has its own."""
     made: SequenceConfig | None = None
-    """What a sequence is made of, in place of the named one's."""
+    """Configuration of a sequence, instead of the named one's."""
     fps: float | None = None
-    """Frames a second; None: the scene's own."""
+    """Frame rate, Hz; None: the scene's own."""
     mocap: Path | None = field(default=None, compare=False)
-    """The recorded motions; None: where SHAPEPOSE_DATA says."""
+    """The file of recorded motions; None: that of SHAPEPOSE_DATA."""
 
     @property
     def label(self) -> str:
-        """What a table calls it."""
+        """Name of the segment in tables."""
         return f"{self.name} {self.span.start}:{self.span.stop}"
 
     @property
@@ -66,18 +66,18 @@ class Segment:
 
     @property
     def detections(self) -> DetectionSequence:
-        """What the simulated detector saw."""
+        """Detections of the simulated detector."""
         return _detections(self)
 
     @property
     def truth(self) -> Reconstruction:
-        """The people as a result, in which everybody is somebody else after a cut."""
+        """The people as a result, in which identities change at a cut."""
         truth = truth_of(self.scene)
         part = np.searchsorted(self.scene.cuts, truth.frame, side="right")
         return replace(truth, person=truth.person + part * (int(truth.person.max(initial=0)) + 1))
 
     def reconstruct(self, config: PipelineConfig | None = None) -> Reconstruction:
-        """Reconstructed at the scene's rate."""
+        """Reconstruct at the scene's rate."""
         scene = self.scene
         times = FrameTimes.from_fps(scene.fps, len(self.span))
         return reconstruct(self.detections, scene.rig, config, times=times, cuts=scene.cuts)
@@ -85,20 +85,20 @@ class Segment:
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is measured, and on what."""
+    """Size of the measurement, and its data."""
 
     quick: bool = False
-    """A few frames of the built-in scene in place of all segments: whether everything works, in two minutes."""
+    """A few frames of the built-in scene instead of all segments: a test of all steps, in two minutes."""
     data: Path | None = None
     """Folder with the `RECORDINGS`. None: there are none."""
     split: Split = "report"
-    """Choose on `tune`, report on `report`."""
+    """Split of the recorded motions: choose on `tune`, report on `report`."""
     seeds: tuple[int, ...] = tuple(range(6101, 6106))
     """Seeds of the sequences that are drawn anew (`who is there`)."""
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        """Two of each sequence; none where there is nothing to simulate them from."""
+        """Two segments of each sequence; none without recorded motions."""
         if self.quick:
             return (Segment("demo", range(QUICK_FRAMES)),)
         every = SEGMENTS[self.split].items() if self.mocap is not None else ()
@@ -165,13 +165,13 @@ THERE_COLUMNS = columns(
     )
 )  # fmt: skip
 HELD_BACK_SEED, HELD_BACK = 1001, {"salsa": 0, "crossing": 108, "crowd": 0}
-"""Where the first 300 frames of each without a cut begin."""
+"""First of 300 frames of each sequence without a cut."""
 SECONDS, RATES, CAMERAS = 4.0, (10, 15, 20, 30, 60), (2, 3, 4, 6)
 """Duration, s, frame rates, Hz, and numbers of cameras of the recordings of `who is there`."""
 
 
 def measure(segment: Segment, config: PipelineConfig) -> Figures:
-    """`TrackingScore.as_dict` of a segment, how many people there are over all frames, and `cpu_ms` a frame."""
+    """`TrackingScore.as_dict` of a segment, the number of people over all frames, and `cpu_ms` a frame."""
     detections = segment.detections
     began = time.process_time()
     people = segment.reconstruct(config)
@@ -181,7 +181,7 @@ def measure(segment: Segment, config: PipelineConfig) -> Figures:
 
 
 def case(name: str, segment: Segment, config: PipelineConfig = OVER_TIME) -> Case:
-    """A segment that is reconstructed and scored."""
+    """A case that reconstructs and scores a segment."""
     return Case(name, partial(measure, segment, config))
 
 
@@ -196,10 +196,10 @@ def in_time(scale: Scale) -> Experiment:
 
 
 def held_back(scale: Scale) -> Experiment:
-    """Held-out people, in sequences that were made when every setting had been chosen.
+    """Held-out people, in sequences that were made after every setting had been chosen.
 
-    The dancers are the same takes as in the reported segments, which nothing is trained on; who stands and walks
-    around them is of test subjects only; places, bodies, cameras and the detector's errors are drawn anew.
+    The dancers are the same takes as in the reported segments, which nothing is trained on; people who stand and
+    walk around them are test subjects only; places, bodies, cameras and the detector's errors are drawn anew.
     """
     rows = dict[str, list[Case]]()
     segments = () if scale.mocap is None or scale.quick else held_back_segments(scale.mocap)
@@ -210,7 +210,7 @@ def held_back(scale: Scale) -> Experiment:
 
 
 def held_back_segments(mocap: Path) -> list[Segment]:
-    """Those of `held_back`, of the recorded motions in a file."""
+    """The segments of `held_back`, from the recorded motions in a file."""
     learnt_from = frozenset(subject for subject in Mocap.load(mocap).subjects if split_of(subject) != "test")
     made = {name: replace(SEQUENCES[name], seed=HELD_BACK_SEED, without=learnt_from) for name in HELD_BACK}
     return [
@@ -223,7 +223,7 @@ def who_is_there(scale: Scale) -> Experiment:
     """Crowds of eight and crossings of seven before 2 to 8 cameras, at 10 to 60 frames a second; two people.
 
     A row for each kind of recording, over its seeds, and for each number of cameras. Eight cameras, two people and
-    frames by themselves are measured at 30 frames a second only: a frame by itself knows no rate.
+    single frames are measured at 30 frames a second only: single frames are independent of the rate.
     """
     rows, of_cameras = dict[str, list[Case]](), dict[str, list[Case]]()
     for (name, cameras, rate), drawn in _crowds(scale).items():

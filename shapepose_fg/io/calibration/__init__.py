@@ -1,4 +1,4 @@
-"""Where the cameras stand: calibration files of many programs to one `Rig`, and our own rig file written."""
+"""Calibration files: reads those of many programs as a `Rig`, and writes our own rig file."""
 
 from shapepose_fg.core.rig_file import RIG_FORMAT as RIG_FORMAT
 from shapepose_fg.core.rig_file import write_rig as write_rig

@@ -1,4 +1,4 @@
-"""COLMAP's text model: cameras.txt and images.txt. Camera from world; no unit and no up axis of its own."""
+"""COLMAP's text model: cameras.txt and images.txt. Camera from world, without a unit and an up axis."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +28,7 @@ MODELS: dict[str, tuple[str, Lens]] = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
 }
-"""COLMAP's camera models that are lenses of OpenCV, and their parameters: of the distortion, OpenCV's in order."""
+"""COLMAP's camera models that OpenCV has, and their parameters: distortion coefficients in OpenCV's order."""
 _CURES = {
     "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
     " gave it one)",
@@ -37,7 +37,7 @@ _CURES = {
 
 
 def _read(content: Content) -> WrittenRig | None:
-    """A camera per image, in the order of images.txt; called after the image, or its folder."""
+    """A camera per image, in the order of images.txt; named after the image, or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
     names = [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
     if content.syntax not in ("folder", "text") or not set(names) & {*FILES, *_BINARY}:
@@ -99,7 +99,7 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
 
 
 def _names(files: Sequence[str]) -> list[str]:
-    """Names of cameras from names of images: the folders where they tell them apart, else the files."""
+    """Names of cameras from names of images: the folders where these are unique, else the files."""
     folders = [str(PurePosixPath(file).parent) for file in files]
     if "." not in folders and len(set(folders)) == len(folders):
         return folders

@@ -1,7 +1,7 @@
-"""What lies at a path, told by its first characters and parsed: JSON, TOML, XML, YAML, text, or a folder.
+"""The content of a path, recognised by its first characters and parsed: JSON, TOML, XML, YAML, text, or a folder.
 
-YAML and XML of OpenCV's FileStorage become plain values and arrays. Not by cv2.FileStorage: it corrupts memory on
-files that are cut or faulty (OpenCV 5.0, found by mutating files).
+YAML and XML of OpenCV's FileStorage become plain values and arrays. cv2.FileStorage is not used: it corrupts
+memory on damaged files (OpenCV 5.0, found by mutating files).
 """
 
 import re
@@ -19,37 +19,38 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, bounded, parse_toml, read_bytes, read_json, read_text
 
 Syntax = Literal["JSON", "TOML", "XML", "OpenCV", "YAML", "text", "folder", "pickle"]
-"""How a file is written; "OpenCV" is the YAML or XML of its FileStorage."""
+"""Syntax of a file; "OpenCV" is the YAML or XML of its FileStorage."""
 
 _TOML_LINE = re.compile(r"""\s*(\[\[?\s*[\w."' -]*[A-Za-z_."'][\w."' -]*\]\]?\s*(#.*)?$|[\w."'-]+\s*=)""")
 _YAML_LINE = re.compile(r"\s*(- )?[\w/.\"' -]+:(\s|$)")
 _MOST_OF_A_LINE = 1000
-"""Characters that tell how a file is written; these patterns take the square of a line's length."""
+"""Maximum number of characters by which a syntax is recognised; the time of these patterns grows with their
+square."""
 _XML_DECLARATION = re.compile(r"<!(DOCTYPE|ENTITY)")
 _YAML_VERSION = re.compile(r"\A%YAML[^\n]*\n")
 _ARRAY_TAGS = ("opencv-matrix", "opencv-nd-matrix")
 _MOST_CHARACTERS = 2**23
-"""A camera has a thousand."""
+"""Maximum number of characters of a calibration; a camera has a thousand."""
 _MOST_DEPTH = 64
-"""Nodes in nodes: libyaml's loader calls itself and crashes the interpreter on very deep ones."""
+"""Maximum depth of nested nodes: libyaml's loader is recursive and crashes the interpreter on very deep ones."""
 _MOST_DIGITS = 100
 """Maximum number of digits of a number: the time that YAML's base 60 takes grows with their square."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """What was found at a path."""
+    """The content of a path."""
 
     path: Path
     """The file or folder that the user named."""
     syntax: Syntax
-    """How it is written."""
+    """Syntax of the content."""
     value: Any
-    """What it holds: an object, table, XML element, text; of a folder, its sorted paths."""
+    """An object, table, XML element, or text; for a folder, its sorted paths."""
 
 
 def load(path: Path) -> Content:
-    """Find out how the file at `path` is written, and parse it; InputError naming the line that is wrong."""
+    """Recognise the syntax of the file at `path`, and parse it; InputError naming the line that is wrong."""
     if path.is_dir():
         return Content(path, "folder", sorted(each for each in path.iterdir() if not each.name.startswith(".")))
     if read_bytes(path, MIDDLE)[:1] == b"\x80":
@@ -101,7 +102,9 @@ def _refuse_long(path: Path, text: str) -> None:
 
 
 def _refuse_hostile(path: Path, text: str) -> None:
-    """InputError where nodes are very deep, or named again: a few names can stand for more than fits memory."""
+    """InputError where nodes are very deep, or aliases are used: a few of them can stand for more than fits
+    memory.
+    """
     depth = 0
     for event in yaml.parse(text, _Safe):
         line = f"{path}: line {event.start_mark.line + 1}"

@@ -37,11 +37,11 @@ _CURES = {
     **dict.fromkeys(("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of fisheyes"),
     "lens": "write perspective or fisheye",
 }
-"""What to do about a value, by its name in any of the formats."""
+"""Cures for values, by their names in any of the formats."""
 
 
 class _Camera(BaseModel, strict=True, extra="forbid"):
-    """A camera of a rig file; its numbers are checked as those of all formats."""
+    """A camera of a rig file; its numbers are checked as in all formats."""
 
     name: Annotated[str, Field(min_length=1)]
     image_size: Any
@@ -70,12 +70,12 @@ class _Rig(BaseModel, strict=True, extra="forbid"):
 
 
 def _members(content: Content) -> dict[str, Any]:
-    """The object that a JSON file holds; without members where it is none."""
+    """The object in a JSON file; empty where it holds another value."""
     return content.value if content.syntax == "JSON" and isinstance(content.value, dict) else {}
 
 
 def _read_rig_file(content: Content) -> WrittenRig | None:
-    """Our own file: all that a `Rig` is."""
+    """Our own file, which holds everything that a `Rig` has."""
     if "format" not in _members(content):
         return None
     if content.value["format"] != RIG_FORMAT:
@@ -116,7 +116,7 @@ def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
 
 
 def _read_association(content: Content) -> WrittenRig | None:
-    """Zhang et al., CVPR 2020, an object of cameras: metres, z up; keys of other tools are passed over."""
+    """Zhang et al., CVPR 2020, an object of cameras: metres, z up; keys of other tools are ignored."""
     members, known = _members(content).values(), {"K", "RT", "R", "T", "imgSize"}
     if not all(isinstance(each, dict) for each in members) or not any(known & each.keys() for each in members):
         return None
@@ -170,10 +170,10 @@ def _read_voxelpose(content: Content) -> WrittenRig | None:
 
 
 def _program(tables: Mapping[str, dict[str, Any]], metadata: Mapping[str, Any]) -> str:
-    """Whose TOML it is, by what only that program writes; AniPose's, which says least, where nothing tells.
+    """The program that wrote a TOML file, by what only that program writes; AniPose, the plainest, by default.
 
     Pose2Sim writes a camera's size as floats and `fisheye = false` at the end. Caliscope writes `cam_id` or `port`
-    into its own file; in the one for AniPose cameras are called as their tables, [cam_0], and the error is 0.
+    into its own file; in the one for AniPose cameras are named after their tables, [cam_0], and the error is 0.
     """
     every = list(tables.values())
     if any("cam_id" in table or "port" in table for table in every):
@@ -194,11 +194,13 @@ def _floats(value: Any) -> bool:
 
 _CALISCOPE_KEY = re.compile(r"cam_\d+")
 _FREEMOCAP = ("charuco_", "freemocap", "groundplane_", "solver_method", "board")
-"""How names in [metadata] begin that FreeMoCap alone writes; the last three since its version 2."""
+"""Prefixes of names in [metadata] that only FreeMoCap writes; the last three since its version 2."""
 
 
 def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis | None]:
-    """Unit and up axis, of those versions that write them: its board in mm, and z off a board on the floor."""
+    """Unit and up axis, from versions that write them: the board's size in mm, and z up for a board on the
+    floor.
+    """
     board = metadata.get("board")
     sizes = [*metadata, *(board if isinstance(board, dict) else ())]
     grounded = any(metadata.get(key) is True for key in ("groundplane_applied", "groundplane_calibration"))
@@ -213,13 +215,13 @@ def _tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def wanted_tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Those that are read: not to be ignored, and with a pose where any has one."""
+    """The tables that are read: not to be ignored, and with a pose where any has one."""
     tables = {key: table for key, table in _tables(value).items() if table.get("ignore") is not True}
     return {key: table for key, table in tables.items() if _POSE & table.keys()} or tables
 
 
 def _read_tables(content: Content, program: str) -> WrittenRig | None:
-    """The cameras that are not to be ignored: camera from world; keys of single programs are passed over."""
+    """The cameras that are not to be ignored: camera from world; keys of single programs are ignored."""
     tables = _tables(content.value) if content.syntax == "TOML" else {}
     metadata = content.value.get("metadata") if len(tables) > 0 else None
     metadata = metadata if isinstance(metadata, dict) else {}
@@ -254,7 +256,8 @@ _DIALECTS: dict[str, tuple[Unit | None, Axis | None, dict[str, str]]] = {
     "Pose2Sim": ("m", "z", {}),
     "AniPose": (None, None, {"unit": "pass --unit, that of the board's squares", "up": _UP}),
 }
-"""AniPose's world is one that nothing levels, in the unit of the board; FreeMoCap's is the first camera."""
+"""Unit, up axis and cures per program. AniPose's world is not levelled and has the unit of the board;
+FreeMoCap's is the first camera."""
 JSON_AND_TOML = (
     Format("our own rig file", _read_rig_file),
     Format("CMU Panoptic's JSON", _read_panoptic),

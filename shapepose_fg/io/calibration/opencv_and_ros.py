@@ -16,7 +16,7 @@ from shapepose_fg.io.calibration.written import Format, Node, WrittenCamera, Wri
 _FISHEYE = 1
 """OpenCV's CALIB_MODEL_FISHEYE."""
 _MOST = 2**20
-"""Numbers of all cameras together."""
+"""Maximum number of numbers of all cameras together."""
 _ASK = {
     "unit": "pass --unit, that of the board's squares",
     "up": "pass --up (a board's z points up or down where it lay; -y of a level first camera)",
@@ -32,9 +32,9 @@ _STEREO_UP = "pass the axis of the first camera that points up with --up; it is 
 _SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
 _MATRICES = ("m", "k", "cameramatrix", "camera_matrix", "mtx", "intrinsic", "intrinsic_matrix")
 _BENDS = ("d", "distcoeffs", "dist_coeffs", "distortion_coefficients", "distortion", "dist", "distcoeff")
-"""How cameras of a stereo pair, their intrinsic matrices and their distortion are called, in small letters."""
+"""Names of the distortion of a stereo pair's cameras, in small letters."""
 _GAP = ("none", "null", "")
-"""What EasyMocap calls a place between two cameras in its list of names."""
+"""Names by which EasyMocap fills places in its list of cameras."""
 
 INTRINSIC, TURN, SHIFT = (
     "camera_matrix K intrinsic_matrix",
@@ -44,16 +44,18 @@ INTRINSIC, TURN, SHIFT = (
 BEND = "distortion_coefficients dist_coeffs distortion_vector dist D"
 _SIZE = "image_width img_width width", "image_height img_height height"
 POSE = "camera_pose_matrix"
-"""Names that programs give to the parts of a camera; `camera_pose_matrix` is MC-Calib's world from camera."""
+"""Name of MC-Calib's world from camera."""
 
 
 def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
-    """The files of a folder with these endings."""
+    """The files of a folder with these suffixes."""
     return {path: load(path) for path in content.value if path.suffix in suffixes.split() and path.is_file()}
 
 
 def _read_multiview(content: Content) -> WrittenRig | None:
-    """What OpenCV's multiview_calibration.py saves: camera from the first camera, in the unit of the board."""
+    """The file that OpenCV's multiview_calibration.py saves: camera from the first camera, in the unit of the
+    board.
+    """
     if content.syntax != "OpenCV" or not {"Rs", "Ts", "Ks"} <= content.value.keys():
         return None
     nodes = Node(content.value, str(content.path), _AGAIN)
@@ -206,12 +208,12 @@ _LENSES: dict[str, Lens] = {
     **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "perspective"),
     **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
-"""ROS' distortion models that are lenses of OpenCV."""
+"""ROS' distortion models that OpenCV has."""
 _POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
 
 
 def is_info(value: Any) -> bool:
-    """Whether this is what ROS' camera_calibration writes, or an echoed CameraInfo message."""
+    """Whether this is a file of ROS' camera_calibration, or an echoed CameraInfo message."""
     known = isinstance(value, dict)
     return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
 
@@ -275,7 +277,7 @@ def _ros_pose(path: Path, value: Any) -> Array:
 
 
 def message_of(value: Any) -> tuple[Any, Any] | None:
-    """Translation and rotation of a pose, however deep its message is stamped."""
+    """Translation and rotation of a pose, for any depth of stamped messages."""
     if isinstance(value, dict) and isinstance(value.get("transforms"), list):
         value = value["transforms"][0] if len(value["transforms"]) == 1 else None
     while isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Calibration files to a `Rig`: the formats that are known, which one a file is, and what it does not say."""
+"""Reads calibration files as a `Rig`: recognises the format, and asks for what the file does not state."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,14 +20,14 @@ from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
-"""All formats that are known; the first to which a file belongs reads it."""
+"""All known formats; the first one that recognises a file reads it."""
 
 _MISSING = {
     "unit": "pass --unit m, cm or mm",
     "up": "pass --up with the axis that points up (x -x y -y z -z)",
     "image_size": "pass --image-size WIDTHxHEIGHT, the pictures that were calibrated, in pixels",
 }
-"""What the user can say, and how, in the order of the sentence."""
+"""Information that the user can give, and how, in the order of the sentence."""
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of numbers like 1e300, which are refused
@@ -40,13 +40,13 @@ def read_rig(
     cameras: Sequence[str] | None = None,
     without: Sequence[str] = (),
 ) -> Rig:
-    """Read the cameras of a calibration file, or folder; the format is told by the content.
+    """Read the cameras of a calibration file or folder; the format is recognised by the content.
 
-    The formats are `FORMATS`; docs/conventions.md says what unit and up axis each has. `up` and `unit` overrule
-    the file. `image_size` (width, height) is for formats that do not say how large the pictures are. `cameras` are
-    the names of those that are wanted, all by default, and `without` of those that are not. What neither
-    the file nor the caller says is an InputError: one sentence that names the file, the key and the cure.
-    `notes` of the rig say what was left out.
+    The formats are `FORMATS`; docs/conventions.md lists their units and up axes. `up` and `unit` override the
+    file. `image_size` (width, height) is for formats that do not state the size of the pictures. `cameras` are the
+    names of those to read, all by default, and `without` of those to leave out. Information that neither the file
+    nor the caller gives is an InputError: one sentence that names the file, the key and the cure. `notes` of the
+    rig say what was left out.
     """
     path = Path(path)
     for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
@@ -87,7 +87,7 @@ def read_rig(
 
 
 def carried(rig: Rig) -> Rig:
-    """The rig with each camera that moves where its trajectory begins."""
+    """The rig with each moving camera at the start of its trajectory."""
     if not rig.moves:
         return rig
     first = {each.name: each.wTb[0] for each in rig.trajectories}
@@ -96,9 +96,9 @@ def carried(rig: Rig) -> Rig:
 
 
 def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
-    """The rig whose cameras move as `given` says, `CAMERA=FILE` each: the file has the camera's own poses.
+    """The rig with cameras that move as in `given`, `CAMERA=FILE` each: the file has the camera's own poses.
 
-    What the calibration says of these cameras' poses is passed over. InputError where it cannot be used.
+    The calibration's poses of these cameras are ignored. InputError where a file cannot be used.
     """
     cameras, trajectories = {each.name: each for each in rig.cameras}, list(rig.trajectories)
     for each in given:
@@ -117,7 +117,7 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
 
 @np.errstate(over="ignore", invalid="ignore")
 def is_calibration(path: Path) -> bool:
-    """Whether a file or folder is of one of the formats, though it may be faulty."""
+    """Whether a file or folder has one of the formats, though it may be damaged."""
     try:
         content = load(path)
     except InputError:
@@ -129,7 +129,7 @@ def is_calibration(path: Path) -> bool:
 
 
 def _unknown(content: Content) -> str:
-    """What was found instead of a calibration, and what is known."""
+    """A sentence on what was found instead of a calibration, and on the known formats."""
     value = content.value
     if content.syntax == "folder":
         return (

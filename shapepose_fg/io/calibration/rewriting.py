@@ -1,7 +1,7 @@
-"""The files of a calibration with the numbers of its cameras replaced: XML, OpenCV's and ROS' YAML, COLMAP's text.
+"""Replaces the numbers of cameras in the files of a calibration: XML, OpenCV's and ROS' YAML, COLMAP's text.
 
-Each function returns the texts of the files by where these were read; what does not fit is left as it was, and who
-calls reads it back.
+Each function returns the texts of the files by their paths; what does not fit is left unchanged, and the caller
+reads the result back.
 """
 
 import re
@@ -129,13 +129,14 @@ def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLik
     return ET.tostring(root, encoding="unicode")
 
 
-def _part(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
-    """A camera's numbers, `count` of them, by a name that programs give them."""
-    R, t = camera.cTw[:, :3], camera.cTw[:, 3] / metres
-    wTc = camera.wTc.copy()
+def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
+    """The `count` numbers of a camera that programs store under `name`; None for unknown names."""
+    R, cTw, wTc = camera.cTw[:, :3], camera.cTw.copy(), camera.wTc.copy()
+    cTw[:, 3] /= metres
     wTc[:3, 3] /= metres
-    kinds = {INTRINSIC: camera.K, TURN: R if count == 9 else cv2.Rodrigues(R)[0], SHIFT: t, POSE: wTc}
-    kinds |= {BEND: np.r_[camera.distortion, np.zeros(14)][:count]}
+    kinds = {f"{INTRINSIC} matrix": camera.K, TURN: R if count == 9 else cv2.Rodrigues(R)[0], SHIFT: cTw[:, 3]}
+    kinds |= {"RT cTw": cTw, f"{POSE} wTc": wTc}
+    kinds |= {f"{BEND} distortion distortions distCoeff distCoef": np.r_[camera.distortion, np.zeros(14)][:count]}
     return next((each for names, each in kinds.items() if name in names.split()), None)
 
 
@@ -145,7 +146,7 @@ def _nodes(content: Content, rig: Rig, metres: float) -> Files:
     def file(path: Path, inside: tuple[str, ...]) -> str:
         def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
             whose = (*inside, *keys)[-2:]
-            return _part(keys[-1], cameras[whose[0]], metres, count) if whose[0] in cameras else None
+            return numbers_of(keys[-1], cameras[whose[0]], metres, count) if whose[0] in cameras else None
 
         return _matrices(read_text(path), value)
 
@@ -168,7 +169,9 @@ def _multiview(content: Content, rig: Rig, metres: float) -> Files:
         if rest != 0:
             return None
         counts = [4 if short else each for short in four]
-        parts = [_part(kind.split()[0], *both) for both in zip(rig.cameras, [metres] * V, counts, strict=True)]
+        parts = [
+            numbers_of(kind.split()[0], *both) for both in zip(rig.cameras, [metres] * V, counts, strict=True)
+        ]
         return np.concatenate([np.ravel(part) for part in parts if part is not None])
 
     return {content.path: _matrices(read_text(content.path), value)}
@@ -182,7 +185,7 @@ def _easymocap(content: Content, rig: Rig, metres: float) -> Files:
     def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
         kind, _, tag = keys[-1].partition("_")
         known = kind in kinds and tag in tags
-        return _part(kinds[kind].split()[0], tags[tag], metres, count) if known else None
+        return numbers_of(kinds[kind].split()[0], tags[tag], metres, count) if known else None
 
     folder = content.path if content.syntax == "folder" else content.path.parent
     halves = [path for path in folder.iterdir() if re.fullmatch(r"(intri|extri)\.ya?ml", path.name)]
@@ -257,4 +260,4 @@ REWRITTEN: dict[str, Callable[[Content, Rig, float], Files]] = {
     COLMAP.name: _colmap,
     ROS.name: _ros,
 }
-"""How each format is written again, by its name."""
+"""Functions that rewrite each format, by its name."""

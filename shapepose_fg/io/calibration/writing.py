@@ -1,4 +1,6 @@
-"""A calibration written again in the format it came in; what that cannot hold becomes our own rig file."""
+"""Writes a calibration in the format that it was read in; what that format cannot hold goes into our own rig
+file.
+"""
 
 import json
 import re
@@ -7,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
@@ -19,14 +21,14 @@ from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import wanted_tables
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
 from shapepose_fg.io.calibration.reading import FORMATS
-from shapepose_fg.io.calibration.rewriting import REWRITTEN
+from shapepose_fg.io.calibration.rewriting import REWRITTEN, numbers_of
 from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 
 _SEVERAL = (OPENCV[0].name, COLMAP.name)
-"""Formats of several files, whichever of them is given."""
+"""Formats that consist of several files."""
 _YAML = (".yml", ".yaml")
 _DIGITS, _DIGITS_PX = 1e-6, 1e-4
-"""How far what reads back may be off: metres and no unit, pixels."""
+"""Tolerances of what is read back: metres and numbers without unit, pixels."""
 _TABLE = re.compile(r"\s*\[\s*(?P<key>[^\]]+?)\s*\]\s*(#.*)?$")
 _ENTRY = re.compile(r"(?P<head>\s*(?P<name>matrix|rotation|translation|distortions)\s*=\s*)")
 
@@ -71,7 +73,7 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
 
 
 def check_target(source: Path, target: Path) -> None:
-    """InputError where `target` has the ending of another format than that of `source` and than .json, our own."""
+    """InputError where `target` has a suffix that is neither that of `source`'s format nor .json, our own."""
     _, form, _ = _found(source)
     several = source.is_dir() or form.name in _SEVERAL
     ending, own = target.suffix.lower(), source.suffix.lower()
@@ -85,7 +87,7 @@ def check_target(source: Path, target: Path) -> None:
 
 
 def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
-    """What lies at `source`, in which format, and its cameras."""
+    """The content of `source`, its format, and its cameras."""
     content = load(source)
     read = ((each, each.read(content)) for each in FORMATS)
     found = next(((form, written) for form, written in read if written is not None), None)
@@ -112,7 +114,7 @@ def _write(files: dict[Path, str], target: Path, *, several: bool) -> None:
 
 
 def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
-    """Whether the cameras of a file are those of a rig, to what a file's digits hold."""
+    """Whether the cameras of a file are those of a rig, within the precision of the file."""
     if [each.name for each in written.cameras] != list(rig.names):
         return False
     for each, camera in zip(written.cameras, rig.cameras, strict=True):
@@ -139,26 +141,20 @@ _PLACES: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
     "VoxelPose's JSON": _voxelpose,
     "4D Association's calibration.json": lambda value: list(value.values()),
 }
-"""Where each format of JSON has its cameras, in the order in which they are read."""
+"""Functions that return the cameras in each format of JSON, in the order in which they are read."""
 
 
 def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:
-    """Put a camera's numbers in the place of those that its entry has, each in the shape it had."""
-    cTw, centre = camera.cTw.copy(), camera.centre / metres
-    cTw[:, 3] /= metres
-    wTc = camera.wTc.copy()
-    wTc[:3, 3] = centre
-    at = centre if "fx" in entry else cTw[:, 3]  # VoxelPose has R (X - T)
-    R = cTw[:, :3] if np.size(entry.get("R", 0)) != 3 else cv2.Rodrigues(cTw[:, :3])[0]
-    numbers = {"K": camera.K, "RT": cTw, "cTw": cTw, "wTc": wTc, "R": R, "T": at, "t": at}
-    numbers |= dict(zip(("fx", "cx", "fy", "cy"), camera.K[[0, 0, 1, 1], [0, 2, 1, 2]], strict=True))
-    d = np.r_[camera.distortion, np.zeros(14)]
-    numbers |= {"k": d[[0, 1, 4]], "p": d[2:4]} if "fx" in entry else {}
-    numbers |= {name: d for name in ("distCoeff", "dist", "distortion", "distCoef")}
-    for name, value in numbers.items():
-        if entry.get(name) is not None:
-            shape = np.shape(entry[name])
-            entry[name] = np.ravel(value)[: int(np.prod(shape))].reshape(shape).tolist()
+    """Replace the numbers of a camera in its entry, each in the shape that it has there."""
+    own = dict[str, ArrayLike]()
+    if "fx" in entry:  # VoxelPose, where T is the centre: R (X - T)
+        own = dict(zip(("fx", "cx", "fy", "cy"), camera.K[[0, 0, 1, 1], [0, 2, 1, 2]], strict=True))
+        d = np.r_[camera.distortion, np.zeros(14)]
+        own |= {"k": d[[0, 1, 4]], "p": d[2:4], "T": camera.centre / metres}
+    for name, old in entry.items():
+        new = own.get(name, numbers_of(name, camera, metres, np.size(old)))
+        if old is not None and new is not None:
+            entry[name] = np.reshape(new, np.shape(old)).tolist()
 
 
 def _toml(source: Path, content: Content, rig: Rig, metres: float) -> str:
@@ -175,18 +171,7 @@ def _toml(source: Path, content: Content, rig: Rig, metres: float) -> str:
         elif camera is not None and (entry := _ENTRY.match(line)) is not None:
             old = tables[key][entry["name"]]
             depth = line.count("[") - line.count("]")
-            line = entry["head"] + json.dumps(_table_value(entry["name"], old, camera, metres))
+            new = numbers_of(entry["name"], camera, metres, np.size(old))
+            line = entry["head"] + json.dumps(np.reshape(np.asarray(new), np.shape(old)).tolist())
         lines.append(line)
     return "\n".join(lines) + "\n"
-
-
-def _table_value(name: str, old: Any, camera: Camera, metres: float) -> list[Any]:
-    """The value of an entry of a camera's table, in the shape it had."""
-    R = camera.cTw[:, :3]
-    values = {
-        "matrix": camera.K,
-        "rotation": cv2.Rodrigues(R)[0] if np.size(old) == 3 else R,
-        "translation": camera.cTw[:, 3] / metres,
-        "distortions": np.r_[camera.distortion, np.zeros(14)][: np.size(old)],
-    }
-    return np.reshape(values[name], np.shape(old)).tolist()

@@ -1,4 +1,4 @@
-"""A calibration as its file says it: poses in the file's own unit, and what the file does not say left open."""
+"""A calibration as the file states it: poses in the file's own unit, and missing information left open."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,12 +21,12 @@ from shapepose_fg.io.validation import describe
 Unit = Literal["m", "cm", "mm"]
 """The unit of lengths in a calibration file."""
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""How long each unit is."""
+"""Length of each unit, metres."""
 
 _ROTATION_TOLERANCE = 1e-3
-"""How far R Rᵀ may be from the identity: calibrations are printed with four to six digits."""
+"""Largest deviation of R Rᵀ from the identity: calibrations are printed with four to six digits."""
 _EXACT = 1e-12
-"""Below this a rotation is left as written, so that a rig that is written and read stays the same."""
+"""Deviation below which a rotation is kept as written, so that a rig that is written and read stays the same."""
 _MOST_COEFFICIENTS = 14
 
 
@@ -35,21 +35,21 @@ class WrittenCamera:
     """One camera of a calibration file."""
 
     name: str
-    """What the file calls it."""
+    """Name in the file."""
     K: Array
     """(3, 3) intrinsic matrix, pixels; (0, 0) is the centre of the first pixel."""
     wTc: Array
     """(4, 4) world-from-camera pose in the file's unit; x right, y down, z forward."""
     image_size: tuple[int, int] | None
-    """(width, height), pixels; None where the file does not say."""
+    """Width and height of the picture, pixels; None where the file does not state them."""
     distortion: Sequence[float] = ()
-    """In OpenCV's order; coefficients at the end may be left out."""
+    """Coefficients in OpenCV's order; missing ones at the end are 0."""
     lens: Lens = "perspective"
-    """Which lens the coefficients belong to."""
+    """Lens model of the coefficients."""
     readout_s: float = 0.0
-    """How long its shutter takes from the first row of a picture to the last, seconds."""
+    """Time that the shutter takes from the first row of a picture to the last, seconds."""
     trajectory: str = ""
-    """The name of the trajectory along which it is carried; then `wTc` is its pose on the carrier, instead."""
+    """The name of the trajectory that carries the camera; `wTc` is then the pose on the carrier."""
 
     def finished(self, metres: float, image_size: tuple[int, int] | None, path: Path) -> Camera:
         """The camera in metres; InputError where its numbers are those of no camera."""
@@ -64,42 +64,42 @@ class WrittenCamera:
 
 @dataclass(frozen=True)
 class WrittenRig:
-    """What a calibration file says."""
+    """The content of a calibration file."""
 
     cameras: Sequence[WrittenCamera]
-    """In the order of the file."""
+    """The cameras in the order of the file."""
     unit: Unit | None
     """Unit of the translations; None where the file and its format do not say."""
     up: Axis | None
-    """Which axis points up; None where the file and its format do not say."""
+    """Axis that points up; None where the file and its format do not state it."""
     cures: Mapping[str, str] = field(default_factory=dict)
-    """How the user can say what the file does not, by field: "unit", "up" or "image_size"."""
+    """Cures for missing information, by field: "unit", "up" or "image_size"."""
     trajectories: Sequence[Trajectory] = ()
-    """Where the carriers of cameras go."""
+    """Trajectories of the carriers of cameras."""
     notes: Sequence[str] = ()
-    """What of the file was left out or taken for granted, a sentence each."""
+    """Notes, a sentence each, on what was left out of the file or assumed."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """One way in which calibrations are written."""
+    """A format of calibrations."""
 
     name: str
-    """For messages."""
+    """Name of the format, for messages."""
     read: Callable[[Content], WrittenRig | None]
     """The cameras; None where the content is of another format, InputError where it is of this one and faulty."""
 
 
 @dataclass(frozen=True)
 class Node:
-    """Values that a file gives under names. Whatever is wrong with one is an InputError: place, name and cure."""
+    """Named values of a file. Anything wrong with one is an InputError with place, name and cure."""
 
     values: Mapping[str, Any]
-    """Numbers, lists of them, arrays, and other things; None is as good as nothing."""
+    """Numbers, lists of them, arrays, and other things; None counts as missing."""
     place: str
     """The file, and the camera in it."""
     cures: Mapping[str, str] = field(default_factory=dict)
-    """What to do, by name; for others under the empty name."""
+    """Cures by name; under the empty name for all others."""
 
     def refuse(self, name: str, problem: str) -> InputError:
         """An error about one of the values."""
@@ -107,12 +107,12 @@ class Node:
         return InputError(f"{self.place}: {name} {problem}; {cure}")
 
     def named(self, names: str | Sequence[str]) -> str | None:
-        """The first of several names, apart by spaces, under which there is a value."""
+        """The first of several names, separated by spaces, that has a value."""
         every = names.split() if isinstance(names, str) else names
         return next((name for name in every if self.values.get(name) is not None), None)
 
     def numbers(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array | None:
-        """The numbers, flat, under the first of `names` that there is; None where there is none.
+        """The numbers, flat, under the first existing one of `names`; None where none exists.
 
         They are finite, and as many as one of `counts`, or at most `most` of them.
         """

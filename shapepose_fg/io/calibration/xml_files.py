@@ -25,16 +25,16 @@ from shapepose_fg.io.validation import is_number
 _RESOLUTION = "video_resolution"
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
 QTM_CAMERAS, NEXUS_CAMERAS = ("cameras/camera", "model"), ("Camera", "TYPE")
-"""Where cameras are, and the attribute that tells those for video."""
+"""Paths of cameras, and the attribute by which video cameras are recognised."""
 SUBPIXEL = 64.0
 """QTM counts focal lengths and centres in 64ths of a pixel."""
 _FULL = (1080, 1440, 2160)
-"""Lines of a picture of the whole sensor that QTM names, by the sensor; no smaller sensor makes videos."""
+"""Numbers of lines of full sensors that QTM names; no smaller sensor makes videos."""
 _CROPPED = 8
-"""Lines by which a picture of part of the sensor may differ from the resolution's name: 1080p has 1088."""
+"""Largest difference between the lines of a cropped picture and those of its resolution's name: 1080p has 1088."""
 _LINES = re.compile(r"(\d{3,4})[pi]", re.ASCII)
 _VIDEO = ("video", "hybrid", "none")
-"""Words in the models of cameras that take videos: Miqus Video (Plus), Miqus Hybrid; none is not known."""
+"""Words in the models of video cameras: Miqus Video (Plus), Miqus Hybrid; none is unknown."""
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """QTM's cameras have y up and look along -z."""
 DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
@@ -43,7 +43,7 @@ DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangental
 def _cameras(
     content: Content, root: str, path: str, model: str, name: str, read: Callable[[ET.Element, str], WrittenCamera]
 ) -> WrittenRig | None:
-    """The video cameras where the file tells them by `model` from marker cameras, else all of them."""
+    """The video cameras where the file distinguishes them by `model` from marker cameras, else all of them."""
     if content.syntax != "XML" or content.value.tag != root or content.value.find(path.split("/")[0]) is None:
         return None
     cameras, used = [], chosen(content.value, path, model)
@@ -78,7 +78,7 @@ def chosen(root: ET.Element, path: str, model: str) -> list[ET.Element]:
 
 
 def _node(element: ET.Element | None, place: str, cure: str) -> Node:
-    """The attributes of an element, of which those that can be are numbers."""
+    """The attributes of an element, converted to numbers where possible."""
 
     def parsed(text: str) -> Any:
         try:

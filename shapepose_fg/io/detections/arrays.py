@@ -1,4 +1,4 @@
-"""People in arrays: FreeMoCap's NumPy file of all cameras, HDF5 of SLEAP and DeepLabCut; never a pickle."""
+"""Detections in arrays: FreeMoCap's NumPy file of all cameras, HDF5 of SLEAP and DeepLabCut; never a pickle."""
 
 import pickletools
 from collections.abc import Iterator
@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.lib import format as npy
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.npz import read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.csv_people import body_parts, people_in
@@ -19,18 +19,18 @@ from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 _FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF5", "DeepLabCut's HDF5"
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
-"""Numbers in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
+"""Maximum number of values in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
 _SMALL_BYTES, _MOST_PACKED = 2**27, 50
-"""Bytes of an array of a packed file, small or at the most so many times the file: columns of NaN pack well."""
+"""Size up to which an array of a compressed file counts as small, bytes, and maximum compression ratio of
+larger ones."""
 _MOST_CAMERAS = 1000
 _MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
 _TABLE, _LONGEST_LIST = "df_with_missing/table", 2**20
-"""Where DeepLabCut and AniPose keep their table, and bytes of the list of its columns."""
+"""Path of the table of DeepLabCut and AniPose, and maximum size of the list of its columns, bytes."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
-"""How HDF5 keeps a text of any length: how long it is, and where."""
+"""HDF5's reference to a text of variable length: its length, and its place."""
 _BLAZEPOSE = 33
-"""MediaPipe's points of the body come first; hands and face follow."""
-_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+"""Number of MediaPipe's points of the body, which come first; hands and face follow."""
 _HDF5 = "an HDF5 file, and only SLEAP's analysis files and DeepLabCut's tables are known here; give the CSV"
 _FREEMOCAP_3D = (
     "FreeMoCap's table of points in 3D, and its 2D points are needed; give the recording's folder, or"
@@ -54,7 +54,7 @@ _OTHERS = {
 
 
 def what_it_is(path: Path) -> str | None:
-    """What a file is that cannot be read, and how to bring its content; None where its ending tells nothing."""
+    """A sentence on what an unsupported file is, and how to convert it; None where its suffix is unknown."""
     known = next((what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None)
     if known is None:
         return None
@@ -63,7 +63,7 @@ def what_it_is(path: Path) -> str | None:
 
 
 def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
-    """One person before camera number `camera` of so many, which are in the file in the calibration's order.
+    """Detections of one person in camera number `camera` of `cameras`, in the order of the calibration.
 
     The file is (cameras, frames, points, 2 or 3): pixels, NaN where nobody is seen; a third number is a score
     where it lies between 0 and 1, else MediaPipe's depth, which is not used. InputError naming file and cure.
@@ -109,8 +109,7 @@ def cameras_of_freemocap(path: Path) -> list[str]:
 def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:
     """Shape, type and order of the array in an .npy file, and where its numbers begin."""
     try:
-        version = npy.read_magic(stream)
-        shape, fortran, dtype = _HEADERS[version](stream)
+        shape, fortran, dtype = read_npy_header(stream)
     except Exception:  # NumPy parses the header as Python's own text, with all errors of that
         raise InputError(f"{path}: this is no NumPy array; {what_it_is(path)}") from None
     if dtype.hasobject:
@@ -168,7 +167,8 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
 
 
 def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
-    """A list of rows of texts, which pandas keeps as a pickle: it is read as text, nothing in it is carried out.
+    """A list of rows of texts, which pandas stores as a pickle: it is parsed as text, and nothing in it is
+    executed.
 
     ValueError where it is anything else.
     """

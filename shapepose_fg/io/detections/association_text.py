@@ -22,25 +22,25 @@ from shapepose_fg.io.validation import is_number
 from shapepose_fg.proposal.assignment import match_best_first
 
 _LONGEST_WORD = 2**20
-"""No number is as long."""
+"""Maximum number of characters of a number."""
 _SPACE = " \n\t"
-"""Pieces end behind one of these, so that no number, letter or end of line is cut."""
+"""Characters at which pieces end, so that no number, letter or end of line is cut."""
 SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
-"""What the format's skeleton numbers mean."""
+"""Meanings of the format's skeleton numbers."""
 
 
 @dataclass(frozen=True)
 class TextSkeleton:
-    """The joints and limbs of a file: those of the detector, where `skeleton` may have more."""
+    """The joints and limbs of a file: those of the detector; `skeleton` may have more."""
 
     number: int
-    """What the file's first line calls it."""
+    """Number of the skeleton in the file's first line."""
     joints: tuple[str, ...]
     """The joints whose candidates are listed, in order; the first of `skeleton`'s."""
     limbs: tuple[tuple[int, int], ...]
     """The limbs whose affinities are listed, in order."""
     skeleton: Skeleton
-    """What is read from it."""
+    """The skeleton that is read from it."""
 
     @property
     def limb_of(self) -> Index:
@@ -64,7 +64,7 @@ TEXT_SKELETONS = {
         ),
     )
 }
-"""The skeletons that are read and written, by the name of ours."""
+"""Supported skeletons, by the name of ours."""
 
 
 def _whole_words(path: Path) -> Iterator[str]:
@@ -83,24 +83,24 @@ def _whole_words(path: Path) -> Iterator[str]:
 
 
 class NumberStream:
-    """The numbers of a file in order. Only some of them are in memory: those since the last `forget`."""
+    """The numbers of a file in order, of which those since the last `forget` are in memory."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.first = 0
-        """How many numbers were forgotten."""
+        """Number of dropped numbers."""
         self.values: Array = np.zeros(0)
-        """Numbers from the first that is not forgotten on."""
+        """The numbers in memory."""
         self._pieces = _whole_words(path)
         self._most = path.stat().st_size // 2 + 1
 
     @property
     def known(self) -> int:
-        """How many numbers of the file have been read."""
+        """Number of the file's numbers that have been read."""
         return self.first + len(self.values)
 
     def reaches(self, count: int) -> bool:
-        """Whether the file has so many numbers; they are in memory then."""
+        """Whether the file has this many numbers; they are then in memory."""
         if count > self._most:  # no room in the file: it is not read to its end for that
             return False
         parts, known = [self.values], self.known
@@ -112,7 +112,7 @@ class NumberStream:
         return known >= count
 
     def forget(self, count: int) -> None:
-        """The first `count` numbers of the file are done with."""
+        """Drop the first `count` numbers of the file."""
         self.values, self.first = self.values[count - self.first :].copy(), count
 
     def refuse(self, index: int | None, problem: str, cure: str) -> InputError:
@@ -148,10 +148,10 @@ class NumberStream:
 
 
 def read_association_text(path: Path, camera: Camera) -> ViewStream:
-    """The candidates that `camera` saw, of `path`, and their skeleton; middle joints are made.
+    """The candidates of `camera` in the file at `path`, and their skeleton; middle joints are computed.
 
-    Of the file only the beginning is read before the stream's blocks are asked for. InputError naming file, line,
-    frame and cure.
+    Only the beginning of the file is read before the stream's blocks are. InputError naming file, line, frame and
+    cure.
     """
     numbers = NumberStream(path)
     kind, frame_count = _header(numbers)
@@ -162,7 +162,7 @@ def read_association_text(path: Path, camera: Camera) -> ViewStream:
 def _blocks(
     numbers: NumberStream, kind: TextSkeleton, frame_count: int, camera: Camera
 ) -> Iterator[ViewCandidates]:
-    """The candidates of one block of frames after the other."""
+    """The candidates in blocks of frames."""
     position = 2
     for start in range(0, frame_count, BLOCK_FRAMES):
         numbers.forget(position)
@@ -226,12 +226,12 @@ def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
 def _layout(
     numbers: NumberStream, kind: TextSkeleton, frames: range, frame_count: int, position: int
 ) -> tuple[Index, Index, int]:
-    """How many candidates each joint of each frame has, and where the numbers of each block start.
+    """The number of candidates of each joint in each frame, and where the numbers of each block start.
 
     Returns `counts` (T, J), `starts` (T, J + 1), the first x of a joint, and in the last column the first affinity
     of the frame; and where the next frame begins. `position` is where the first does. Each count is known only
-    when the one before has been passed, so this is a loop, over blocks; everything inside the blocks is done in
-    arrays.
+    when the one before has been skipped, so that this is a loop over blocks; everything inside the blocks is done
+    in arrays.
     """
 
     def reach(count: int, what: str) -> None:
@@ -293,12 +293,12 @@ def _expand(sizes: Index) -> tuple[Index, Index]:
 
 
 def with_middles(view: ViewCandidates, skeleton: Skeleton) -> ViewCandidates:
-    """`view` of a file's joints as candidates of the whole skeleton: its middle joints are made.
+    """`view` of a file's joints as candidates of the whole skeleton, with its middle joints.
 
     A middle belongs to two candidates (hips) that share a neighbour (the neck) by affinity. Each candidate makes
-    one middle at most: pairs are taken in falling order of the lesser of their two affinities to the neighbour.
-    A middle is as sure as the less sure of its two, has affinity 1 to them, and to every neighbour that both are
-    linked to the mean of their affinities. Pairs that no limb of the skeleton joins are left out.
+    one middle at most: pairs are taken in falling order of the smaller of their two affinities to the neighbour. A
+    middle has the lower confidence of its two, affinity 1 to them, and to every neighbour that both are linked to
+    the mean of their affinities. Pairs that no limb of the skeleton joins are left out.
     """
     for middle, first, second in skeleton.middles:
         view = _with_middle(view, middle, first, second)

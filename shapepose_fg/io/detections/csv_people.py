@@ -18,13 +18,13 @@ _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
 _MOST_COLUMNS = 10_000
 _BLAZEPOSE = 33
-"""Caliscope numbers MediaPipe's points of the body so; those of hands and face have other numbers."""
+"""Caliscope's number of MediaPipe's points of the body; those of hands and face have other numbers."""
 _LINES = 4096
-"""Lines that are taken in together."""
+"""Number of lines that are processed together."""
 
 
 def head_of(path: Path) -> list[str]:
-    """The first line's fields; none where it is no text."""
+    """The first line's fields; none where the file is no text."""
     with open_regular(path) as stream:
         line = stream.read(4096).split(b"\n", 1)[0]
     try:
@@ -109,7 +109,8 @@ def cameras_of_caliscope(path: Path) -> list[str]:
 
 
 def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeople:
-    """One person before camera number `camera` of `cameras`, with MediaPipe's points; frames are `sync_index`.
+    """Detections of one person in camera number `camera` of `cameras`, with MediaPipe's points; frames are
+    `sync_index`.
 
     InputError naming line and cure.
     """

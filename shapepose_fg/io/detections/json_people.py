@@ -40,13 +40,13 @@ _RERUN = {
     _SEPARATE: "run AlphaPose again, without --format",
 }
 _LONGEST_GAP = 1000
-"""Frames that may be missing, and as many as there are: more are numbers of something else."""
+"""Largest ratio of missing to existing frames: more are numbers of something else."""
 _LOOKED_AT = 100
-"""Files of frames without people that are passed over to tell whose they are."""
+"""Maximum number of files without people that are read to recognise the program."""
 _LONGEST_NAME = 4096
-"""Characters of a picture's path: the search takes the square of them."""
+"""Maximum number of characters of a picture's path: the time of the search grows with their square."""
 _FRAME_FILE = re.compile(r"(\d+)(_keypoints|(\.\w{1,5})?\.predictions)?\.json$")
-"""How the file of a frame is named."""
+"""Pattern of the names of files of frames."""
 _FRAME_NUMBER = re.compile(r"(\d+)\D*$")
 """The last number in the name of a picture."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
@@ -54,7 +54,8 @@ _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
 _LISTS = ("annotations", "instance_info")
 """Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
 _AT_ONCE = 1024
-"""Items that are checked together: as Python's numbers they take several times the memory of an array."""
+"""Number of items that are checked together: as Python's numbers they take several times the memory of an
+array."""
 
 
 class _Person(BaseModel, strict=True, extra="allow"):
@@ -117,7 +118,7 @@ class _Object(BaseModel, strict=True):
     keypoints: _Columns | None = None
 
     def flat(self, place: str) -> list[float]:
-        """x, y and score of each keypoint; those that are hardly seen are in the corner 0 0."""
+        """x, y and score of each keypoint; those that are hardly seen are at 0 0."""
         own = self.keypoints
         if own is None:
             return []
@@ -161,7 +162,7 @@ def _checked(values: list[float], place: str, program: str) -> list[float]:
 
 
 def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, program: str) -> None:
-    """Take numbers of keypoints into `known`; InputError where there are several."""
+    """Add numbers of keypoints to `known`; InputError where there are several."""
     known |= {len(person) // 3 for person in people}
     if len(known) > 1:
         counts = " and ".join(map(str, sorted(known)))
@@ -262,7 +263,7 @@ def read_frame_files(folder: Path) -> CameraPeople:
 
 
 def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | None]:
-    """Whose files of frames these are, by the first with people, and the joints that it names."""
+    """The program that wrote files of frames, by the first with people, and the joints that it names."""
     program, joints = _POSE2SIM, None
     for n, file in enumerate(files[:_LOOKED_AT]):
         content = read_json(file, most=MIDDLE)
@@ -383,7 +384,7 @@ class _Collected:
             start += len(some)
 
     def add(self, rows: list[list[float]]) -> None:
-        """Take in people with flat keypoints."""
+        """Add people with flat keypoints."""
         _of_one_model(self._counts, rows, self.path, self.program)
         if len(rows) > 0:
             self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
@@ -391,7 +392,7 @@ class _Collected:
     def camera(
         self, frames: list[int], listed: tuple[int, int], joints: str | tuple[str, ...] | None
     ) -> CameraPeople:
-        """All of them, who are in these `frames` (N); `listed` are the first and last that the file knows."""
+        """All people, in these `frames` (N); `listed` are the first and last that the file knows."""
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
         how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun, "joints": joints}
         return CameraPeople(self.path, self.program, blocks, *listed, **how)

@@ -1,4 +1,4 @@
-"""Which joints the keypoints of people are: as the user says, as the files say, or as their number allows."""
+"""The joints of keypoints: as the user states, as the files state, or by the number of keypoints."""
 
 from collections.abc import Sequence
 
@@ -13,19 +13,20 @@ from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, Kept
 
 _CURE = "name the detector's own with --skeleton"
 _MOST_PEOPLE = 200
-"""People of a camera whose looks are compared with a body's."""
+"""Maximum number of a camera's people that are compared with a body."""
 _SPREAD, _SIGMAS = 0.5, 2.5
-"""Spread of a person's fit that is assumed beside the seen one, nats a pair of joints, as few people alike are no
-proof; and how many sigmas are sure. Layouts differ by 0.7 to 1.7, some with two other joints by 0.07."""
+"""Assumed standard deviation of a person's fit besides the observed one, nats per pair of joints, because few
+similar people prove little; and standard deviations that a decision needs. Layouts differ by 0.7 to 1.7, some
+with two other joints by 0.07."""
 
 
 def skeleton_of_people(
     people: Sequence[KeptPeople], wanted: Skeleton | None = None, declared: DeclaredJoints | None = None
 ) -> tuple[Skeleton, list[str]]:
-    """The skeleton that the people of all cameras have, and what is to be said of how it was found.
+    """The skeleton of the people of all cameras, and notes on how it was found.
 
-    What the user `wanted` goes before the names in the files, these before what a project's settings `declared`,
-    and this before the number of keypoints. InputError where cameras or names contradict each other.
+    The user's `wanted` has precedence over names in the files, these over what a project's settings `declared`,
+    and this over the number of keypoints. InputError where cameras or names contradict each other.
     """
     counted = _one_count(people)
     if counted is None:
@@ -96,7 +97,7 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
 
 
 def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
-    """(L, N) how well people (N, K, 2) fit each layout, without those who tell nothing."""
+    """(L, N) fit of people (N, K, 2) to each layout, without people with too few joints."""
     from shapepose_fg.body.joint_order import fit_of_order
 
     fits = np.array([fit_of_order(people, keypoint_names(each)) for each in layouts])
@@ -104,8 +105,8 @@ def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
 
 
 def _sure(fits: Array) -> int | None:
-    """The layout that people fit best (L, N), if surely better than the most usual, the first, or that one if it
-    surely fits better than all others; else None.
+    """The layout that people fit best (L, N), if significantly better than the most usual, the first; or that
+    one if it fits significantly better than all others; else None.
     """
     from shapepose_fg.body.joint_order import LIKE_A_BODY
 
@@ -117,12 +118,12 @@ def _sure(fits: Array) -> int | None:
 
 
 def _surely(more: Array) -> bool:
-    """Whether people fit one layout surely better than another, by so much `more` (N,)."""
+    """Whether people fit one layout significantly better than another, given their differences `more` (N,)."""
     return len(more) > 0 and bool(more.mean() > _SIGMAS * np.sqrt((more.var() + _SPREAD**2) / len(more)))
 
 
 def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
-    """How many keypoints a person has, and the first camera with people; None without people."""
+    """Number of keypoints per person, and the first camera with people; None without people."""
     counts: dict[int, CameraPeople] = {}
     for each in people:
         if each.keypoint_count is not None:
@@ -139,8 +140,8 @@ def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
 def _named_in_files(
     people: Sequence[KeptPeople], count: int
 ) -> tuple[tuple[Skeleton, str, list[str]] | None, list[str]]:
-    """The skeleton that the files name, how, and which names are passed over; None where none names any, and what
-    is to be said of names that tell nothing.
+    """The skeleton that the files name, its source, and names that are ignored; None where none names any; and
+    notes on unknown names.
 
     InputError where files of two cameras name different joints, or names that cannot be those of the keypoints.
     """
@@ -163,7 +164,7 @@ def _named_in_files(
 
 
 def _declared(declared: DeclaredJoints, count: int) -> tuple[tuple[Skeleton, list[str]] | None, str]:
-    """`_called` of what a project's settings say: they need not name all keypoints, and may be of others."""
+    """`_called` for a project's settings, which need not name all keypoints, and may be of others."""
     joints = declared.joints
     if not isinstance(joints, str):
         if len(joints) > count:
@@ -175,7 +176,7 @@ def _declared(declared: DeclaredJoints, count: int) -> tuple[tuple[Skeleton, lis
 def _called(
     joints: str | tuple[str, ...], count: int, source: str
 ) -> tuple[tuple[Skeleton, list[str]] | None, str]:
-    """The skeleton that a source names for `count` keypoints, with the names that are passed over, and a sentence
+    """The skeleton that a source names for `count` keypoints, with the names that are ignored, and a sentence
     about it; None where it names none that is known, or none of so many keypoints.
 
     InputError where it names each joint, and not so many, or not those that a person needs.

@@ -1,4 +1,4 @@
-"""What one camera saw in one picture as a line of JSON: OpenPose's frame, with camera and time beside it."""
+"""Detections of one camera in one picture as a line of JSON: OpenPose's frame, with camera and time."""
 
 from typing import Annotated, Any
 
@@ -37,11 +37,10 @@ class _Line(BaseModel, strict=True, extra="allow"):
 
 
 def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[Any, ...] | None:
-    """What `OnlineReconstructor.push_view` takes: the camera, what it saw, undistorted, when, seconds, and its
-    pose with covariance, None where the line has none. Joints far outside the picture are left out.
-    None where the camera is one of `Rig.unwanted`.
+    """The arguments of `OnlineReconstructor.push_view`: camera, undistorted detections, time in seconds, and pose
+    with covariance, None where the line has none. Joints far outside the picture are left out.
 
-    InputError naming the `place` of a line that is none.
+    None where the camera is one of `Rig.unwanted`. InputError naming the `place` of an invalid line.
     """
     line = validated(_Line, parse_json(text.strip(), place), place, _CURE)
     if line.camera in rig.unwanted:

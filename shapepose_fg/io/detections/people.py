@@ -1,4 +1,6 @@
-"""People of one camera as detectors write them: kept, given scores from 0 to 1, taken apart into candidates."""
+"""People of one camera as detectors write them: stored, with scores scaled to 0 to 1, and divided into
+candidates.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,15 +15,15 @@ from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
 
 OVERSHOOT = 1.1
-"""Heat maps that are enlarged overshoot a little: scores up to this are cut at 1 without a word."""
+"""Largest score that is cut at 1 without a note: enlarged heat maps overshoot a little."""
 _RARE = 0.01
-"""Scores are divided by what this share of them exceeds: the highest alone would be decided by one outlier."""
+"""Share of scores above the one that all are divided by: the maximum would depend on one outlier."""
 _MOST_LOOKED_AT = 4_000_000
 """Number of scores above which only every second, third ... of them is used to find how they are scaled."""
 _BLOCKS_LOOKED_AT = 10
-"""Blocks of a camera's people that are read to see what they look like."""
+"""Number of blocks of a camera's people that are compared with a body."""
 _OCCLUDED = 0.5
-"""The score of a keypoint that an annotator marked though it was hidden: COCO's visibility 1 of 2."""
+"""Score of a keypoint that an annotator marked as hidden: COCO's visibility 1 of 2."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class PeopleBlock:
     """People of some frames, keypoint by keypoint, in the detector's own order."""
 
     frame: Index
-    """(N,) number of each person's frame, as the files say it; not falling."""
+    """(N,) number of each person's frame in the files; not falling."""
     keypoints: Array
     """(N, K, 3) x, y in pixels, score; a score of 0 (or less, or not a number) is a joint that was not seen."""
 
@@ -54,49 +56,49 @@ class CameraPeople:
     source: Path
     """The file or folder that they come from, for messages."""
     program: str
-    """Which program's format it was recognised as, for messages."""
+    """Program whose format was recognised, for messages."""
     blocks: Iterator[PeopleBlock]
-    """The people in the order of their frames, some frames at a time, read when they are asked for."""
+    """The people in the order of their frames, in blocks of frames that are read one by one."""
     first: int
     """Number of the first frame."""
     last: int
     """Number of the last frame."""
     every_frame: bool = True
-    """Whether the files list every frame, those without people too. Where not, frames may be missing at both
-    ends, and the other cameras tell how long the recording is."""
+    """Whether the files list every frame, also those without people. If not, frames may be missing at both
+    ends, and the other cameras define the length of the recording."""
     lists_people: bool = False
-    """Whether a frame is known by its people only: the first that is listed need not be the recording's first."""
+    """Whether only frames with people are listed: the first of them need not be the recording's first."""
     gaps: tuple[tuple[int, int], ...] = ()
     """First and last number of frames in between that are missing from the files: no people are seen in them."""
     rerun: str = "write the detections again"
-    """How the program makes pixels of the calibrated pictures."""
+    """Instruction for running the program on the calibrated pictures."""
     joints: str | tuple[str, ...] | None = None
-    """What the files say of their keypoints: each one's name, in their order, as the program calls it; or what the
-    program calls the whole layout ("coco", "BODY_25B"); None where they say nothing."""
+    """Names of the keypoints in the files, in their order and in the program's words; or the program's name of
+    the whole layout ("coco", "BODY_25B"); None where the files have neither."""
 
 
 @dataclass(frozen=True)
 class DeclaredJoints:
-    """What the settings of a project say of the keypoints; names in the detections' own files go first."""
+    """Joints from the settings of a project; names in the detections' own files have precedence."""
 
     joints: str | tuple[str, ...]
     """As in `CameraPeople.joints`."""
     source: str
-    """Where it is said, for messages: "Config.toml: pose.pose_model"."""
+    """Place of the statement, for messages: "Config.toml: pose.pose_model"."""
 
 
 class KeptPeople:
-    """All people of one camera, read to the end and kept; and what must be known of all of them."""
+    """All people of one camera, stored, with statistics of all of them."""
 
     def __init__(self, camera: CameraPeople, kept: KeptArrays, name: str) -> None:
-        """Read them, into `kept` under names that begin with `name`."""
+        """Read them, and store them in `kept` under names that begin with `name`."""
         self.camera, self._kept, self._names = camera, kept, list[str]()
         self.keypoint_count: int | None = None
         """K, None without people."""
         self.farthest: float | None = None
         """The largest coordinate of a keypoint that was seen, pixels; None where there is none."""
         self.score_count, self.top_score, self.visibilities = 0, 0.0, True
-        """How many scores there are, the highest, and whether none is another number than 1 and 2."""
+        """Number of scores, the highest one, and whether all of them are 1 or 2."""
         for block in camera.blocks:
             if len(block.frame) == 0:
                 continue
@@ -112,7 +114,7 @@ class KeptPeople:
                 self.farthest = max(self.farthest or 0.0, float(np.nanmax(xy)))
 
     def some(self, most: int) -> Array:
-        """(N, K, 2) positions of some of them, at most so many, spread over the recording; NaN where not seen."""
+        """(N, K, 2) positions of at most `most` people, spread over the recording; NaN where not seen."""
         count = self.keypoint_count or 0
         names = self._names[:: -(-len(self._names) // _BLOCKS_LOOKED_AT) if self._names else 1]
         parts = [np.asarray(self._kept.array(name, "keypoints")) for name in names]
@@ -121,7 +123,7 @@ class KeptPeople:
         return np.where(every[..., 2:] > 0, every[..., :2], np.nan)
 
     def blocks(self, *, last_time: bool = False) -> Iterator[PeopleBlock]:
-        """The people in the order of their frames; the last time they are not kept any longer."""
+        """The people in the order of their frames; with `last_time` they are dropped as they are read."""
         for name in self._names:
             block = PeopleBlock(*(self._kept.array(name, key) for key in ("frame", "keypoints")))
             if last_time:
@@ -130,11 +132,11 @@ class KeptPeople:
 
 
 Scores = Callable[[Array], Array]
-"""Turns a detector's scores (...) into ones from 0 to 1."""
+"""Function that maps a detector's scores (...) to 0 to 1."""
 
 
 def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
-    """How the scores of all cameras become probabilities; and what is said of it, None where they were before.
+    """The mapping of all cameras' scores to probabilities, and a note on it; None where they are probabilities.
 
     - COCO's visibilities (only 0, 1 and 2, and a 2 among them): 2 is 1, and 1, hidden, is 0.5.
     - Scores that exceed 1.1: divided by the score that 1 in 100 exceeds, if that is above 1, then cut at 1.
@@ -157,13 +159,13 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
 def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: int, last: int) -> ViewStream:
     """The joints of people as candidates, with affinity 1 between those of one person that a limb joins.
 
-    So that grouped and ungrouped detections walk the same way. Frames run from number `first` to `last`. Joints
-    that the skeleton makes are the middles of two that were seen, as sure as the less sure of them.
+    Grouped and ungrouped detections are thus processed alike. Frames run from number `first` to `last`. Joints
+    that the skeleton adds are the middles of two that were seen, with the lower of their scores.
     """
     count = last - first + 1
 
     def blocks() -> Iterator[ViewCandidates]:
-        """In blocks of `BLOCK_FRAMES` frames, of people in blocks of any length."""
+        """Blocks of `BLOCK_FRAMES` frames, from people in blocks of any length."""
         waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
         given = people.blocks(last_time=True)
         for start in range(0, count, BLOCK_FRAMES):

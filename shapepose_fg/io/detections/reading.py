@@ -1,4 +1,4 @@
-"""2D detections of every camera, from a folder: which files are whose, which format they are, one table of all.
+"""Reads 2D detections of every camera from a folder: finds files, recognises the format, makes one table of all.
 
 A format of your own is an entry in `FORMATS` and a function that reads it.
 """
@@ -32,21 +32,23 @@ from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000
-"""No recording is as long: ids of pictures that are not frames' numbers."""
+"""Maximum number of frames of a recording: larger numbers are ids of pictures."""
 _MOST_EMPTY = 200_000
-"""Nor begins with so many frames without people: such numbers count from the first, and it is said."""
+"""Maximum number of frames without people at the beginning: beyond it, numbers count from the first one, with a
+note."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """One way in which detections are written: a file or folder per camera."""
+    """A format of detections: a file or folder per camera."""
 
     name: str
     """For messages and documents."""
     names: tuple[str, ...]
-    """What a camera's file, or without an ending its folder, is called; {} is the camera."""
+    """Names of a camera's file, or without a suffix its folder; {} is the camera."""
     read: Callable[[Path, Camera], CameraPeople | ViewStream]
-    """What a camera saw: people, or candidates with affinities; InputError naming file, place and cure."""
+    """Function that reads a camera: people, or candidates with affinities; InputError naming file, place and
+    cure."""
 
 
 JSON = Format(
@@ -60,11 +62,11 @@ HDF5 = Format(
 )
 TEXT = Format("4D Association's text", ("{}.txt",), read_association_text)
 FORMATS = [TEXT, JSON, CSV, HDF5]
-"""The first by whose names some camera has a file or folder reads those of all cameras."""
+"""Known formats; the first one by whose names some camera has a file or folder reads those of all cameras."""
 _FOLDERS = ("detection", "output_data/raw_data", "raw_data")
-"""Where 4D Association and FreeMoCap lay them, in the folder of a recording."""
+"""Folders of detections in the recordings of 4D Association and FreeMoCap."""
 _PROGRAM_S = re.compile(r"^(alphapose-)?results_|_results$|_json$|\.analysis$|DLC[_A-Za-z].*")
-"""What programs add to a camera's name, or a video's: what follows DLC has numbers of its own."""
+"""What programs add to the name of a camera or a video: the part after DLC has numbers of its own."""
 _FREEMOCAP_FILES = re.compile(r"2dData_numCams_numFrames_numTrackedPoints_pixelXY\.npy$|^mediaPipeData_2d\.npy$")
 
 
@@ -75,13 +77,13 @@ def read_detections(
     kept: KeptArrays | None = None,
     own_frames: bool = False,
 ) -> DetectionTable:
-    """Read what every camera of `rig` saw from the folder `path`, undistorted.
+    """Read the detections of every camera of `rig` from the folder `path`, undistorted.
 
-    The formats are `FORMATS`, told by the files (docs/conventions.md). Cameras that the rig does not have are
-    passed over. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a TOML file that describes it;
-    without it the names of joints in the files tell it, or what a project declares, else the number of keypoints.
-    `notes` of the table say what was made of the files. `kept` holds the recording, in memory by default: with an
-    empty `InFolder` it may be larger than that. With `own_frames` cameras may have different numbers of frames.
+    The formats are `FORMATS`, recognised by the files (docs/conventions.md). Cameras that the rig does not have
+    are skipped. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a TOML file that describes it;
+    without it names of joints in the files determine it, or what a project declares, else the number of keypoints.
+    `notes` of the table say how the files were interpreted. `kept` holds the recording, in memory by default: with
+    an empty `InFolder` it may be larger than that. With `own_frames` cameras may have different numbers of frames.
     Raises InputError, one sentence that names file, place and cure.
     """
     kept = InMemory() if kept is None else kept
@@ -109,8 +111,8 @@ def read_detections(
 
 
 def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
-    """The format, every camera's file or folder in the folder `path`, in the rig's order, and what was taken to be
-    what.
+    """The format, every camera's file or folder in the folder `path`, in the rig's order, and notes on inferred
+    names.
 
     InputError naming the camera that is missing.
     """
@@ -157,7 +159,7 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
 
 
 def camera_names(path: Path) -> list[str]:
-    """What cameras are called whose detections are at a place that `read_detections` reads, by files and folders.
+    """Names of cameras by the files and folders at a place that `read_detections` reads.
 
     InputError where there are none.
     """
@@ -185,13 +187,13 @@ def camera_names(path: Path) -> list[str]:
 
 
 def _entries(path: Path) -> tuple[Path, list[Path]]:
-    """The folder of the detections, which programs put into one of that name, and what is in it."""
+    """The folder of the detections, which may be inside of `path`, and its entries."""
     folder = next((each for name in _FOLDERS if (each := path / name).is_dir()), path)
     return folder, sorted(each for each in folder.iterdir() if not each.name.startswith("."))
 
 
 def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
-    """What may be a camera's in a folder, by format, and what the cameras are called then."""
+    """Possible files of cameras in a folder, by format, with the names of the cameras."""
     files = [each for each in entries if each.is_file()]
     folders = [each for each in entries if each.is_dir()]
     tables = [each for each in files if each.suffix == ".csv" and is_deeplabcut(each)]
@@ -210,7 +212,7 @@ def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
 
 
 def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
-    """The format of a file that holds all cameras; None where it is none."""
+    """The format of a file that holds all cameras; None for other files."""
     if file.is_file() and _FREEMOCAP_FILES.search(file.name) is not None:
         return Format("", (), lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)))
     if file.is_file() and file.suffix == ".csv" and is_caliscope(file):
@@ -219,7 +221,7 @@ def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
 
 
 def _unfiltered(files: list[Path]) -> list[Path]:
-    """Files, without DeepLabCut's `_filtered` ones of those that are there as they were detected."""
+    """Files without DeepLabCut's `_filtered` ones where the unfiltered ones exist."""
     there = {each.name for each in files}
     return [each for each in files if each.name.replace("_filtered", "") not in there - {each.name}]
 
@@ -232,7 +234,7 @@ def _read_folder(place: Path, camera: Camera) -> CameraPeople:
 
 
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
-    """What is called after a camera: a file, or a folder where the pattern has no ending."""
+    """The file that is named after a camera, or a folder where the pattern has no suffix."""
     for pattern in patterns:
         place = folder / pattern.format(name)
         if place.is_file() if Path(pattern).suffix else place.is_dir():
@@ -241,7 +243,7 @@ def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
 
 
 def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None) -> Skeleton:
-    """The skeleton that all candidates have."""
+    """The skeleton of all candidates."""
     first = streams[0]
     skeleton = first.skeleton or wanted or BODY_25
     for each in streams[1:]:
@@ -257,9 +259,9 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
 
 
 def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:
-    """The people of every camera as candidates, what was made of their scores and frames, and the table's `first`.
+    """The people of every camera as candidates, notes on their scores and frames, and the table's `first`.
 
-    Where all files list people and not frames, their numbers are the frames': nobody is in those before the first.
+    Where all files list people and not frames, their numbers are the frames': earlier frames are empty.
     """
     cameras = [each.camera for each in people]
     first, last = _span(cameras)

@@ -1,7 +1,8 @@
-"""What one camera saw, block by block, and the blocks of all cameras put together as a table of the recording."""
+"""Detections of one camera in blocks of frames, and a table of those of all cameras."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES, DetectionTable, keep_block
 
 MARGIN = 0.25
-"""How far outside the picture a detector may place a joint, as a part of the picture's size."""
+"""Distance outside the picture at which a detector may place a joint, as a share of the picture's size."""
 _STRAY = 0.05
 """Largest share of a camera's joints far outside its picture: they are left out, and a note says so. More are
 detections of other pictures."""
@@ -24,7 +25,7 @@ _BENT = 0.5
 """Largest share of a camera's joints where its distortion cannot be undone, as in the corners of wide lenses. More
 mean that the coefficients are wrong."""
 _LEAST_SCORE = 1e-6
-"""Below this a detector says that it saw nothing; products of such scores are 0."""
+"""Score below which a joint was not detected; products of such scores are 0."""
 
 
 @dataclass(frozen=True)
@@ -59,23 +60,23 @@ class ViewStream:
     source: Path
     """The file or folder that they come from, for messages."""
     frame_count: int
-    """T, frames that the source holds, seen or empty."""
+    """T, the number of frames in the source, with and without people."""
     blocks: Iterator[ViewCandidates]
-    """The blocks in order, each read when it is asked for; the last may have fewer frames."""
+    """The blocks in order, which are read one by one; the last may have fewer frames."""
     first_number: int = 0
-    """What the source itself calls its first frame."""
+    """Number of the first frame in the source."""
     skeleton: Skeleton | None = None
-    """Whose joints the candidates are, where the source says it."""
+    """Skeleton of the candidates, where the source states it."""
 
 
 def assemble(
     views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: KeptArrays, own_frames: bool = False
 ) -> DetectionTable:
-    """Put the views of a recording together, one `ViewStream` per camera of `rig`, undistorted; held by `kept`.
+    """Combine the views of a recording, one `ViewStream` per camera of `rig`, undistorted; stored in `kept`.
 
-    Where they hold different frames, those that all have are taken, and a note says it; with `own_frames` all are,
-    and nobody is seen in those that a camera lacks. Raises InputError where there are none, or where the views do
-    not fit their pictures.
+    Where they have different frames, the common ones are used, and a note says so; with `own_frames` all are, and
+    views are empty in missing ones. Raises InputError where there are none, or where the views do not fit their
+    pictures.
     """
     views, count, said = _any_frame(views) if own_frames else _common(views)
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
@@ -103,7 +104,7 @@ def _any_frame(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, 
 
 
 def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
-    """The frames that all views have, how many these are, and what is said where some have others."""
+    """The frames that all views have, their number, and notes where some have others."""
     start = max(view.first_number for view in views)
     stop = min(view.first_number + view.frame_count for view in views)
     if all(view.first_number == start and view.frame_count == stop - start for view in views):
@@ -124,13 +125,13 @@ def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, lis
 
 
 def _spans(views: Sequence[ViewStream]) -> str:
-    """Which frames each view has."""
+    """The frames of each view, in words."""
     words = ", ".join(f"{view.source.name} {_span_words(view)}" for view in views[:12])
     return words + (f" and {len(views) - 12} more" if len(views) > 12 else "")
 
 
 def _span_words(view: ViewStream) -> str:
-    """How many frames a view has, and their numbers."""
+    """The number of a view's frames, and their numbers, in words."""
     if view.frame_count == 0:
         return "has none"
     return f"has {view.frame_count}, {view.first_number} to {view.first_number + view.frame_count - 1}"
@@ -181,9 +182,9 @@ def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detection
 
 
 def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> DetectionTable:
-    """The recording whose frame t is, of each view v, frame `picture` (T, V)[t, v] of the given one; -1 is none.
+    """The recording whose frame t is, for each view v, frame `picture` (T, V)[t, v] of the given one; -1 is none.
 
-    Held by `kept`.
+    Stored in `kept`.
     """
     count, views = picture.shape
     for n, begin in enumerate(range(0, count, BLOCK_FRAMES)):
@@ -195,7 +196,7 @@ def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> D
 
 
 def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int) -> ViewCandidates:
-    """What a view saw in some of its frames, as frames `begin` and on; -1 is none."""
+    """Candidates of a view in some of its frames, as frames `begin` and on; -1 is none."""
     there = np.flatnonzero(picture >= 0)
     every = [recording[frame] for frame in picture[there].tolist()]
     parts = [each.only(each.view == view) for each in every]
@@ -211,14 +212,14 @@ class _LeftOut:
         self._count, self._of, self._first = 0, 0, ""
 
     def add(self, out: Mask, words: Callable[[int], str]) -> None:
-        """Take in which candidates (D,) of a block are left out; `words` say where one of them is."""
+        """Count the candidates (D,) of a block that are left out; `words` describes one of them."""
         if self._count == 0 and out.any():
             self._first = words(int(np.argmax(out)))
         self._count += int(out.sum())
         self._of += len(out)
 
     def note(self) -> list[str]:
-        """A sentence, if there were some; InputError where there are so many that it cannot be by chance."""
+        """A sentence, if there were some; InputError where there are too many for chance."""
         joints = "joint" if self._count == 1 else "joints"
         share = f"{self._count} {joints} of {self._of} ({self._count / max(self._of, 1):.1%})"
         if self._count > self._most * self._of:
@@ -241,29 +242,21 @@ class _Undistorted:
         camera, (width, height), xy = self.camera, self.camera.image_size, view.seen.xy
         size = np.array([width, height], dtype=np.float64)
         outside = np.any((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size), axis=1)
-
-        def where(row: int) -> str:
-            return (
-                f"{self.source}: frame {view.frame[row]} has a joint at pixel ({xy[row, 0]:.0f},"
-                f" {xy[row, 1]:.0f}), far outside the {width} x {height} picture of the calibration"
-            )
-
-        self.reasons[0].add(outside, where)
+        why = f"far outside the {width} x {height} picture of the calibration"
+        self.reasons[0].add(outside, partial(self._words, view, why))
         certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
         straight = camera.undistort(certain.seen.xy)
         undone = np.asarray(~np.isfinite(straight).all(axis=1))
-        xy = certain.seen.xy
-
-        def bent(row: int) -> str:
-            return (
-                f"{self.source}: frame {certain.frame[row]} has a joint at pixel ({xy[row, 0]:.0f},"
-                f" {xy[row, 1]:.0f}), where the distortion of camera {camera.name} cannot be undone"
-            )
-
-        self.reasons[1].add(undone, bent)
+        why = f"where the distortion of camera {camera.name} cannot be undone"
+        self.reasons[1].add(undone, partial(self._words, certain, why))
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
+
+    def _words(self, view: ViewCandidates, why: str, row: int) -> str:
+        """Which candidate of a block is left out, and why."""
+        x, y = view.seen.xy[row]
+        return f"{self.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), {why}"
 
 
 def undistorted(view: ViewCandidates, source: Path | str, camera: Camera) -> ViewCandidates:
-    """What one camera saw in pixels of a camera without distortion; joints without a place there are left out."""
+    """Undistorted detections of one camera; joints without an undistorted place are left out."""
     return _Undistorted(source, camera).undistorted(view)

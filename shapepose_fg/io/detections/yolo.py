@@ -17,7 +17,7 @@ _YOLO = "YOLO's labels"
 _RERUN = "run yolo pose again with save_txt=True"
 _FRAME_FILE = re.compile(r"(\d+)\.txt$")
 _BOX = 5
-"""Class, and middle, width and height of the box, before the keypoints."""
+"""Number of values in front of the keypoints: class, and middle, width and height of the box."""
 
 
 def label_files(folder: Path) -> list[tuple[int, Path]]:

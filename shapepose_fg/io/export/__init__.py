@@ -1,1 +1,1 @@
-"""Results as files of other programs."""
+"""Exports results to the formats of other programs."""

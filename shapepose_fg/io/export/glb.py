@@ -16,9 +16,9 @@ from shapepose_fg.io.export.skinned import BONES, Motion, everybody
 from shapepose_fg.io.export.take import y_up
 
 _SET = 4
-"""Bones in a set of influences. Every program reads the first set, Blender all of them."""
+"""Number of bones in a set of influences. Every program reads the first set, Blender all of them."""
 _ARRAY, _ELEMENTS = 34962, 34963
-"""glTF's targets: what vertices have, and which vertices make triangles."""
+"""glTF's targets of arrays: attributes of vertices, and indices of triangles."""
 _COMPONENTS = {"uint8": 5121, "uint32": 5125, "float32": 5126}
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
@@ -90,7 +90,7 @@ class _File:
         )
 
     def content(self, roots: list[int], more: dict[str, Any]) -> bytes:
-        """The whole file, whose scene are the nodes `roots`, with what is said of it."""
+        """The whole file, whose scene are the nodes `roots`, with `more` properties."""
         binary = bytes(self._binary) + bytes(-len(self._binary) % 4)
         tree = {
             "asset": {"version": "2.0", "generator": "shapepose-fg"},

@@ -23,7 +23,7 @@ from shapepose_fg.io.export.take import Take, opensim_axes
 from shapepose_fg.io.pose2sim_project import Pose2SimProject
 
 _MOST = 65_535
-"""The number of a frame, and how many there are, have 16 bits in a C3D file."""
+"""Maximum number of frames, and of a frame, in a C3D file, which has 16 bits for them."""
 _TRC_HEAD = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
 
 
@@ -36,11 +36,11 @@ class Markers:
     xyz: Array
     """(T, M, 3) metres, y up; NaN where the marker is missing."""
     sigma_m: Array
-    """(T, M) standard deviation, root mean square over the axes, metres; NaN where it is not known."""
+    """(T, M) standard deviation, root mean square over the axes, metres; NaN where unknown."""
 
     @property
     def there(self) -> Mask:
-        """(T, M) where a marker is not missing."""
+        """(T, M) mask of the existing markers."""
         return np.asarray(np.isfinite(self.xyz).all(axis=2))
 
     @property
@@ -67,8 +67,8 @@ def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | No
 
 
 def opensim_names(joints: tuple[str, ...]) -> tuple[str, ...]:
-    """The names that Pose2Sim's OpenSim models have for joints: ours, but for the middle of the hips, which is
-    `Hip` in the model for HALPE_26, which has the top of the head too, and `CHip` in those for BODY_25 and COCO.
+    """Names of joints in Pose2Sim's OpenSim models: ours, except for the middle of the hips, which is `Hip` in
+    the model for HALPE_26, which has the top of the head too, and `CHip` in those for BODY_25 and COCO.
     """
     hip = "Hip" if "Head" in joints else "CHip"
     return tuple(hip if name == MID_HIP else name for name in joints)
@@ -108,7 +108,7 @@ def _c3d_take(written: Written, take: Take) -> tuple[Take, Array]:
 def _each(
     job: Job, take: Take, kind: str, written: Written, write: Callable[[int, Markers, Take, Written], None]
 ) -> Written:
-    """Write everybody with a marker; who has none is noted."""
+    """Write all people with a marker; others are noted."""
     for person, who in enumerate(take.persons.tolist()):
         markers = markers_of(take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None)
         if len(markers.frames) > 0:

@@ -18,13 +18,13 @@ from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
 from shapepose_fg.io.export.take import y_up, z_up
 
 _SMPL_H = 156
-"""Numbers of a pose of SMPL-H: pelvis, 21 joints of the body, 15 of each hand."""
+"""Number of values of a pose of SMPL-H: pelvis, 21 joints of the body, 15 of each hand."""
 _SHARED = 22
-"""Joints, from the pelvis on, that SMPL and SMPL-H have alike."""
+"""Number of joints, from the pelvis on, that SMPL and SMPL-H have in common."""
 _AMASS_BETAS = 16
-"""Shape components in AMASS."""
+"""Number of shape components in AMASS."""
 OPEN_BODY = "shapepose-fg open body"
-"""What the body that ships is called in a file."""
+"""Name of the shipped body in files."""
 
 
 def write_amass(job: Job) -> Written:
@@ -70,7 +70,7 @@ def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
 
 
 def _gender(body: str) -> str:
-    """The gender of a body model by the name of its file, as SMPL's are called; neutral where it says nothing."""
+    """The gender of a body model by the name of its file, as SMPL's are named; neutral where there is none."""
     name = body.lower().replace("-", "_")
     words = name.replace(".", "_").split("_")
     if "female" in words or "f" in words:

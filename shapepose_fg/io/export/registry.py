@@ -1,4 +1,4 @@
-"""The formats that a result can be exported to, what a writer is given, and a saved result in several formats."""
+"""Export formats, their common input, and the export of a saved result to several formats."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ from shapepose_fg.io.solved_setup import CAMERAS, body_of
 
 
 class MarkerSet(StrEnum):
-    """Which points are markers, and what they are called."""
+    """Which points are markers, and their names."""
 
     OPENSIM = "opensim"
     """The joints of the result, named as in the OpenSim models of Pose2Sim."""
@@ -36,39 +36,39 @@ class MarkerSet(StrEnum):
 
 @dataclass(frozen=True)
 class Job:
-    """A take, where its files go, and what was asked for."""
+    """A take, its output folder, and options."""
 
     take: Take
-    """What is exported."""
+    """The people to export."""
     folder: Path
-    """Where the files go."""
+    """The output folder."""
     body_file: Path | None = None
     """File of the body model; None for the one that the result was made with."""
     markers: MarkerSet = MarkerSet.OPENSIM
-    """What TRC and C3D hold."""
+    """Markers of TRC and C3D."""
     fill_gaps_s: float = 0.2
-    """Holes in a body's motion up to this long are interpolated where a format can have none."""
+    """Longest hole in a body's motion that is interpolated where a format can have none, s."""
 
     @property
     def body(self) -> Path | None:
-        """File of the body model; None for the one that ships."""
+        """File of the body model; None for the shipped one."""
         named = self.take.people.run.get("body")
         return self.body_file if self.body_file is not None or named is None else Path(str(named))
 
     @cached_property
     def arrays(self) -> SmplArrays:
-        """The body model; InputError where its file is not there any more."""
+        """The body model; InputError where its file is missing."""
         return body_of(self.take.people.run, self.body_file)
 
 
 @dataclass
 class Written:
-    """What came of a format."""
+    """Output of a format."""
 
     files: list[Path] = field(default_factory=list)
-    """The files, whole."""
+    """The written files."""
     notes: list[str] = field(default_factory=list)
-    """What was left out or changed, a sentence each."""
+    """Notes on what was left out or changed, a sentence each."""
 
     def add(self, path: Path, content: str | bytes) -> None:
         """Write a file, whole or not at all."""
@@ -76,8 +76,10 @@ class Written:
         self.files.append(path)
 
     def near_origin(self, take: Take, turn: Array, kind: str, where: str) -> tuple[Take, Array]:
-        """The take for formats of seven digits, and (3,) its origin in the axes that `turn` (3, 3) makes of the
-        world's, metres; one that is not the world's is noted, with the place in the file that says it, `where`.
+        """The take for formats of seven digits, and (3,) its origin, metres, in the axes that result from `turn`
+        (3, 3).
+
+        An origin that is not the world's is noted, with the place in the file that states it, `where`.
         """
         local, origin = take.near_origin()
         origin = turn @ origin
@@ -90,7 +92,7 @@ class Written:
         return local, origin
 
     def at_one_rate(self, take: Take) -> Take:
-        """The take for formats that know one rate only; frames that have no place at it are noted."""
+        """The take for formats with one rate; frames that have no place at it are noted."""
         even, lost = take.at_one_rate()
         if lost > 0:
             self.notes.append(f"{lost} frames left out: at {take.fps:g} a second others are nearer to their place")
@@ -99,25 +101,25 @@ class Written:
 
 @dataclass(frozen=True)
 class Format:
-    """One format of file."""
+    """An export format."""
 
     name: str
-    """What it is called on the command line."""
+    """Name on the command line."""
     about: str
-    """What it holds and who reads it, in a few words."""
+    """Content and readers, in a few words."""
     writer: str
     """Module and function that writes it: `write(job: Job) -> Written`; with `rows` it is `write(opened, rows,
     folder) -> Written` of an `OpenedReconstruction` and the rows of it (R,), None for all."""
     identities: bool = True
-    """Whether it follows people over frames, and so needs a result over time."""
+    """Whether it has people over time, and so needs a result with identities."""
     observations: bool = False
-    """Whether it shows what people were solved from."""
+    """Whether it has the detections that people were solved from."""
     rows: bool = False
-    """Whether it holds the result's rows as they are, and is written without having them all in memory."""
+    """Whether it has the result's rows as they are, and is written without having them all in memory."""
 
     @property
     def write(self) -> Any:
-        """The function; InputError where a package is missing or a take lacks what it needs."""
+        """The writer; InputError where a package is missing or a take lacks what it needs."""
         module, function = self.writer.split(":")
         return getattr(import_module(f"shapepose_fg.io.export.{module}"), function)
 
@@ -140,11 +142,11 @@ FORMATS = {
         ),
     )
 }  # fmt: skip
-"""By name. A format of your own is an entry here and a module beside this one."""
+"""Formats by name. A format of your own is an entry here and a module beside this one."""
 
 
 def chosen(names: Sequence[str]) -> list[Format]:
-    """The formats of these names, each once, in the order given; InputError for a name that there is not."""
+    """The formats of these names, each once, in the order given; InputError for unknown names."""
     for name in names:
         if name not in FORMATS:
             raise InputError(f"format {name}: there is none of this name; there are {' '.join(FORMATS)}")
@@ -161,10 +163,11 @@ def export_result(
     body: Path | None = None,
     **options: Any,
 ) -> dict[str, Written]:
-    """What was written of each format into `folder`, by its name; InputError where a result does not allow it.
+    """Export a result to several formats into `folder`; returns the output by format. InputError where it is
+    impossible.
 
-    `options` are those of `read_take`, the others `Job`'s; `body` is where the body model's file is now. Files
-    that are there already are replaced. A format of which no file came out is an InputError too.
+    `options` are those of `read_take`, the others `Job`'s; `body` is the present file of the body model. Existing
+    files are replaced. A format without any file is an InputError too.
     """
     job: Job | None = None
     if not all(each.rows for each in formats):
@@ -193,10 +196,10 @@ def read_take(
     observations: bool = True,
     **options: Any,
 ) -> Take:
-    """What of the result at `path` is exported; InputError, one sentence, where it cannot be.
+    """Read what is exported of the result at `path`; InputError, one sentence, where it is impossible.
 
-    `up` is asked for where there is no cameras.json beside people.npz. `frames` and `persons` choose rows;
-    `observations` says whether what they were solved from is read, too. `options` are those of `Take.of`.
+    `up` is needed where there is no cameras.json beside people.npz. `frames` and `persons` choose rows;
+    `observations` also reads their detections. `options` are those of `Take.of`.
     """
     cameras = results_folder(path) / CAMERAS
     if up is not None and up not in get_args(Axis):
@@ -221,7 +224,7 @@ def read_take(
 def chosen_rows(
     opened: OpenedReconstruction, path: Path, frames: range | None, persons: tuple[int, ...] | None
 ) -> Index | None:
-    """(R,) rows of these frames and people; None for all. InputError for somebody who is not there."""
+    """(R,) rows of these frames and people; None for all. InputError for unknown people."""
     if frames is None and persons is None:
         return None
     mine = np.ones(len(opened), dtype=bool)

@@ -1,7 +1,6 @@
-"""A take as a rerun recording: written as RRD or shown in the viewer, how it is laid out, and nothing sent
-unasked.
+"""Rerun recordings of a take: written as RRD or shown in the viewer, with a layout, and without telemetry.
 
-In the recording's own axes, metres; what is missing is not drawn.
+In the recording's own axes, metres; missing values are not drawn.
 """
 
 import json
@@ -27,7 +26,7 @@ from shapepose_fg.io.export.take import Take, y_up
 
 APPLICATION = "shapepose-fg"
 _CONNECT_S, _PATIENCE_S = 10.0, 30
-"""How long a viewer that runs, and one that is started, may take to answer."""
+"""Time that a running viewer, and one that is started, may take to answer, s."""
 
 
 def new_stream() -> Any:
@@ -41,8 +40,8 @@ def new_stream() -> Any:
 
 @contextmanager
 def shown(first: Any, url: str | None) -> Iterator[Any]:
-    """A recording that the viewer at `url`, or one that is started, shows, at `first` in that layout; InputError
-    where that fails.
+    """A recording that is shown by the viewer at `url`, or by one that is started, with `first` as its layout;
+    InputError where that fails.
     """
     stream, rr = new_stream(), optional("rerun", "view")
     try:
@@ -64,12 +63,12 @@ def shown(first: Any, url: str | None) -> Iterator[Any]:
 
 
 def viewer_file() -> str | None:
-    """The viewer that came with rerun-sdk, also where its folder is not on the PATH; any other; or None."""
+    """The viewer of rerun-sdk, also where its folder is not on the PATH; any other one; or None."""
     return shutil.which("rerun", path=sysconfig.get_path("scripts")) or shutil.which("rerun")
 
 
 def quiet_viewer() -> list[str]:
-    """Switch the statistics of use off; what is to be said of it. InputError where they cannot be."""
+    """Switch telemetry off; returns notes. InputError where that fails."""
     viewer = viewer_file()
     if viewer is None or not switch_off(viewer):
         return []
@@ -77,7 +76,7 @@ def quiet_viewer() -> list[str]:
 
 
 def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
-    """The body model, or a note where its file is not there any more: the rest can be looked at without it."""
+    """The body model, or a note where its file is missing: the rest can be shown without it."""
     try:
         return job.arrays, []
     except InputError as error:
@@ -86,7 +85,7 @@ def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
 
 @contextmanager
 def written(path: Path, first: Any) -> Iterator[Any]:
-    """A recording that is written to `path` when the block has filled it, whole or not at all."""
+    """A recording that is written to `path` at the end of the block, whole or not at all."""
     stream = new_stream()
     with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
         draft = Path(folder) / "people.rrd"
@@ -99,7 +98,7 @@ def written(path: Path, first: Any) -> Iterator[Any]:
 
 
 def write_rrd(job: Job) -> Written:
-    """`people.rrd`; without bodies where the body model is not there any more."""
+    """Write `people.rrd`; without bodies where the body model is missing."""
     found, path = Written(), job.folder / "people.rrd"
     take, origin = found.near_origin(job.take, np.eye(3), "rrd", "origin_m of the entity world/origin")
     arrays, notes = body_if_there(job)
@@ -167,10 +166,10 @@ def _eye(rrb: Any, axis: Axis, around: Array) -> Any:
 
 
 def switch_off(viewer: str) -> bool:
-    """Switch rerun's statistics of use, which its viewer sends to its makers, off with the program `viewer`.
+    """Switch rerun's telemetry off, which its viewer sends to its makers, with the program `viewer`.
 
-    For this and all later uses of rerun, as its manual says; True where they were on. InputError where they cannot
-    be: nothing is sent unasked.
+    For this and all later uses of rerun, as its manual says; True where it was on. InputError where that fails:
+    nothing is sent unasked.
     """
 
     def says(command: str) -> str:
@@ -179,7 +178,7 @@ def switch_off(viewer: str) -> bool:
         return done.stdout
 
     def on() -> bool:
-        """Whether they are sent; where the variable CI is set, rerun has none and prints `null`."""
+        """Whether telemetry is on; where the variable CI is set, rerun has none and prints `null`."""
         settings = json.loads(says("config"))
         return settings is not None and settings.get("analytics_enabled", True)
 

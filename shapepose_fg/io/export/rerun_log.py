@@ -1,4 +1,4 @@
-"""What a rerun recording holds: people and cameras in the world, what cameras saw and took, and how it fits."""
+"""Content of a rerun recording: people and cameras in the world, detections, their gates and residuals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
@@ -25,39 +25,39 @@ from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.placement import CameraFootage, Placement
 
 _CAMERAS = "world/cameras"
-"""Where cameras are in the recording."""
-_REGION = float(np.sqrt(chi2.ppf(0.95, 3)))
-"""Standard deviations at which an ellipsoid holds 95 % of a Gaussian."""
+"""Path of the cameras in the recording."""
+_REGION = float(np.sqrt(2 * gammaincinv(1.5, 0.95)))
+"""Radius, in standard deviations, of the ellipsoid that holds 95 % of a Gaussian."""
 _JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
 _PALE = 0.6
-"""How much white is in the colour of a joint that no view saw."""
+"""Share of white in the colour of a joint that no view saw."""
 _CHUNK = 64
-"""Bodies that are posed at once."""
+"""Number of bodies that are posed at once."""
 _GATES = {
     Gate.TOO_FAR: (213, 43, 43),
     Gate.CONTRADICTS_BODY: (214, 39, 190),
     Gate.BEHIND_CAMERA: (90, 90, 90),
     Gate.NOT_PLACED: (150, 150, 150),
 }
-"""Colours of detections that were not used, by reason; those that were have their person's."""
+"""Colours of unused detections, by reason; used ones have their person's."""
 _USED_DOT, _UNUSED_DOT = -2.0, -3.0
-"""Radii of dots on the screen, whatever the zoom: that is what rerun takes negative radii for."""
+"""Radii of dots on the screen, independent of zoom, which rerun marks by negative values."""
 _QUALITY = 75
 """Quality of the JPEGs, out of 100: a second of four cameras in full HD is about 30 MB."""
 
 
 def person_path(who: int) -> str:
-    """Where a person is in the recording."""
+    """Path of a person in the recording."""
     return f"world/people/{who}"
 
 
 def camera_path(name: str) -> str:
-    """Where a camera is in the recording, whatever its name."""
+    """Path of a camera in the recording, for any name."""
     return f"{_CAMERAS}/{optional('rerun', 'view').escape_entity_path_part(name)}"
 
 
 def _set_time(stream: Any, take: Take, index: int) -> None:
-    """What is logged from now on is of this frame."""
+    """Set the frame of what is logged from now on."""
     stream.set_time("frame", sequence=int(take.frames[index]))
     stream.set_time("time", duration=float(take.times_s[index]))
 
@@ -81,7 +81,7 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
 
 
 class LiveLog:
-    """What is logged of people who come moment by moment; the world and its cameras when it begins."""
+    """Logs people who come frame by frame; logs the world and its cameras at the beginning."""
 
     def __init__(self, stream: Any, rig: Rig, arrays: SmplArrays) -> None:
         self._rr, self._stream, self._rig = optional("rerun", "view"), stream, rig
@@ -89,7 +89,7 @@ class LiveLog:
         log_world(stream, rig.up, rig)
 
     def moment(self, rows: Reconstruction) -> None:
-        """Log one moment's people; who was there before and is not in `rows` is cleared."""
+        """Log one frame's people; people who are not in `rows` any more are cleared."""
         persons, time_s = rows.person.astype(np.int64), rows.time_s[:1]
         if len(rows) > 0:
             self._stream.set_time("time", duration=float(time_s[0]))
@@ -111,22 +111,22 @@ class LiveLog:
 
 @dataclass(frozen=True)
 class Skin:
-    """A body model, and what is drawn of its skin."""
+    """A body model, and the part of its skin that is drawn."""
 
     arrays: SmplArrays
     kept: Index
-    """Its vertices that are drawn."""
+    """Indices of the vertices that are drawn."""
     faces: NDArray[np.int32]
     """(F, 3) triangles between these."""
 
     @classmethod
     def of(cls, arrays: SmplArrays) -> "Skin":
-        """Coarse enough for a viewer."""
+        """A skin that is coarse enough for a viewer."""
         return cls(arrays, *thinned(arrays.template, arrays.faces)[:2])
 
 
 def log_world(stream: Any, up: Axis, rig: Rig | None) -> None:
-    """What does not change: which way is up, and cameras that are known."""
+    """Log what is static: the up axis, and known cameras."""
     rr = optional("rerun", "view")
     axes = f"RIGHT_HAND_{up[-1].upper()}_{'DOWN' if up[0] == '-' else 'UP'}"
     stream.log("world", getattr(rr.ViewCoordinates, axes), static=True)
@@ -139,7 +139,7 @@ def _sigma_path(who: int) -> str:
 
 
 def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> None:
-    """What does not change of a person: the line's colour, and the triangles of the skin."""
+    """Log what is static for a person: the line's colour, and the triangles of the skin."""
     colour = _rgb8(np.array(colour_of(who)))
     stream.log(_sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True)
     if skin_of is not None:
@@ -149,7 +149,7 @@ def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> N
 
 
 def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
-    """Joints, bones, ellipsoids and sigma of one person, frame by frame; what ends is cleared."""
+    """Log joints, bones, ellipsoids and sigma of one person, frame by frame; clear what ends."""
     who, people, there_before = int(take.persons[person]), take.people, False
     path, plot, colour = person_path(who), _sigma_path(who), np.array(colour_of(who))
     bones, sigma = bones_of(tuple(people.joint_names.tolist())), 1e3 * sigma_m(people.covariance)
@@ -196,7 +196,7 @@ def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array
 
 
 def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: Skin) -> None:
-    """The body of one person where there is one."""
+    """Log the body of one person in the frames that have one."""
     path, arrays, faces = f"{person_path(int(take.persons[person]))}/body", skin_of.arrays, skin_of.faces
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
@@ -217,7 +217,7 @@ def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: S
 
 
 def _log_moving(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
-    """Cameras that move, frame by frame."""
+    """Log moving cameras, frame by frame."""
     for index, time_s in enumerate(take.times_s if rig.moves else ()):
         _set_time(stream, take, index)
         for camera, moves in zip(rig.at(np.full(len(rig), time_s)).cameras, rig.carrier >= 0, strict=True):
@@ -227,7 +227,7 @@ def _log_moving(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
 
 
 def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
-    """Lenses, and where cameras stand; their pictures are those of cameras without distortion."""
+    """Log lenses and poses of cameras; their pictures are those of cameras without distortion."""
     for camera in rig.cameras:
         pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
         lens = rr.Pinhole(
@@ -243,7 +243,9 @@ def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
 
 
 def _log_observations(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
-    """What each camera saw of the people: used in their colours, not used in that of the reason; and residuals."""
+    """Log each camera's detections of the people: used ones in their colours, unused ones by reason; and
+    residuals.
+    """
     table = take.people.observations
     if table is None or tuple(table.view_names.tolist()) != rig.names:
         return
@@ -279,7 +281,7 @@ def log_pictures(
     pictures: Sequence[tuple[CameraFootage, Footage]],
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """What the cameras took of a take's frames, undistorted, so that people and detections lie on it."""
+    """Log the cameras' pictures of a take's frames, undistorted, so that people and detections fit them."""
     rr = optional("rerun", "view")
     if take.rig is None:
         raise ValueError("pictures need cameras")
@@ -304,7 +306,7 @@ def log_pictures(
 
 
 def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where in a picture each pixel of the calibrated picture without distortion is: columns and rows, (H, W)."""
+    """Place of each pixel of the calibrated picture without distortion in a picture: columns and rows, (H, W)."""
     width, height = camera.image_size
     column, row = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([column.ravel(), row.ravel()], axis=1)

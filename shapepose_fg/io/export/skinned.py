@@ -1,4 +1,4 @@
-"""The bodies of a take as bones and a skin, in NumPy: what BVH, glTF, AMASS and marker files are made of."""
+"""The bodies of a take as bones and a skin, in NumPy, from which BVH, glTF, AMASS and marker files are made."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from shapepose_fg.io.export.take import Take
 
 BONES = len(SMPL_PARENTS)
 _VISIBLE_M = 1e-3
-"""Smaller differences between shapes are not told of."""
+"""Difference between shapes, m, up to which no note is given."""
 
 
 @dataclass(frozen=True)
@@ -60,20 +60,20 @@ class RestBody:
 
 @dataclass(frozen=True)
 class Motion:
-    """How one person's body moves: F frames with a body, in the axes of a format."""
+    """The motion of one person's body: F frames with a body, in the axes of a format."""
 
     rest: RestBody
     """The body, one shape for all frames."""
     index: Index
-    """(F,) which frames of the take have a body."""
+    """(F,) frames of the take that have a body."""
     rotations: Array
     """(F, 24, 4) each bone against its parent, the pelvis against the world; quaternions x y z w."""
     pelvis: Array
     """(F, 3) the pelvis in the world, metres."""
     spread_m: float = 0.0
-    """How far a joint lies at most from where it is with the frame's own shape; 0 where all have one shape."""
+    """Largest distance of a joint from its place with the frame's own shape, m; 0 where all have one shape."""
     filled: Mask | None = None
-    """(F,) frames that lie in a hole, between those before and after it; None where no hole was filled."""
+    """(F,) mask of interpolated frames; None where no hole was filled."""
 
     def joints(self) -> Array:
         """(F, 24, 3) the joints in the world, metres."""
@@ -99,7 +99,7 @@ class Motion:
 
 
 def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motion | None:
-    """The body of one person in the world turned by `axes` (3, 3); None for somebody without a body."""
+    """The body of one person in the world rotated by `axes` (3, 3); None for a person without a body."""
     parts = [take.column(name, person) for name in BODY]
     index = np.flatnonzero(with_body(*parts))
     if len(index) == 0:
@@ -118,9 +118,9 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motio
 
 
 def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) -> Iterator[tuple[int, Motion]]:
-    """Who has a body, and how it moves in the world turned by `axes` (3, 3).
+    """All people with a body, and their motions in the world rotated by `axes` (3, 3).
 
-    Who has none, or several shapes, is noted in `written`.
+    People without a body, or with several shapes, are noted in `written`.
     """
     for person, who in enumerate(take.persons.tolist()):
         motion = motion_of(take, person, job.arrays, axes)
@@ -136,7 +136,7 @@ def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) ->
 
 
 def all_segments(job: Job, kind: str, axes: Array, written: Written) -> Iterator[tuple[Path, Motion, Take]]:
-    """Everybody's motion at one rate without long holes: file without ending, motion, take of its frames."""
+    """All motions at one rate without long holes: file without suffix, motion, take of its frames."""
     take = written.at_one_rate(job.take)
     for who, motion in everybody(job, take, kind, axes, written):
         for segment in motion.segments(int(job.fill_gaps_s * take.fps + 1e-6)):

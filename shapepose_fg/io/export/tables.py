@@ -26,9 +26,9 @@ COLUMNS = (
 ).split()
 """The first line of a CSV file."""
 _GROUP_ROWS = 4096
-"""Rows of a group of Parquet: some 20 MB, of which readers take what they need."""
+"""Number of rows in a group of Parquet: some 20 MB, which readers load separately."""
 _OBSERVED = "observations."
-"""What the names of observations.npz's columns begin with in Parquet."""
+"""Prefix of the names of observations.npz's columns in Parquet."""
 
 
 def write_csv(job: Job) -> Written:
@@ -39,7 +39,7 @@ def write_csv(job: Job) -> Written:
 
 
 def csv_text(take: Take) -> str:
-    """All joints that are placed: a joint that is not known has no line. What else is not known is empty."""
+    """A line for each joint with a place; unknown values are empty."""
 
     def words(values: Array, digits: str = "%.6f") -> list[str]:
         return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
@@ -112,7 +112,7 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
 
 
 def _columns(opened: OpenedReconstruction, rows: Index) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """All columns in some rows, by their names, and what is said of the whole file."""
+    """All columns in some rows, by their names, and the metadata of the whole file."""
     people = opened.rows(rows)
     table = people.observations
     columns = {name: getattr(people, name) for name in people.ROWS}

@@ -1,4 +1,4 @@
-"""What is exported: the people of a result on one timeline, each with a place for every frame."""
+"""The people of a result on one timeline, each with a row for every frame: the input of exports."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,21 +23,22 @@ _TO_Y_UP: dict[Axis, list[list[int]]] = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
     "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
-"""The smallest turn that takes each axis to y."""
+"""The smallest rotation that takes each axis to y."""
 _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""(x, y, z) to (x, -z, y): what Blender's importers do with a file whose y is up."""
+"""(x, y, z) to (x, -z, y): the rotation that Blender's importers apply to a file whose y is up."""
 _FORWARD_X = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-"""About y: with it a world whose z is up becomes (y, z, x), as Pose2Sim writes it."""
+"""Rotation about y, with which a world whose z is up becomes (y, z, x), as Pose2Sim writes it."""
 _LONGEST = 1_000_000
-"""Frames of a file with one rate: nine hours at 30 a second. Beyond, times are in another unit or have a hole."""
+"""Maximum number of frames of a file with one rate: nine hours at 30 Hz. Beyond, times have another unit or a
+hole."""
 _BODY_BYTES = 2_000
-"""What one person's body takes in a frame while it is written, about."""
+"""Approximate memory of one person's body per frame while it is written, bytes."""
 _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
 """Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
 _FAR_M = 1000.0
 """Largest coordinate that a float of 32 bits keeps to a tenth of a millimetre, metres."""
 _SHORTEST_S, _LONGEST_S = 1e-6, 1e5
-"""From frame to frame: outside of this times are in another unit."""
+"""Shortest and longest time between frames, s; outside of these, times have another unit."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +54,13 @@ class Take:
     frames: NDArray[np.int64]
     """(T,) numbers of the frames, as in people.npz."""
     times_s: Array
-    """(T,) when they were taken, seconds; rising."""
+    """(T,) rising times of the frames, seconds."""
     fps: float
-    """Frames a second (`rate_of`)."""
+    """Frame rate, Hz (`rate_of`)."""
     up: Axis
-    """Which axis of the world points up."""
+    """Axis of the world that points up."""
     rig: Rig | None = None
-    """The cameras, where they are known."""
+    """The cameras; None where they are unknown."""
 
     @classmethod
     def of(
@@ -74,9 +75,9 @@ class Take:
     ) -> "Take":
         """The timeline of a result; ValueError where it has none.
 
-        `fps` takes the place of the result's own times, which must be known without it. `seen_only` leaves out
-        every joint that no view saw in that frame, and the bodies of rows where none was seen. With `identities`
-        off, a result without time is a Take too: a person is then a number within the frame.
+        `fps` replaces the result's own times, and is needed where these are unknown. `seen_only` leaves out every
+        joint that no view saw in that frame, and the bodies of rows where none was seen. With `identities` off, a
+        result without identities is a Take too: a person is then a number within the frame.
         """
         if len(people) == 0:
             raise ValueError("no people were found, so there is nothing to export")
@@ -168,7 +169,7 @@ def _moved(rig: Rig, origin: Array) -> Rig:
 
 
 def _check_memory(persons: int, frames: int) -> None:
-    """InputError where places of all people in all frames, and one person's body, need more than there is."""
+    """InputError where joints of all people in all frames, and one person's body, do not fit in memory."""
     needed, free = frames * (2 * 8 * persons + _BODY_BYTES), free_memory()
     if free is not None and needed > free:
         raise InputError(
@@ -178,7 +179,7 @@ def _check_memory(persons: int, frames: int) -> None:
 
 
 def _seen(people: Reconstruction) -> Reconstruction:
-    """The people without what no view saw."""
+    """The people without joints that no view saw."""
     if not (people.known != Known.UNKNOWN).any():
         raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
@@ -191,7 +192,7 @@ def _seen(people: Reconstruction) -> Reconstruction:
 
 
 def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> Array:
-    """When each frame was taken: frames without a row lie between those with one."""
+    """Times of the frames: frames without a row lie between those with one."""
     if fps is not None:
         return frames / typed_rate(fps)
     known, first = np.unique(people.frame, return_index=True)
@@ -207,7 +208,7 @@ def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None)
 
 
 def _fps_of(people: Reconstruction) -> float:
-    """Frames a second by run.json."""
+    """Frame rate according to run.json, Hz."""
     fps = people.run.get("time", {}).get("fps")
     if fps is None or not fps > 0:
         raise ValueError("one frame does not say how many there are a second; give --fps")

@@ -1,4 +1,4 @@
-"""When each camera took its pictures: by the footage itself, or by what the user says."""
+"""Times of each camera's pictures, from the footage itself or from the user's options."""
 
 import re
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from shapepose_fg.io.validation import is_number
 def clocks_of(
     footage: Sequence[Footage], fps: Sequence[str], start: Sequence[str], cameras: Sequence[str]
 ) -> tuple[list[CameraClock], bool]:
-    """When each camera took its frames, and whether in seconds: without any rate frames are counted.
+    """The clock of each camera, and whether it is in seconds: without any rate frames are counted.
 
     `fps` and `start` are options, as `per_camera` reads them.
     """
@@ -43,7 +43,7 @@ def clocks_of(
 
 
 def typed_rate(text: str | None) -> float | None:
-    """Frames a second."""
+    """A frame rate, Hz."""
     if text is None:
         return None
     if not is_number(text) or not 0.01 <= float(text) <= 1e5:
@@ -52,7 +52,7 @@ def typed_rate(text: str | None) -> float | None:
 
 
 def typed_start(text: str | None, period: float, has_clock: bool) -> float:
-    """When a camera's first frame was taken, in seconds, or in frames where there is no clock."""
+    """Time of a camera's first frame, in seconds, or in frames where there is no clock."""
     if text is None:
         return 0.0
     match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())

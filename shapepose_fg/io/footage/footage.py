@@ -1,4 +1,4 @@
-"""The pictures of one camera, frame by frame: of a video, of a folder of pictures, or a single picture."""
+"""The pictures of one camera, frame by frame: from a video, a folder of pictures, or a single picture."""
 
 import os
 import re
@@ -20,23 +20,24 @@ from shapepose_fg.io.footage.places import PICTURES
 Picture = NDArray[np.uint8]
 """(H, W, 3) blue, green, red."""
 Progress = Callable[[int, int], None]
-"""Is told how many frames are done, and how many there are."""
+"""Called with the number of frames that are done, and the number of all."""
 
 _READ_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _SAFE_READING = (
     "protocol_whitelist;file"
     "|format_whitelist;mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,mpeg,mpegts,mpegvideo,asf,h264,hevc,m4v"
 )
-"""A video is read by these rules: its file alone, and no playlist, which could name other files and addresses."""
+"""Options for reading untrusted videos: the file alone, and no playlist, which could name other files and
+addresses."""
 _MOST_BYTES = 2**29
-"""Bytes of a picture's file."""
+"""Maximum size of a picture's file, bytes."""
 _LARGEST = 16384
-"""No camera has pictures with a longer side, pixels: a file that says so is damaged, or meant to do harm."""
+"""Longest side of a picture, pixels: a file with a larger one is damaged, or malicious."""
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
 def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
-    """The footage at `path`: a video (looked through once, for its frames and times), a folder, or a picture.
+    """The footage at `path`: a video (decoded once, for its frames and times), a folder, or a picture.
 
     InputError where nothing in it can be read.
     """
@@ -46,9 +47,9 @@ def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
 
 
 def glance(path: Path, capture: Any = None) -> tuple[tuple[int, int], float]:
-    """Size (width, height) and frames a second that a video tells of itself, without looking through it.
+    """Size (width, height) and frame rate that a video's header states, without decoding it.
 
-    The rate is 0 where it does not say, or cannot be. `capture` is the video, where it is open.
+    The rate is 0 where there is none, or it is impossible. `capture` is the video, where it is open.
     """
     capture = _capture(path) if capture is None else capture
     size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
@@ -66,7 +67,7 @@ class Video:
     time_s: Array
     """(N,) the frames' own times in the file, seconds after the first."""
     notes: tuple[str, ...] = ()
-    """What is wrong with the file, a sentence each."""
+    """Notes on problems of the file, a sentence each."""
     _capture: Any = field(default=None, repr=False)
     _next: int = 0
     _last: Picture | None = None
@@ -129,9 +130,9 @@ class PictureFiles:
     number: Index
     """(N,) number of each frame, rising."""
     notes: tuple[str, ...] = ()
-    """What is wrong with the files, a sentence each."""
+    """Notes on problems of the files, a sentence each."""
     time_s: Array | None = None
-    """Files do not say when they were taken."""
+    """Always None: files of pictures have no times."""
 
     @classmethod
     def open(cls, path: Path) -> "PictureFiles":
@@ -162,11 +163,11 @@ class PictureFiles:
 
 
 Footage = Video | PictureFiles
-"""What one camera took: N frames with numbers, of which some may have no picture."""
+"""The footage of one camera: N numbered frames, of which some may have no picture."""
 
 
 def _fitting(picture: Any, size: tuple[int, int]) -> Picture | None:
-    """A picture, where it could be read and has the size."""
+    """A picture that could be read and has the size; else None."""
     return picture if picture is not None and picture.shape[1::-1] == size else None
 
 
@@ -191,9 +192,9 @@ def _capture(path: Path) -> Any:
 
 
 def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
-    """(N,) seconds after the first frame, and what is odd about them.
+    """(N,) seconds after the first frame, and notes on irregular times.
 
-    The file's own times where they rise; else the rate that it names.
+    The file's own times where they rise; else times by the rate that it states.
     """
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if fps < 0.01:

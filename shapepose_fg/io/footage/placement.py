@@ -1,4 +1,4 @@
-"""Where the calibrated picture lies in those of the footage; and footage.json: what detections were made from."""
+"""The place of calibrated pixels in pictures of the footage; and footage.json, the pictures behind detections."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -22,11 +22,11 @@ FOOTAGE = "footage.json"
 """The file beside the detections."""
 
 _BLOCK = 16
-"""Video coders work in blocks of this many pixels: a few columns or rows come and go with them."""
+"""Block size of video coders, pixels: a few columns or rows are added or removed with them."""
 
 
 class PlacementKind(StrEnum):
-    """How pictures of another size come from calibrated ones."""
+    """How pictures of another size were made from calibrated ones."""
 
     SAME = "same"
     """They have the same size."""
@@ -42,14 +42,14 @@ class PlacementKind(StrEnum):
 
 @dataclass(frozen=True)
 class Placement:
-    """How calibrated pixels lie in a picture: along each axis, edges at scale * u + shift."""
+    """The place of calibrated pixels in a picture: along each axis, edges at scale * u + shift."""
 
     kind: PlacementKind
-    """Where it comes from."""
+    """How the pictures were made."""
     picture_size: tuple[int, int]
     """Width and height of the pictures, pixels."""
     calibrated_size: tuple[int, int]
-    """(width, height) that the calibration is for."""
+    """Width and height of the calibrated pictures, pixels."""
 
     @cached_property
     def scale(self) -> Array:
@@ -67,7 +67,7 @@ class Placement:
 
     @property
     def region(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom edge of what is calibrated and in the picture; 0 is a pixel's centre."""
+        """Left, top, right, bottom edge of the calibrated part of the picture; 0 is a pixel's centre."""
         low = np.maximum(self.shift, 0.0)
         high = np.minimum(self.shift + self.scale * self.calibrated_size, self.picture_size)
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
@@ -85,7 +85,7 @@ class Placement:
 def placements_of(
     given: Sequence[str], sizes: Mapping[str, tuple[int, int]], rig: Rig
 ) -> tuple[dict[str, Placement], list[str]]:
-    """Where calibrated pixels lie in the pictures of cameras, `sizes` (width, height), and what was concluded.
+    """The placements of cameras with pictures of `sizes` (width, height), and notes on inferred ones.
 
     `given` are kinds of placement, for all cameras or CAMERA=KIND.
     """
@@ -104,11 +104,11 @@ def placements_of(
 def place(
     name: str, picture_size: tuple[int, int], calibrated_size: tuple[int, int], wanted: PlacementKind | None
 ) -> tuple[Placement, str | None]:
-    """How the pictures of camera `name` are placed, and a sentence where that was concluded from their sizes.
+    """The placement of camera `name`, and a sentence where it was inferred from sizes.
 
-    Concluded are: equal sizes; a difference of up to 16 pixels, which was cut off or added on the right or at the
+    Inferred are: equal sizes; a difference of up to 16 pixels, which was cut off or added on the right or at the
     bottom; and otherwise the same shape at another size, which was resized. InputError for any other size, unless
-    `wanted` says what was done, and where what is wanted is impossible.
+    `wanted` states the kind, and where the wanted kind is impossible.
     """
     (width, height), (full_width, full_height) = picture_size, calibrated_size
     full = f"{full_width} x {full_height}"
@@ -170,7 +170,7 @@ class _File(BaseModel):
 
 
 def write_used_footage(file: Path, cameras: Sequence[CameraFootage], about: dict[str, Any]) -> None:
-    """Write `file`; `about` is kept with it."""
+    """Write `file`, with `about` in it."""
     entries = [
         {
             "name": each.name,

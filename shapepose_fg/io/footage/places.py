@@ -1,4 +1,4 @@
-"""Which video or folder of pictures is which camera's."""
+"""Finds the video or folder of pictures of each camera."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,15 +11,15 @@ VIDEOS = frozenset(".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .ts .mts .m2ts .wm
 PICTURES = frozenset(".jpg .jpeg .png .bmp .tif .tiff .webp".split())
 """Endings of pictures."""
 _INNER = ("videos", "images", "video", "image")
-"""Folders in which other programs' projects keep their footage."""
+"""Folders of footage in other programs' projects."""
 
 
 def per_camera(
     option: str, given: Sequence[str], cameras: Sequence[str], *, one_for_all: bool = False
 ) -> list[str | None]:
-    """(V,) what an option says of each camera: CAMERA=VALUE, or where it may be one VALUE for all.
+    """(V,) the value of an option for each camera: CAMERA=VALUE, or where allowed one VALUE for all.
 
-    InputError for other cameras, and for what is said twice.
+    InputError for unknown cameras, and for duplicates.
     """
     values: dict[str, str] = {}
     rest: str | None = None
@@ -34,7 +34,7 @@ def per_camera(
         name = text[:cut]
         if name not in cameras:
             there = " ".join(cameras)
-            raise InputError(f"{option} {text}: the calibration has no camera {name!r}; it has {there}")
+            raise InputError(f"{option} {text}: there is no camera {name!r}; there are {there}")
         if name in values:
             raise InputError(f"{option} {text}: camera {name} is given twice; give it once")
         values[name] = text[cut + 1 :]
@@ -42,10 +42,10 @@ def per_camera(
 
 
 def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """A video, a picture, or a folder of pictures for each camera, and what was taken to be what.
+    """A video, a picture, or a folder of pictures for each camera, and notes on inferred names.
 
-    `given` is one folder that holds something named after each camera, or CAMERA=PATH for each of them.
-    InputError naming the camera that is missing, or what could be meant twice.
+    `given` is one folder with an entry named after each camera, or CAMERA=PATH for each of them. InputError naming
+    the camera that is missing, or what is ambiguous.
     """
     if len(given) == 1 and ("=" not in given[0] or Path(given[0]).exists()):
         return _in_folder(Path(given[0]), cameras)
@@ -62,8 +62,8 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
 
 
 def names_of_footage(given: Sequence[str]) -> list[str]:
-    """What cameras are called by what `find_footage` takes alone: a folder's videos, or else its other footage, or
-    the names before `=`. InputError where there is nothing.
+    """Names of cameras from the arguments of `find_footage` alone: a folder's videos, or else its other
+    footage, or the names before `=`. InputError where there is nothing.
     """
     if len(given) > 1 or ("=" in given[0] and not Path(given[0]).exists()):
         return [text.partition("=")[0] for text in given]
@@ -77,7 +77,9 @@ def names_of_footage(given: Sequence[str]) -> list[str]:
 
 
 def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """What a folder holds of each camera, told by the names: videos, pictures, and folders that hold pictures."""
+    """The entries of a folder for each camera, by their names: videos, pictures, and folders that hold
+    pictures.
+    """
     if folder.is_file():
         raise InputError(
             f"{folder}: this is one file; give the folder with the footage of all cameras, or CAMERA=PATH for each"

@@ -1,7 +1,7 @@
 """The fields of the ROS 2 messages that are written and read: those of ROS, and three of our own.
 
-ROS's are as in the distributions from Humble on; constants and comments do not change what is written. Of
-nav_msgs/Odometry and the two with it only what is read is here.
+ROS's are as in the distributions from Humble on, without constants and comments. Of nav_msgs/Odometry and two
+related messages only the fields that are read are here.
 """
 
 import re
@@ -75,10 +75,10 @@ def type_name(name: str) -> str:
 
 
 def check_definition(name: str, text: str) -> None:
-    """Whether a message that is laid out as `text` says has all fields of `name` (package/Message) that are read.
+    """Check that a message with the layout `text` has all fields of `name` (package/Message) that are read.
 
-    Messages may have others besides. ValueError that names the message and the field. Arrays whose items take no
-    bytes, or of very many items, are refused, too: a short message could hold any number of them.
+    Messages may have further fields. ValueError that names the message and the field. Arrays whose items take no
+    bytes, or of very many items, are refused, too: a short message could have any number of them.
     """
     parts = re.split(r"^=+\s*MSG: *(\S+) *$", "\n".join(text.splitlines()), flags=re.MULTILINE)
     theirs = {
@@ -128,11 +128,11 @@ def _plain(name: str) -> str:
 _FAMILY = {each: "whole" for n in (8, 16, 32, 64) for each in (f"int{n}", f"uint{n}")}
 _FAMILY |= {"byte": "whole", "char": "whole", "bool": "bool", "string": "string", "wstring": "wstring"}
 _FAMILY |= {"float32": "real", "float64": "real"}
-"""What kind of value a type of ROS has; any other is a message."""
+"""Kinds of values by type of ROS; any other type is a message."""
 _MOST_ITEMS = 2**16
-"""Items of an array of fixed size."""
+"""Maximum number of items of an array of fixed size."""
 _TIME = {
     each: {"sec": "int32", "nanosec": "uint32"}
     for each in ("builtin_interfaces/Time", "builtin_interfaces/Duration")
 }
-"""Messages that need no definition in the file."""
+"""Messages without a definition in the file."""

@@ -3,7 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -40,32 +40,30 @@ from shapepose_fg.io.ros.poses import KINDS, Frames, frame_of, stamp_ns
 
 _DETECTIONS = "shapepose_msgs/Detections"
 _LASTS_S = 0.2
-"""Markers of who is seen no more stay so long."""
+"""Lifetime of the markers of a person who is not seen any more, s."""
 _CHUNK = 2**26
-"""Bytes that a chunk may unpack to; those of ROS 2 have one million."""
+"""Maximum size of a decompressed chunk, bytes; those of ROS 2 have one million."""
 _WINDOW, _MOST_RECORDS = 2**27, 2**19
-"""Bytes of zstd's window, as its own program takes without being asked; and records of a chunk, which are all in
-memory: 64 MiB of records of 128 bytes."""
+"""Maximum size of zstd's window, bytes, its own program's default; and maximum number of records of a chunk,
+which are all in memory: 64 MiB of records of 128 bytes."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
 _LOOK_S = 0.1
-"""Pictures that wait for a pose are looked at so often, by the log's time: each look goes through all poses."""
+"""Interval between searches for the poses of waiting pictures, s of the log's time: each search reads all
+poses."""
 _POSES_KEPT_S = 3.0
-"""Poses are kept so long: detections that were logged later than what moved find theirs."""
+"""Time for which poses are kept, s, so that detections that were logged later find theirs."""
 View = tuple[str, Detections, float, Array | None, Array | None]
-"""What `OnlineReconstructor.push_view` takes."""
+"""The arguments of `OnlineReconstructor.push_view`."""
 
 
-class McapWriter:
-    """Writes people frame by frame; a context: without its end a file has no index."""
+class McapWriter(AbstractContextManager["McapWriter"]):
+    """Writes people frame by frame; a context manager, without whose end a file has no index."""
 
     def __init__(self, stream: IO[bytes], rig: Rig | None) -> None:
         self._file = optional("mcap_ros2.writer", "ros").Writer(stream)
         self._schemas: dict[str, Any] = {}
         self._rig, self._begun = rig, False
-
-    def __enter__(self) -> "McapWriter":
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -73,7 +71,9 @@ class McapWriter:
         self._file.finish()
 
     def frame(self, rows: Reconstruction, time_s: float, kind: str = "settled") -> None:
-        """The people of one moment: /people, /people/markers, /tf; before the first one cameras, /tf_static."""
+        """Write the people of one frame: /people, /people/markers, /tf; before the first one cameras,
+        /tf_static.
+        """
         if not self._begun and self._rig is not None:
             self._message("/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s), time_s)
             for camera in self._rig.cameras:
@@ -92,7 +92,7 @@ class McapWriter:
             self._message("/tf", "tf2_msgs/TFMessage", {"transforms": moved}, time_s)
 
     def detections(self, camera: str, seen: list[list[float]], time_s: float, rig: Rig) -> None:
-        """What one camera's detector saw: x, y, score of each keypoint, of each person, in picture pixels."""
+        """Write one camera's detections: x, y, score of each keypoint, of each person, in picture pixels."""
         which = rig.cameras[rig.names.index(camera)]
         people = [{"pose_keypoints_2d": each} for each in seen]
         message = {"header": header(optical(which), time_s), "camera": camera, "people": people}
@@ -105,11 +105,11 @@ class McapWriter:
 
 
 def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]) -> Iterator[View]:
-    """What `OnlineReconstructor.push_view` takes, in the order in which it was logged: camera, detections, when by
-    its stamp, seconds, and of a camera that moves its pose with covariance, between those in the file.
+    """The arguments of `OnlineReconstructor.push_view` in the order of the log: camera, detections, time by the
+    stamp, seconds, and for a moving camera its interpolated pose with covariance.
 
-    A picture waits for the pose after it. `note` is told of cameras whose pictures had none. InputError, one
-    sentence, for a file that is none or holds no detection.
+    A picture waits for the pose after it. `note` receives cameras whose pictures had none. InputError, one
+    sentence, for an invalid file or one without detections.
     """
     number, frames, unplaced, begun_s, tidied_s = 0, Frames(), Counter[tuple[str, str]](), math.inf, -math.inf
     looked_s, left = -math.inf, 0
@@ -161,7 +161,7 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
 
 
 def read_frame(file: Path, frame: str, name: str) -> Trajectory:
-    """Where a frame goes, or what a topic of poses tells; with no `frame`, the one that there is. InputError."""
+    """The trajectory of a frame, or of a topic of poses; without `frame`, the only one. InputError."""
     frames = Frames()
     with open_regular(file, _CURE_POSES) as stream:
         for topic, kind, _, message in _decoded(stream, file, set(KINDS), _CURE_POSES):
@@ -177,8 +177,8 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
 
 @contextmanager
 def _whole(file: Path, cure: str) -> Iterator[None]:
-    """InputError where a message in the block lacks a field, or has another kind of value there: the library may
-    take a damaged definition otherwise than `check_definition` does.
+    """InputError where a message in the block lacks a field, or has another kind of value there: the library
+    may interpret a damaged definition differently from `check_definition`.
     """
     try:
         yield
@@ -187,7 +187,7 @@ def _whole(file: Path, cure: str) -> Iterator[None]:
 
 
 def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
-    """Topic, kind, time of the log, and content of messages; what is wrong with the file as an InputError."""
+    """Topic, kind, time of the log, and content of messages; InputError for damaged files."""
     factory, decoders = optional("mcap_ros2.decoder", "ros").DecoderFactory(), dict[int, Any]()
     try:
         for schema, channel, message in _messages(stream):

@@ -21,20 +21,20 @@ from shapepose_fg.core.reconstruction import Reconstruction
 Message = dict[str, Any]
 MAP, WORLD = "map", "world"
 NS = 1_000_000_000
-"""Nanoseconds of a second."""
+"""Nanoseconds per second."""
 _LAST_S = 2**31
-"""A stamp's seconds are 32 bits."""
+"""Upper limit of a stamp's seconds, which have 32 bits."""
 _SPHERES, _LINES = 7, 5
 """`SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker."""
 _JOINT_M, _BONE_M = 0.05, 0.03
 _BODY_FROM_FRONT = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-"""Columns: SMPL's axes (x left, y up, z front) of a frame whose x is front, y left and z up."""
+"""Rotation to SMPL's axes (x left, y up, z front) from a frame whose x is front, y left and z up."""
 _LENSES = {4: "equidistant", 5: "plumb_bob"}
-"""By the number of coefficients; those with more are `rational_polynomial`."""
+"""Names of lens models by the number of coefficients; those with more are `rational_polynomial`."""
 
 
 def nanoseconds(time_s: float) -> int:
-    """A time as the log of an MCAP file has it; InputError before 1970 and after 2038."""
+    """A time in nanoseconds for the log of an MCAP file; InputError before 1970 and after 2038."""
     if not 0 <= time_s < _LAST_S:
         raise InputError(f"time {time_s:g} s: ROS's clocks run from 0 to 2^31 s; give times from 0 on")
     return round(time_s * NS)
@@ -47,7 +47,7 @@ def header(frame_id: str, time_s: float) -> Message:
 
 
 def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
-    """shapepose_msgs/People: one moment's rows, the arrays of people.npz, flat, NaN where unknown."""
+    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN where unknown."""
     names = "joints covariance velocity velocity_covariance betas global_orient body_pose transl".split()
     people = [
         {"person": int(rows.person[n]), "status": str(rows.status[n]), "known": rows.known[n].tolist()}
@@ -76,7 +76,7 @@ def body_transforms(rows: Reconstruction, time_s: float) -> Message:
 
 
 def fixed_transforms(rig: Rig, time_s: float) -> Message:
-    """tf2_msgs/TFMessage of what does not move: the world in `map`, and cameras in it or on their carriers."""
+    """tf2_msgs/TFMessage of static frames: the world in `map`, and cameras in it or on their carriers."""
     up, z = rig.up_vector, np.array([0.0, 0, 1])
     axis, R = np.cross(up, z), np.eye(3)
     if axis.any():
@@ -92,7 +92,7 @@ def fixed_transforms(rig: Rig, time_s: float) -> Message:
 
 
 def carrier_transforms(rig: Rig, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: what carries cameras, in the world."""
+    """tf2_msgs/TFMessage: carriers of cameras, in the world."""
     at = np.full(1, time_s)
     return {
         "transforms": [_transform(WORLD, ros_name(each.name), each.at(at)[0], time_s) for each in rig.trajectories]
@@ -100,7 +100,7 @@ def carrier_transforms(rig: Rig, time_s: float) -> Message:
 
 
 def camera_info(camera: Camera, time_s: float) -> Message:
-    """sensor_msgs/CameraInfo of pictures as they were taken, with the lens's distortion."""
+    """sensor_msgs/CameraInfo for pictures with distortion."""
     width, height = camera.image_size
     return {
         "header": header(optical(camera), time_s),
@@ -118,7 +118,7 @@ def camera_info(camera: Camera, time_s: float) -> Message:
 
 
 def markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Message:
-    """visualization_msgs/MarkerArray: joints and bones of everybody, gone after `lasts_s`."""
+    """visualization_msgs/MarkerArray: joints and bones of everybody, with a lifetime of `lasts_s`."""
     return {"markers": list(_markers(rows, time_s, lasts_s))}
 
 
@@ -157,7 +157,7 @@ def optical(camera: Camera) -> str:
 
 
 def _hips(rows: Reconstruction, n: int) -> Array:
-    """(3,) the middle of the hips; NaN where it is not known."""
+    """(3,) the middle of the hips; NaN where unknown."""
     names = rows.joint_names.tolist()
     at = [names.index(each) for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"]) if each in names]
     return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)

@@ -1,4 +1,4 @@
-"""Where a robot says that its parts are: transforms, odometry and poses in ROS 2 messages, as a tree of frames."""
+"""Poses of a robot's parts: transforms, odometry and poses in ROS 2 messages, as a tree of frames."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -19,14 +19,14 @@ KINDS = tuple(map(type_name, (TREE, _WITH_CHILD, *_ALONE)))
 """Messages that hold poses."""
 _STATIC = "tf_static"
 _UNIT = 0.01
-"""How far the length of a quaternion may be from 1."""
+"""Largest deviation of a quaternion's length from 1."""
 _MOST_METRES = 1e6
 _TURN_THEN_WAY = np.array([3, 4, 5, 0, 1, 2])
-"""ROS's covariances are of the way, then of the turn."""
+"""Order of rotation before translation in ROS's covariances, which have translation first."""
 
 
 class Frames:
-    """Poses of frames in their parents, as they are told; what is asked for is put together along the tree."""
+    """Poses of frames in their parents, collected from messages, and chained along the tree."""
 
     def __init__(self) -> None:
         self._parent: dict[str, str] = {}
@@ -36,9 +36,9 @@ class Frames:
         self._known: dict[str, Trajectory] = {}
 
     def add(self, topic: str, kind: str, message: Any, place: str) -> None:
-        """Take in a message of one of `KINDS`. InputError naming `place` where a pose in it is none.
+        """Add a message of one of `KINDS`. InputError naming `place` where a pose in it is invalid.
 
-        Odometry comes before transforms of the same frame: it says how surely.
+        Odometry has precedence over transforms of the same frame, because it has covariances.
         """
         for parent, child, stamp, pose, covariance in _links(topic, kind, message):
             if topic.endswith(_STATIC):
@@ -69,12 +69,13 @@ class Frames:
         return found
 
     def moves(self, frame: str) -> bool:
-        """Whether it, or what it is on, has told poses over time."""
+        """Whether the frame, or one above it, has several poses over time."""
         return any(each in self._told for each in self.chain(frame))
 
     def at(self, frame: str, time_s: Array) -> tuple[Array, Array, Mask]:
-        """A frame in the root of its tree at times (N,): poses (N, 4, 4), their covariances (N, 6, 6), turn then
-        way along its own axes, 0 where nothing is said, and (N,) whether poses were told near enough.
+        """Poses (N, 4, 4) of a frame in the root of its tree at times (N,), their covariances (N, 6, 6),
+        rotation before translation along its own axes, 0 where there are none, and (N,) whether poses are near
+        enough in time.
         """
         poses = np.tile(np.eye(4), (len(time_s), 1, 1))
         surely, there = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
@@ -91,7 +92,7 @@ class Frames:
         return poses, surely, there
 
     def trajectory(self, frame: str, name: str) -> Trajectory:
-        """Where a frame goes, at the times at which what moves most often under it was told. ValueError."""
+        """The trajectory of a frame, at the times of the link in its chain that has most poses. ValueError."""
         moved = [each for each in self.chain(frame) if each in self._told]
         most = max(moved, key=lambda each: len(self._told[each]))
         time_s = np.array(sorted(self._told[most])) / NS
@@ -102,14 +103,14 @@ class Frames:
         return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
 
     def forget(self, before_s: float) -> None:
-        """Drop what was told before, but for the last of it."""
+        """Drop earlier poses, except for the last of each link."""
         for child, told in self._told.items():
             for stamp in sorted(stamp for stamp in told if stamp < before_s * NS)[:-1]:
                 del told[stamp]
                 self._known.pop(child, None)
 
     def _trajectory(self, child: str) -> Trajectory | None:
-        """One link over time; None where it was told once only."""
+        """One link over time; None where it has one pose only."""
         if child not in self._known and len(self._told[child]) > 1:
             told = sorted(self._told[child].items())
             time_s, poses = np.array([at for at, _ in told]) / NS, np.stack([pose for _, (pose, _) in told])
@@ -135,7 +136,7 @@ def _links(topic: str, kind: str, message: Any) -> Iterator[tuple[str, str, int,
 
 
 def stamp_ns(header: Any) -> int:
-    """When, of a std_msgs/Header, nanoseconds."""
+    """Stamp of a std_msgs/Header, nanoseconds."""
     return header.stamp.sec * NS + header.stamp.nanosec
 
 
@@ -158,8 +159,8 @@ def _matrix(pose: Array, place: str) -> Array:
 
 
 def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
-    """(6, 6) turn then way along the frame's own axes, of ROS's 36 numbers, along the parent's; None where these
-    are zero, which says that nothing is known, or begin with -1.
+    """(6, 6) covariance of rotation before translation along the frame's own axes, from ROS's 36 numbers along
+    the parent's; None where these are zero, which means unknown, or begin with -1.
     """
     if numbers is None:
         return None
@@ -175,9 +176,7 @@ def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
 
 
 def _of_inverse(poses: Array) -> Array:
-    """(N, 6, 6) the adjoints of inverses of poses (N, 4, 4): how a turn and a way along a parent's axes look from
-    the frame.
-    """
+    """(N, 6, 6) adjoints of the inverses of poses (N, 4, 4): from a parent's axes to the frame's."""
     R, (x, y, z) = poses[:, :3, :3].mT, poses[:, :3, 3].T
     none = np.zeros_like(x)
     found = np.zeros((len(poses), 6, 6))

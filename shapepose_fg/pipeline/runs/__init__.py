@@ -1,1 +1,1 @@
-"""A reconstruction on its way: solved windows that are kept, where it can go on, and the result made of them."""
+"""A reconstruction in progress: its solved windows, from which it can be resumed, and its result."""

@@ -1,4 +1,4 @@
-"""The result of a run, made of its parts column by column: in memory, or straight into the files."""
+"""The result of a run, assembled from its parts column by column: in memory, or straight into the files."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,14 +25,15 @@ from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
 _FLOOR_ROWS = 4000
-"""About so many rows, of every so many frames, a floor is found from."""
+"""Approximate number of rows, spread over all frames, from which a floor is found."""
 _STANDS_M_S = 0.1
-"""A foot stands where its heel or a toe is seen and slower, and the speed is known to within this per axis."""
+"""Maximum speed of a standing foot, m/s: that of a visible heel or toe, whose speed is known this well per
+axis."""
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """The parts of a run, and what makes a result of them."""
+    """The parts of a run, and all that is needed to assemble a result from them."""
 
     parts: Parts
     """The solved windows."""
@@ -41,34 +42,34 @@ class Assembly:
     view_names: Sequence[str]
     """(V,) names of the cameras."""
     names: Mapping[int, int] = field(default_factory=dict)
-    """What tracks are called in the result; who is not in it keeps the name."""
+    """Names of tracks in the result; a track that is not in it keeps its number."""
     bodies: BodiesOverTime | None = None
-    """Bodies that take the place of the windows' own."""
+    """Bodies that replace those of the windows."""
     run: dict[str, Any] = field(default_factory=dict)
-    """How it came about (`Reconstruction.run`)."""
+    """Origin of the result (`Reconstruction.run`)."""
 
     def __len__(self) -> int:
         return self.parts.rows
 
     @property
     def shapes(self) -> SubjectShapes | None:
-        """Everybody's shape."""
+        """The shapes of all people."""
         return None if self.bodies is None else self.bodies.shapes
 
     @cached_property
     def persons(self) -> list[NDArray[np.int64]]:
-        """For each part (R,) who its rows are."""
+        """For each part the identities (R,) of its rows."""
         tracks = (self.parts.column(n, "person").tolist() for n in range(len(self.parts)))
         return [np.array([self.names.get(each, each) for each in track], dtype=np.int64) for track in tracks]
 
     @cached_property
     def rows_of(self) -> dict[int, int]:
-        """How many rows everybody has, by number."""
+        """The number of rows of each person."""
         return {number: sum(places.values()) for number, places in sorted(self._places.items())}
 
     @cached_property
     def _places(self) -> dict[int, dict[int, int]]:
-        """In which parts everybody is, and in how many rows of each."""
+        """For each person the parts with its rows, and their number in each."""
         places: dict[int, dict[int, int]] = {}
         for n, person in enumerate(self.persons):
             for number, count in Counter(person.tolist()).items():
@@ -78,7 +79,7 @@ class Assembly:
     def own_pieces(
         self, number: int, columns: Sequence[str], rows: range | None = None
     ) -> Iterator[tuple[NDArray[Any], ...]]:
-        """`columns` of somebody's rows, part by part; `rows` counts among somebody's own, None for all."""
+        """`columns` of one person's rows, part by part; `rows` counts among the person's own, None for all."""
         wanted = range(self.rows_of[number]) if rows is None else rows
         before = 0
         for n, count in self._places[number].items():
@@ -89,7 +90,9 @@ class Assembly:
                 yield tuple(self.parts.column(n, name)[mine] for name in columns)
 
     def person(self, number: int, rows: Sequence[range]) -> Person:
-        """What somebody's bodies are fitted to, in some of somebody's own rows, one range after the other."""
+        """The data that a person's bodies are fitted to, in some of the person's own rows, one range after the
+        other.
+        """
         columns = ("joints", "covariance", "time_s")
         pieces = [piece for part in rows for piece in self.own_pieces(number, columns, part)]
         return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
@@ -102,23 +105,23 @@ class Assembly:
             before.update(person.tolist())
 
     def counts(self) -> dict[str, Any]:
-        """What run.json says of the rows (`Reconstruction.counts`)."""
+        """The entry of run.json about the rows (`Reconstruction.counts`)."""
         return count_rows(zip(self.pieces("status"), self.pieces("known"), strict=True))
 
     def columns(self) -> dict[str, Pieces]:
-        """What people.npz holds."""
+        """The columns of people.npz."""
         return self._columns(Reconstruction.empty(self.joint_names), "")
 
     def observation_columns(self) -> dict[str, Pieces] | None:
-        """What observations.npz holds; None where there are no rows."""
+        """The columns of observations.npz; None where there are no rows."""
         empty = ObservationTable.empty(self.joint_names, self.view_names)
         return self._columns(empty, OBSERVED) if len(self) > 0 else None
 
     def reconstruction(self, every: int = 1, *, consume: bool = False) -> Reconstruction:
-        """In memory, all of it or every so many frames.
+        """The result in memory, all of it or every n-th frame.
 
-        With `consume` the parts are given up as they are read, so that rows are not in memory twice; nothing else
-        can be made of them afterwards.
+        With `consume` the parts are released as they are read, so that rows are not in memory twice; nothing else
+        can be assembled afterwards.
         """
         chosen = [np.flatnonzero(frame % every == 0) for frame in self.pieces("frame")]
         empty = Reconstruction.empty(self.joint_names)
@@ -151,7 +154,7 @@ class Assembly:
         return replace(self, run=self.run | entries)
 
     def _piece(self, n: int, name: str, before: Mapping[int, int]) -> NDArray[Any]:
-        """A column of a part; `before` is how many rows everybody has in the parts before it."""
+        """A column of a part; `before` is the number of rows of each person in the parts before it."""
         if name.removeprefix(OBSERVED) == "person":
             return self.persons[n]
         values = self.parts.column(n, name)
@@ -167,7 +170,7 @@ class Assembly:
         }
 
     def floor(self, model: BodyModel, up: Array) -> Floor | str:
-        """Where the soles of everybody's bodies stand, or in words why no floor was found; `up` (3,) points up."""
+        """The floor under the soles of all bodies, or in words why none was found; `up` (3,) points up."""
         joints, parts = tuple(self.joint_names), self.parts
         # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.
         soles = [n for n in feet_of(joints).tolist() if not joints[n].endswith("Ankle")]

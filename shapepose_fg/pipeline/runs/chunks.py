@@ -1,4 +1,6 @@
-"""A recording cut into chunks whose people are followed apart, side by side; who is who from chunk to chunk."""
+"""Divides a recording into chunks whose people are tracked in parallel, and joins identities across their
+borders.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -44,8 +46,8 @@ def cut_in_chunks(
 ) -> list[Chunk]:
     """Chunks of about `chunk_frames` whose borders are those of windows, so that windows are as without chunks.
 
-    `time_s` (T,) are the times of all frames of the recording. What is followed before a chunk is whole windows,
-    at least `WARM_S` of them. Each segment between cuts is cut for itself.
+    `time_s` (T,) are the times of all frames of the recording. Tracking begins whole windows before a chunk, at
+    least `WARM_S`. Each segment between cuts is divided separately.
     """
     batch = config.batch_frames
     step = max(1, round(chunk_frames / batch)) * batch
@@ -63,10 +65,11 @@ def cut_in_chunks(
 
 
 def _until(stop: int, segment: range, first: int, time_s: Array, config: PipelineConfig) -> int:
-    """How far people must be followed for the window that ends at `stop`: half a window and the overlap beyond it,
-    the block in which that is decided, as far as following looks ahead, and two frames to spare, in whole batches.
+    """The frame to which people must be tracked for the window that ends at `stop`.
 
-    `Engine` compares means over the cameras' times, which round differently: a frame more or less, twice.
+    It is half a window and the overlap beyond it, the block in which that is decided, the tracker's look-ahead,
+    and two frames to spare, in whole batches. `Engine` compares means over the cameras' times, which round
+    differently: a frame more or less, twice.
     """
     beyond = stop + config.batch_frames // 2 + 1
     while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.shared_s:
@@ -83,7 +86,7 @@ def _until(stop: int, segment: range, first: int, time_s: Array, config: Pipelin
 
 
 def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
-    """The windows of a chunk, whose people are followed from `chunk.first` on."""
+    """The windows of a chunk, whose people are tracked from `chunk.first` on."""
     state, done, step = engine.start(), chunk.first, engine.config.batch_frames
     for start in range(chunk.first, chunk.until, step):
         batch = range(start, min(start + step, chunk.until))
@@ -97,16 +100,16 @@ def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> It
 
 @dataclass(frozen=True)
 class Border(Table):
-    """Who is where in the frames on both sides of a border: N rows."""
+    """Tracks in the frames on both sides of a border: N rows."""
 
     frame: Annotated[Index, Column("N", np.intp)]
     """(N,) frame of each row."""
     track: Annotated[Index, Column("N", np.intp)]
-    """(N,) whose it is, as one of the chunks has it."""
+    """(N,) track of each row, as numbered in one of the chunks."""
     candidate: Annotated[Index, Column("N J V", np.intp)]
-    """(N, J, V) its detections; -1 for none."""
+    """(N, J, V) detections of the row; -1 for none."""
     place: Annotated[Array, Column("N J 3", unit="m")]
-    """(N, J, 3) where its joints were expected, metres; NaN where nothing was."""
+    """(N, J, 3) predicted joints, metres; NaN where there is no prediction."""
 
     @classmethod
     def of(cls, span: Span) -> "Border":
@@ -116,10 +119,10 @@ class Border(Table):
 
 
 def same_people(before: Border, after: Border) -> dict[int, int]:
-    """For tracks of `after` who they are among those of `before`, as far as they are there.
+    """Match tracks of `after` with those of `before`, one to one, as far as they are the same person.
 
-    By the detections that both chunks gave to them in the frames that both know; people out of sight by where they
-    were expected. One to one.
+    Tracks match by the detections that both chunks assigned to them in the frames that both have; tracks without
+    detections by their predicted joints.
     """
     shared = np.intersect1d(before.frame, after.frame)
     before, after = (each.rows(np.isin(each.frame, shared)) for each in (before, after))
@@ -133,7 +136,9 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
 
 
 def _alike(a: Border, b: Border) -> float:
-    """0 for two people; up to 1 for one out of sight, and up to 2 by how many detections both tracks have."""
+    """Similarity of two tracks: 0 for two people; up to 1 without detections, and up to 2 by the share of
+    common ones.
+    """
     _, first, second = np.intersect1d(a.frame, b.frame, return_indices=True)
     if len(first) == 0:
         return 0.0
@@ -148,25 +153,27 @@ def _alike(a: Border, b: Border) -> float:
 
 
 class Identities:
-    """What the tracks of one chunk after the other are called, so that a person keeps the name."""
+    """Assigns identities to the tracks of consecutive chunks, so that a person keeps the identity."""
 
     def __init__(self, next_id: int, border: Border | None) -> None:
-        """The next new person's identity, and who was where at the end of the chunk before."""
+        """`next_id` is the next free identity, `border` the tracks at the end of the chunk before."""
         self.next_id = next_id
         self.border = border
 
     def names(self, begins: Border, *, alone: bool) -> dict[int, int]:
-        """What tracks of a chunk are called that were there in the one before; `alone`: nothing carries over."""
+        """Identities of those tracks of a chunk that continue one of the chunk before; empty where frames are
+        `alone`.
+        """
         return {} if alone or self.border is None else same_people(self.border, begins)
 
     def name(self, track: int, names: dict[int, int]) -> int:
-        """What a track is called; a track without a name gets the next."""
+        """Identity of a track; a track without one gets the next free one."""
         if track not in names:
             names[track] = self.next_id
             self.next_id += 1
         return names[track]
 
     def remember(self, ends: Border, names: dict[int, int]) -> None:
-        """Who is where at the end of a chunk."""
+        """Store the tracks at the end of a chunk."""
         track = [self.name(each, names) for each in ends.track.tolist()]
         self.border = replace(ends, track=np.array(track, dtype=np.intp))

@@ -1,4 +1,4 @@
-"""The folder of a run that is not finished: room for it, what it was begun from, and what it has done so far."""
+"""The folder of an unfinished run: free space, what the run was begun from, and what it has done so far."""
 
 import hashlib
 import json
@@ -26,19 +26,19 @@ from shapepose_fg.pipeline.runs.parts import Parts
 PARTS = "parts"
 """The folder of an unfinished run, beside its results."""
 _GONE = ".parts-gone"
-"""What that folder is called while it is removed: after a kill on the way it is no half of a run."""
+"""Name of that folder while it is removed: if interrupted, it is not mistaken for an unfinished run."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
 _LOOKED_AT = 200
-"""Frames, spread over the run, by which people are counted."""
+"""Number of frames, spread over the run, from which the number of people is estimated."""
 _WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
-"""What differs, where a key would not say it."""
+"""Names of differences that need other words than their keys."""
 
 
 def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False) -> InFolder:
-    """The folder of a run into `output` that is begun from `begun`, plain values; or goes on, with `resume`.
+    """The folder of a run into `output` that is begun from `begun`, plain values; or resumed, with `resume`.
 
-    With `restart` what a stopped run left is removed. InputError where a stopped run left something and neither is
+    With `restart` the remains of an interrupted run are removed. InputError where there are some and neither is
     given, and where it was begun from something else: the first difference is named. The caller is the only run in
     `output`.
     """
@@ -67,7 +67,7 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
 
 
 def frames_done(output: Path) -> int:
-    """How many frames of the unfinished run in `output` are kept."""
+    """Number of solved frames of the unfinished run in `output`."""
     folder = inside(output, PARTS)
     return Parts(InFolder(folder, _digest(read_json(inside(folder, _MANIFEST))))).notes().frames
 
@@ -78,7 +78,7 @@ def _digest(begun: Any) -> str:
 
 
 def end_run(output: Path) -> None:
-    """Remove what a run kept: its results are written."""
+    """Remove the files of a run whose results are written."""
     gone = inside(output, _GONE)
     shutil.rmtree(gone, ignore_errors=True)
     if (output / PARTS).exists():
@@ -100,9 +100,10 @@ def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
 
 
 def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> int:
-    """What a run needs on the disk at the most: its rows twice, as parts and, compressed or not, as results.
+    """Upper bound of the space that a run needs on the disk: its rows twice, as parts and as results.
 
-    As many people are expected as a view has detections of each joint, in the mean over views, joints and frames.
+    The number of people is estimated by the detections of each joint per view, in the mean over views, joints and
+    frames.
     """
     joints = detections.skeleton.joints
     if len(frames) == 0:
@@ -116,7 +117,7 @@ def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> in
 
 
 def check_room(folder: Path, needed: int) -> None:
-    """InputError where the disk of `folder` has less room than that."""
+    """InputError where the disk of `folder` has less free space."""
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise InputError(
@@ -129,9 +130,9 @@ _KNOWN, _WRITTEN, _ARRAYS = "known-people", "known-people-written", ("betas", "i
 
 
 def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShapes]) -> SubjectShapes:
-    """Who was known when the run began; `load` reads them from `file`, a file of shapes, when it begins.
+    """People known when the run began; `load` reads them from `file`, a file of shapes, when it begins.
 
-    InputError where the file has changed since, but for what this run itself wrote into it.
+    InputError where the file has changed since, unless this run itself wrote it.
     """
     now = hashlib.sha256(read_bytes(file)).hexdigest() if file.exists() else None
     if _KNOWN not in kept.names(_KNOWN):
@@ -158,7 +159,7 @@ def checksum_at_start(kept: KeptArrays) -> str:
 
 
 def write_people(kept: KeptArrays, file: Path, people: SubjectShapes) -> None:
-    """Bring `file` up to date; a run that is stopped right behind it knows its own doing."""
+    """Bring `file` up to date; a run that is interrupted right afterwards recognises its own change."""
     content = BytesIO()
     people.write(content)
     kept.keep(_WRITTEN, {}, hashlib.sha256(content.getvalue()).hexdigest())

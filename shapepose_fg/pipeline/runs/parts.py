@@ -1,4 +1,4 @@
-"""Solved windows, kept one after the other: what a run has done so far, and from where it can go on."""
+"""Solved windows, stored one after the other: what a run has done so far, and where it can be resumed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,24 +23,24 @@ from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
 _STATUS = np.array([*map(str, Status)])
-"""A status is kept as its place in this list."""
+"""Statuses, stored as their index in this list."""
 _CODE = Column("N", np.uint8, codes=Status)
 OBSERVED = "observations."
-"""What the names of observations' columns begin with, among those of a part."""
+"""Prefix of the names of observations' columns among those of a part."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """After a batch of frames was followed."""
+    """State of tracking after a batch of frames."""
 
     frame: int
-    """The first frame that was not."""
+    """The first frame that was not tracked."""
     next_id: int = 0
-    """The identity of the next new person."""
+    """The next free identity."""
     state: StreamState | None = None
-    """What is carried on; None where nothing is: before a cut, at the end of a chunk, frame by frame."""
+    """State of the tracker; None before a cut, at the end of a chunk, and frame by frame."""
     border: Border | None = None
-    """Between chunks: who was where at the end of the last."""
+    """Tracks at the end of the last chunk, between chunks."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,18 @@ class Part:
     """One window, solved."""
 
     rows: Reconstruction
-    """Its rows; a person is a track there, or frame by frame a number within the frame."""
+    """Rows of the window; a person is a track there, or frame by frame a number within the frame."""
     notes: Notes
-    """What is to be said about it."""
+    """Notes about it."""
     checkpoint: Checkpoint | None = None
-    """From where following goes on after it, where that is known."""
+    """State with which tracking continues after it, where that is known."""
 
 
 class Parts:
     """The windows of a run, in order."""
 
     def __init__(self, kept: KeptArrays) -> None:
-        """Those that are in `kept`, up to the last from which the run can go on."""
+        """The stored windows of `kept`, up to the last one from which the run can be resumed."""
         self.kept = kept
         followed = kept.names("followed-")
         self._followed = followed[-1] if followed else None
@@ -73,11 +73,11 @@ class Parts:
 
     @property
     def rows(self) -> int:
-        """How many rows all of them have."""
+        """Number of rows of all windows."""
         return sum(self._counts)
 
     def append(self, part: Part) -> None:
-        """Keep the next window. When this returns, and it has a checkpoint, the run can go on behind it."""
+        """Store the next window. When this returns, and it has a checkpoint, the run can be resumed behind it."""
         n, rows, table = len(self), part.rows, part.rows.observations
         if table is None:
             raise ValueError("the rows of a part need their observations")
@@ -120,11 +120,11 @@ class Parts:
                 done = mine.stop
 
     def drop(self, n: int) -> None:
-        """Forget the rows of a part."""
+        """Remove the rows of a part."""
         self.kept.drop(_name(n))
 
     def notes(self) -> Notes:
-        """What is to be said about all of them."""
+        """Notes about all of them."""
         notes = Notes()
         for n in range(len(self)):
             with naming(self.kept.place(_name(n)), ANEW):
@@ -132,7 +132,7 @@ class Parts:
         return notes
 
     def checkpoint(self, read: Callable[[int], Input], frames: range, nobody: Tracks) -> Checkpoint | None:
-        """From where following goes on; None at the beginning. `read` gives what the cameras saw of a frame.
+        """State with which tracking continues; None at the beginning. `read` returns the input of a frame.
 
         InputError where it is none of a run of these `frames`, whose tracks are as those of `nobody`.
         """
@@ -148,7 +148,7 @@ class Parts:
 
 
 def _are_of(rows: Reconstruction, frames: range, frame_s: Array) -> bool:
-    """Whether rows are of these frames, at their times, and nobody is twice in one."""
+    """Whether rows are of these frames, at their times, and each person at most once per frame."""
     if np.any((rows.frame < frames.start) | (rows.frame >= frames.stop)):
         return False
     each = np.unique(np.stack([rows.frame, rows.person], axis=1), axis=0)
@@ -160,7 +160,7 @@ def _name(n: int) -> str:
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
-    """A checkpoint as arrays. What the cameras gave is not among them: it is read again."""
+    """A checkpoint as arrays. The cameras' input is not among them: it is read again."""
     arrays: dict[str, NDArray[Any]] = {"at": np.array([checkpoint.frame, checkpoint.next_id])}
     if checkpoint.border is not None:
         arrays |= {f"border.{name}": getattr(checkpoint.border, name) for name in Border.ROWS}
@@ -189,16 +189,16 @@ _FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6
 _FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12)}
 _FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
 _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
-"""What `checkpoint_arrays` gives."""
+"""Columns of `checkpoint_arrays`."""
 
 
 def checkpoint_of(
     arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range, nobody: Tracks
 ) -> Checkpoint:
-    """The checkpoint that `checkpoint_arrays` made the `arrays` of.
+    """The checkpoint from the `arrays` that `checkpoint_arrays` returned.
 
-    `read` gives what the cameras saw of a frame; frames before `solved` are in parts, and all of the run are
-    `frames`. ValueError where the arrays are not of such a run.
+    `read` returns the input of a frame; frames before `solved` are in parts, and `frames` are all of the run.
+    ValueError where the arrays are not of such a run.
     """
     following, next_id = arrays["at"].tolist()
     next_track, before = arrays["state.numbers"].tolist() if "state.numbers" in arrays else (0, 0)
@@ -233,7 +233,7 @@ def checkpoint_of(
 
 
 def _check_tracks(track: Index, next_id: int) -> None:
-    """ValueError for people of whom one is there twice, or who were not there yet."""
+    """ValueError for duplicate tracks, and for tracks with numbers that were not given yet."""
     if len(np.unique(track)) < len(track) or np.any(track >= next_id):
         raise ValueError(f"its tracks must be different numbers below {next_id}")
 

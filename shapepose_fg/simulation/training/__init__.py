@@ -1,1 +1,1 @@
-"""What the pose prior and the learned fitter are taught from: motions, who is left out, and how it is done."""
+"""Training of the pose prior and of the learned fitter: motions, splits, and procedure."""

@@ -1,4 +1,4 @@
-"""The learned fitter for another body: the shipped network in that body's words, and trained on it."""
+"""The learned fitter for another body: the shipped network translated to that body's shapes, and trained on it."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -32,7 +32,7 @@ from shapepose_fg.simulation.training.train import (
 
 TRAINED, PLAIN = "trained", "plain optimiser"
 _RIDGE_M = 0.005
-"""What of a shape moves points by less than this says nothing of which shape it is in the other body."""
+"""Movement of points by a shape component, m, below which it is ignored in the other body."""
 _SLOWER = 0.2
 """Learning rate relative to that of training from scratch: this network needs small changes only."""
 _CALIBRATION_PEOPLE = 4096
@@ -47,10 +47,11 @@ def adapted(
     card: Mapping[str, str],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FitterWeights, dict[str, Score]]:
-    """The shipped weights trained on `motions` for `body`; what they and the plain optimiser do on `unseen` ones.
+    """The shipped weights trained on `motions` for `body`; and their scores and the plain optimiser's on `unseen`
+    ones.
 
-    Covariances hold on `unseen`. `card` says what the motions are; `progress` is told how many iterations of how
-    many are done.
+    Covariances are calibrated on `unseen`. `card` describes the motions; `progress` is called with the number of
+    finished iterations and of all.
     """
     shipped, frame = FitterWeights.default(), PersonFrame.of(body, motions.poses, motions.weight)
     rate = _SLOWER * config.learning_rate
@@ -75,10 +76,10 @@ def adapted(
 
 
 def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -> TrainedNetwork:
-    """The network of `weights` for `body`: shapes are those of `trained_on` in other words, all else stays.
+    """The network of `weights` for `body`: shapes are converted from those of `trained_on`, all else stays.
 
     With betas c = M b of the body that it knows, the same person has b = N c: by least squares of all points. So
-    it is told M b and the gradient Nᵀ dE/db, and steps by N times what it says.
+    its input is M b and the gradient Nᵀ dE/db, and its step in b is N times its output.
     """
     network = TrainedNetwork.of(weights.network)
     if fingerprint(body) == weights.body:
@@ -99,5 +100,5 @@ def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -
 
 
 def _solved(by: Array, wanted: Array) -> Tensor:
-    """X (10, 10) with `by` X next to `wanted`."""
+    """X (10, 10) with `by` X closest to `wanted`."""
     return torch.from_numpy(np.linalg.solve(by.T @ by + _RIDGE_M**2 * np.eye(10), by.T @ wanted)).float()

@@ -1,10 +1,10 @@
-"""What a detector and a triangulation make of true joints: the targets that a fitter is trained on.
+"""Corrupts true joints as a detector and triangulation do, for the targets that a fitter is trained on.
 
 Half of the people are seen by a few virtual cameras: each view hides some joints, misses some, and reports the
 others with a confidence and an error drawn from the simulator's tables; the views' rays are triangulated with the
-weights that the pipeline gives them. So depth is worse than width, a joint may be a single ray, and claims are
-sometimes wrong. The rest have plain isotropic noise. Then whole limbs, sides and halves go missing, joints are
-outliers, sides swap.
+weights that the pipeline gives them. So depth is worse than width, a joint may be a single ray, and stated
+covariances are sometimes wrong. The rest have plain isotropic noise. Then whole limbs, sides and halves are
+removed, joints become outliers, and sides are swapped.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _NEAREST = {
     "head": "Nose", "collar": "Neck", "hip": "LHip", "knee": "LKnee", "ankle": "LAnkle", "foot": "LBigToe",
     "shoulder": "LShoulder", "elbow": "LElbow", "wrist": "LWrist", "hand": "LWrist",
 }  # fmt: skip
-"""Points that the detector has no statistics for err as their nearest joint does."""
+"""Nearest joint of the points for which there are no statistics of the detector, whose errors they get."""
 _GROUP = torch.tensor(
     [
         int(JOINT_GROUP[BODY_25.index(name if name in BODY_25.joints else _NEAREST[name.split("_")[-1]])])
@@ -54,30 +54,30 @@ _SWAPPED = torch.stack([_LEG, _SHIN, _ARM, _HAND, _LEG + _ARM])
 _MIRROR = torch.tensor(MIRROR)
 
 _PIPELINE_SIGMA_M = 0.013
-"""The pipeline's claim: this over the confidence (see `observations`)."""
+"""Standard deviation that the pipeline states for a joint, m, divided by the confidence (see `observations`)."""
 
 
 @dataclass(frozen=True)
 class CorruptionConfig:
-    """How often what happens; shares of people unless it says otherwise."""
+    """Probabilities of corruptions; shares of people unless stated otherwise."""
 
     triangulated: float = 0.5
     """Share of people whose targets come from virtual cameras; the others' have isotropic noise."""
     clean: float = 0.3
     """Share without noise among the people with isotropic noise."""
     limb: float = 0.45
-    """One limb is missing; two with this squared."""
+    """One limb is missing; two limbs with the square of this."""
     region: float = 0.08
     """A side, a half or the head is missing."""
     single: float = 0.5
     """Largest share of joints that are missing one by one."""
     complete: float = 0.25
-    """Nothing at all is taken away."""
+    """No joint is removed."""
     outlier: float = 0.012
     """Share of joints that are off by 25 cm (one sigma per axis) though their stated information is that of a
     good joint."""
     swap: float = 0.04
-    """Left and right of a limb change places."""
+    """Left and right of a limb are swapped."""
 
 
 def corrupt(
@@ -119,7 +119,7 @@ class _Draw:
 
 
 def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
-    """(B, K) 0 for what is missing, 1 for the rest."""
+    """(B, K) 0 for missing joints, 1 for the others."""
     B, K = xyz.shape[:2]
     gone = (draw.uniform(B, K) < config.single * draw.uniform(B, 1)).float()
     for _ in range(2):
@@ -186,7 +186,7 @@ def _hidden(xyz: Tensor, direction: Tensor, across: Tensor, draw: _Draw) -> Tens
 
 
 def _reports(state: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tuple[Tensor, Tensor, Tensor]:
-    """What one view makes of joints in `state` (B, K): missed or not, true sigma and claimed sigma, metres."""
+    """Detections of one view for joints in `state` (B, K): missed or not, true sigma and stated sigma, metres."""
     B, K = state.shape
     group = _GROUP.expand(B, K)
     missed = draw.uniform(B, K) < _table(statistics.miss)[group, state]

@@ -1,7 +1,8 @@
-"""What training differentiates, in torch: the update network's layers, its steps, and the points of a body.
+"""The differentiable parts of training, in torch: the update network's layers, its steps, and the points of a
+body.
 
-What the network sees is computed by the fitter's own code (`body/fitting/descent.py`), which has no gradient.
-Fits use NumPy's network (`body/fitting/network.py`); a test holds the two together.
+The network's input is computed by the fitter's own code (`body/fitting/descent.py`), which has no gradient. Fits
+use NumPy's network (`body/fitting/network.py`); a test compares the two.
 """
 
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 
 
 class TrainedNetwork(nn.Module):
-    """An `UpdateNetwork` that learns. Its last layer starts at zero, so an untrained one stands still."""
+    """A trainable `UpdateNetwork`. Its last layer starts at zero, so that an untrained one makes no step."""
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -39,7 +40,7 @@ class TrainedNetwork(nn.Module):
 
     @classmethod
     def of(cls, network: UpdateNetwork) -> "TrainedNetwork":
-        """With the weights of a network of the fitter's."""
+        """A trainable network with the weights of one of the fitter's."""
         found = cls(network.config)
         found.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in network.weights.items()})
         return found
@@ -77,7 +78,7 @@ class DescentTargets:
     xyz: Tensor
     """(B, K, 3) metres, finite."""
     information: Tensor
-    """(B, K, 3, 3) 1/m², the model's error included; zero for a joint never seen."""
+    """(B, K, 3, 3) 1/m², the model's error included; zero for a joint that was not seen."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 Split = Literal["train", "validation", "test"]
 
 SPLITS: tuple[Split, ...] = get_args(Split)
-"""The three parts: learn from the first, choose by the second, report the third."""
+"""The three parts: for training, for choosing settings, and for reporting."""
 
 TEST_SUBJECTS = ("60", "61", "02", "08", "16", "43", "94", "139")
 """CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and jumps, a bar,
@@ -28,7 +28,7 @@ Indian dance, getting up."""
 VALIDATION_SUBJECTS = ("06", "12", "127", "140")
 """CMU subjects on which settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
 UNKNOWN_SUBJECT = "?"
-"""A recording without a subject: used for training, never for what is reported."""
+"""Subject of a recording without one: used for training, never for reports."""
 
 ACKNOWLEDGEMENT = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. "
@@ -38,31 +38,32 @@ MIRROR_JOINTS = tuple(place - BODY_POINTS.index(SMPL_24[0]) for place in MIRROR[
 """(24,) index of each SMPL joint's partner on the other side of the body; its own for joints in the middle."""
 
 SEGMENT_CAP = 300
-"""Frames' worth of weight that one recording may have (10 s)."""
+"""Maximum weight of one recording, frames (10 s)."""
 SUBJECT_CAP = 1500
-"""Frames' worth of weight that one subject may have: 13,000 frames of one climber are one person's habit."""
+"""Maximum weight of one subject, frames: 13,000 frames of one climber are one person's habit."""
 WALK_CAP = 0.25
-"""Share of the weight of a split that all walking together may have. Learning from 0.25 instead of 0.15 gave walks
-of unseen people 1.6 nats a frame and took 0.1 from everything else; without a cap 0.6 more for 0.1 more."""
+"""Maximum share of all walking in the weight of a split. Learning from 0.25 instead of 0.15 gave walks of
+unseen people 1.6 nats a frame and took 0.1 from everything else; without a cap 0.6 more for 0.1 more."""
 TARGET_FPS = 30.0
-"""AMASS recordings are thinned to about this many frames a second: every k-th frame, nothing interpolated."""
+"""Approximate frame rate to which AMASS recordings are thinned, Hz: every k-th frame, nothing interpolated."""
 
 _LEANING_RAD = 0.15
-"""How far people who are drawn lean, one sigma."""
+"""Standard deviation of the lean of drawn people, rad."""
 _WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
 _BODY_COLUMNS = 66
-"""Root and 21 body joints, three columns each: what SMPL, SMPL+H and SMPL-X files agree on."""
+"""Number of columns of root and 21 body joints, which SMPL, SMPL+H and SMPL-X files have in common."""
 _Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])
-"""AMASS has z up, SMPL's own frame y."""
+"""Rotation from AMASS, z up, to SMPL's own frame, y up."""
 _NOT_MOTIONS = ("shape.npz", "_stagei.npz")
-"""Files that AMASS lays beside its motions."""
+"""Suffixes of files beside motions in AMASS."""
 
 
 def split_of(subject: str) -> Split:
-    """Which part a `subject` belongs to.
+    """The part that a `subject` belongs to.
 
     CMU's subjects are known by their numbers, written as CMU writes them ("02", "139"): a copy of the same
-    recordings in another collection keeps its place. Everybody else goes by a stable hash of the name, 8 : 1 : 1.
+    recordings in another collection is in the same part. Others are assigned by a stable hash of the name, 8 : 1 :
+    1.
     """
     if subject in TEST_SUBJECTS:
         return "test"
@@ -86,10 +87,9 @@ class Motions:
     poses: NDArray[np.float32]
     """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
     weight: Array
-    """(N,) how many frames this one counts for, at most 1: recordings, subjects and walking are capped within
-    their split."""
+    """(N,) weight of each frame, at most 1: recordings, subjects and walking are capped within their split."""
     subject: NDArray[np.str_]
-    """(N,) who was recorded."""
+    """(N,) recorded subject."""
 
     def __post_init__(self) -> None:
         N = len(self.poses)
@@ -117,7 +117,7 @@ class Motions:
 
 
 def drawn_motions(count: int, seed: int) -> Motions:
-    """Poses of the pose prior, upright and of any heading: what there is to learn from without recordings."""
+    """Poses of the pose prior, upright and with any heading: training data without recordings."""
     rng = np.random.default_rng(seed)
     root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
@@ -126,7 +126,7 @@ def drawn_motions(count: int, seed: int) -> Motions:
 
 
 _Recording = tuple[str, bool, NDArray[np.float32]]
-"""Who was recorded, whether it is walking, poses (T, 24, 3)."""
+"""Subject, whether it is walking, poses (T, 24, 3)."""
 
 
 def load_motions(path: str | Path) -> Motions:

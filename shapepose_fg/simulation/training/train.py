@@ -1,4 +1,6 @@
-"""Trains the update network: draw people, corrupt their joints, unroll, judge every iterate; then calibrate."""
+"""Trains the update network: draws people, corrupts their joints, unrolls updates, scores every iterate;
+calibrates.
+"""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -31,45 +33,45 @@ from shapepose_fg.simulation.training.differentiable import (
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 
 INSIDE = 0.9
-"""Share of the joints that shall lie inside the ellipsoid of that probability which their prior claims."""
+"""Share of the joints inside the ellipsoid of that probability from the stated prior covariance."""
 _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
-"""The last one that has a point decides."""
+"""Skeletons for calibration; the last one that has a point determines its value."""
 _ENOUGH = 50
-"""Joints without which nothing is said."""
+"""Minimum number of joints for a calibration."""
 
 _ALL = tuple(range(len(BODY_POINTS)))
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How the network is trained."""
+    """Settings of training."""
 
     iterations: int = 18_000
-    """Batches in all."""
+    """Number of batches."""
     batch: int = 256
-    """People in each."""
+    """Number of people per batch."""
     learning_rate: float = 1.5e-3
-    """At its highest, after a twentieth of the iterations; falls to zero by a cosine."""
+    """Largest learning rate, after a twentieth of the iterations; it falls to zero by a cosine."""
     weight_decay: float = 0.02
-    """AdamW's."""
+    """Weight decay of AdamW."""
     averaging: float = 0.999
     """Decay of the exponential moving average of the weights over iterations; the averaged weights are shipped."""
     model_sigma_m: float = 0.02
-    """Added to every target, as the fitter's evidence does."""
+    """Standard deviation added to every target, m, as in the fitter."""
     kernel_scale: float = 6.0
     """Width of the robust kernel of the energy whose gradient the network receives, in standard deviations."""
     shake_rad: float = 0.05
-    """Sigma added to recorded angles: bodies and recordings have play."""
+    """Standard deviation added to recorded angles, rad: bodies and recordings are inexact."""
     exchange: float = 0.15
     """Share of people who get an arm or a leg of another person."""
     skeletons: tuple[float, ...] = (0.55, 0.15, 0.15, 0.15)
     """Shares of BODY_25, COCO_17, HALPE_26, SMPL_24."""
     rotation_m: float = 0.05
-    """What a rotation that is wrong by a radian costs, in metres of a joint."""
+    """Weight of a wrong rotation in the loss, metres of a joint per radian."""
     shape_m: float = 0.01
-    """What a wrong beta costs, the same."""
+    """Weight of a wrong beta in the loss, metres of a joint per standard deviation."""
     corruption: CorruptionConfig = field(default_factory=CorruptionConfig)
-    """How targets are made."""
+    """Settings of the corruption of targets."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Size of the network."""
     seed: int = 0
@@ -119,7 +121,7 @@ class PeopleSource:
 
 
 def _tensor(values: Array) -> Tensor:
-    """In single precision, as training is."""
+    """A tensor in single precision, in which training runs."""
     return torch.from_numpy(values).float()
 
 
@@ -143,7 +145,7 @@ class Trainer:
         self.iteration = 0
 
     def run(self, iterations: int) -> Iterator[list[float]]:
-        """Goes on for some `iterations`; yields the mean joint error in mm of every iterate."""
+        """Run some `iterations`; yields the mean joint error in mm of every iterate."""
         for _ in range(iterations):
             yield self._iterate()
 
@@ -187,7 +189,7 @@ def _learning_rate(config: TrainingConfig, iteration: int) -> float:
 def prepared(
     people: People, frame: PersonFrame, config: TrainingConfig, generator: torch.Generator
 ) -> tuple[DescentTargets, State, State, Tensor]:
-    """Corrupted targets, the start, the true state and true points, all in the person's frame as it is found."""
+    """Corrupted targets, the start, the true state and true points, all in the person's estimated frame."""
     B = len(people.points)
     offered = _OFFERED[torch.multinomial(torch.tensor(config.skeletons), B, True, generator=generator)]
     xyz, information = corrupt(people.points, offered, generator, config.corruption)
@@ -215,7 +217,7 @@ def mean_variance(information: Tensor) -> Tensor:
 
 
 _SEEN_M = 0.2
-"""Joints less sure than this say nothing about where a person stands."""
+"""Standard deviation above which joints are ignored in a person's position, m."""
 _OFFERED = torch.zeros(len(TARGET_SKELETONS), len(BODY_POINTS))
 for _row, _names in enumerate(TARGET_SKELETONS.values()):
     _OFFERED[_row, list(slots(_names))] = 1
@@ -256,7 +258,7 @@ def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) 
 def left_out_squared(
     weights: FitterWeights, source: PeopleSource, places: tuple[int, ...], count: int, generator: torch.Generator
 ) -> dict[int, Array]:
-    """By point: squared Mahalanobis distances of true joints to where the body puts them without their target."""
+    """Squared Mahalanobis distances of true joints to the body's without their target, by point."""
     model = source.model.with_keypoints(tuple(BODY_POINTS[place] for place in places))
     fitter = SmplFitter(model, weights=weights)
     truth, targets = _corrupted(source, places, count, generator)
@@ -279,16 +281,18 @@ def _corrupted(
 
 @dataclass(frozen=True)
 class Score:
-    """How a fitter does."""
+    """Scores of a fitter."""
 
     joints_mm: float
-    """Mean error of all joints, with a target or without."""
+    """Mean error of all joints, with and without a target, mm."""
     ms: float
-    """Processor time of a fit, leave-one-out passes included."""
+    """Processor time of a fit, ms, leave-one-out passes included."""
 
 
 def compared(fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int = 512) -> dict[str, Score]:
-    """Scores of `fitters` of BODY_25's joints on the same people; rows that one does not finish count for none."""
+    """Scores of `fitters` of BODY_25's joints on the same people; rows that one of them does not fit count for
+    none.
+    """
     places = slots(TARGET_SKELETONS["BODY_25"])
     truth, targets = _corrupted(source, places, count, torch.Generator().manual_seed(3))
     error, spent = dict[str, Array](), dict[str, float]()

@@ -1,4 +1,6 @@
-"""Bodies, skeletons, detections and names on a picture as the camera took it: through the lens, at any size."""
+"""Draws bodies, skeletons, detections and labels on pictures as the camera took them: with distortion, at any
+size.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,28 +25,28 @@ Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""
 
 GATED: Colour = (40, 40, 255)
-"""Detections that were not used."""
+"""Colour of detections that were not used."""
 _WHITE: Colour = (255, 255, 255)
 _DARK: Colour = (30, 30, 30)
 _BEND = 8
-"""Pieces in which a bone is drawn, because a lens bends it."""
+"""Number of straight pieces in which a bone is drawn, because a lens bends it."""
 _OPACITY = 0.45
 """Opacity of bodies: what is under them stays visible."""
 _FINE = 8
-"""Bits of a pixel's fraction in OpenCV's drawing."""
+"""Number of fractional bits of a pixel in OpenCV's drawing."""
 _REACH = 0.5
-"""Points farther outside the picture than this share of its size are not placed: no lens was calibrated there, and
-its polynomial may fold them back into the picture."""
+"""Distance outside the picture, as a share of its size, beyond which points are not drawn: no lens was
+calibrated there, and its polynomial may fold them back into the picture."""
 
 
 @dataclass(frozen=True)
 class PictureView:
-    """A camera's pictures, drawn at a size of their own."""
+    """A camera's pictures at the size at which they are drawn."""
 
     camera: Camera
     """The camera, with its lens."""
     placement: Placement
-    """Where calibrated pixels lie in its pictures."""
+    """Place of calibrated pixels in its pictures."""
     size: tuple[int, int]
     """Width and height of what is drawn on, pixels: the picture, enlarged or made smaller."""
 
@@ -75,13 +77,13 @@ class PictureView:
 
 
 def blue_green_red(person: int) -> Colour:
-    """The colour of an identity: the same in all that draws the result."""
+    """The colour of an identity, the same in all visualisations."""
     red, green, blue = (round(255 * part) for part in colour_of(person))
     return blue, green, red
 
 
 def stroke_of(size: tuple[int, int]) -> int:
-    """How wide bones are drawn on a picture of `size`, pixels."""
+    """Width of bones on a picture of `size`, pixels."""
     return max(2, round(max(size) / 320))
 
 
@@ -92,7 +94,7 @@ def draw_bodies(
     faces: Whole,
     colours: Sequence[Colour],
 ) -> Picture:
-    """The surfaces `vertices` (P, Nv, 3), metres, in a colour each, lit from the camera."""
+    """Draw the surfaces `vertices` (P, Nv, 3), metres, in a colour each, lit from the camera."""
     if len(vertices) == 0:
         return picture
     points, corners = joined(vertices, faces)
@@ -119,11 +121,11 @@ class Skeletons:
     seen: Mask
     """(P, J) whether a view saw the joint in this frame; others are inferred."""
     bones: Index
-    """(B, 2) joints that are joined."""
+    """(B, 2) pairs of joints that lines connect."""
     colours: Sequence[Colour]
-    """(P,) one for each person."""
+    """(P,) colour of each person."""
     labels: Sequence[str]
-    """(P,) what is written above each person."""
+    """(P,) label above each person."""
 
     @classmethod
     def of(cls, people: Reconstruction) -> "Skeletons":
@@ -215,12 +217,12 @@ def draw_label(
 
 
 def _fine(xy: Array) -> NDArray[np.int32]:
-    """Pixels as OpenCV's drawing takes them with fractions."""
+    """Pixels with fractions as OpenCV's drawing expects them."""
     return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
 
 
 def write_picture(path: Path, picture: Picture) -> None:
-    """Write a picture; the ending, .png or .jpg, says how."""
+    """Write a picture in the format of its suffix, .png or .jpg."""
     quality = [cv2.IMWRITE_JPEG_QUALITY, 90] if path.suffix == ".jpg" else []
     done, content = cv2.imencode(path.suffix, picture, quality)
     if not done:

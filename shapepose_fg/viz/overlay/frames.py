@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _INK: drawing.Colour = (45, 45, 45)
 _GRID = "grid"
-"""What the file with all cameras is called."""
+"""Name of the file with all cameras."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Overlay:
     people: OpenedReconstruction
     """The result, as it was saved."""
     rig: Rig
-    """Its cameras."""
+    """Cameras of the result."""
     cameras: Sequence[tuple[CameraFootage, Footage]]
     """The pictures of the cameras that are drawn."""
     skeletons: bool = True
@@ -111,7 +111,7 @@ def write_overlay(
 
 @contextmanager
 def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWriter]:
-    """An mp4 video that is put in place when it is complete."""
+    """An mp4 video that is moved to `path` when it is complete."""
     part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV tells the container by the ending
     path.parent.mkdir(parents=True, exist_ok=True)
     part.unlink(missing_ok=True)  # it may be a link
@@ -128,7 +128,7 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWri
 
 
 def _draw_detections(picture: Picture, view: drawing.PictureView, people: Reconstruction) -> None:
-    """Draw what the camera of `view` saw of the people of one frame."""
+    """Draw the detections of the people of one frame in the camera of `view`."""
     table = people.observations
     if table is None or view.camera.name not in table.view_names.tolist():
         return
@@ -141,7 +141,7 @@ def _draw_detections(picture: Picture, view: drawing.PictureView, people: Recons
 
 
 def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int, int]) -> Picture:
-    """The camera's picture of a frame at the size that is drawn; grey where there is none."""
+    """The camera's picture of a frame at the drawn size; grey where there is none."""
     place = int(used.places[frame]) if frame < len(used.places) else -1
     picture = footage.at(place) if place >= 0 else None
     if picture is None:
@@ -154,9 +154,9 @@ def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int,
 
 
 def grid_shape(sizes: Sequence[tuple[int, int]], width: int) -> tuple[int, list[tuple[int, int]]]:
-    """How many columns a grid of pictures has that is nearest to 16:9, and the size of each picture in it.
+    """Number of columns with which a grid of pictures is nearest to 16:9, and the size of each picture in it.
 
-    All have one height, that of a row; sides are even, as videos want them.
+    All have the same height; sides are even, as videos need them.
     """
     widest = max(w / h for w, h in sizes)
 

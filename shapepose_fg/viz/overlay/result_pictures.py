@@ -1,4 +1,4 @@
-"""Where the pictures of a result are, and which of them belongs to which of its frames."""
+"""Finds the pictures of a result, and the picture of each of its frames."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, placements
 from shapepose_fg.io.footage.places import find_footage
 
 _MOST_FRAMES = 10_000_000
-"""No recording is as long: numbers in the names of pictures that are not those of frames."""
+"""Maximum number of frames: larger numbers in the names of pictures are not those of frames."""
 
 
 def pictures_of(
@@ -28,13 +28,13 @@ def pictures_of(
     open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
     tell: Callable[[str], None] = print,
 ) -> list[tuple[CameraFootage, Footage]]:
-    """The pictures of the cameras `drawn`, and which belongs to which frame; InputError where they are missing.
+    """The pictures of the cameras `drawn`, and the one of each frame; InputError where they are missing.
 
-    `run` is what the result's run.json says. They are in `videos`, as `find_footage` takes it, or where `detect`
-    says in the folder `detections`, or beside what the result was made from. `image_placement` is how those of
-    another size than the calibration's came about, as `placements_of` takes it. `moments` are (T,) the frames of
-    each camera's own that the result's frames show, where these differ (`read_moments`). `open_one` opens the
-    pictures of a camera, by its name; `tell` is given what was taken to be what.
+    `run` is the result's run.json. Pictures are in `videos`, as `find_footage` takes it, or where `detect` noted
+    it in the folder `detections`, or beside the inputs of the result. `image_placement` is how pictures of another
+    size than the calibration's were made, as `placements_of` takes it. `moments` are (T,) the frames of each
+    camera's own that the result's frames show, where these differ (`read_moments`). `open_one` opens the pictures
+    of a camera, by its name; `tell` receives notes on inferred files.
     """
     used = {each.name: each for each in _used_footage(run, detections)}
     unknown = [name for name in drawn if name not in used]
@@ -89,7 +89,7 @@ def pictures_of(
 
 
 def _counted(footage: Footage, numbered: bool) -> Index:
-    """(T,) the picture of each frame, -1 where one is missing: that of its number, or counted from the first."""
+    """(T,) the picture of each frame, -1 where one is missing: by its number, or counted from the first."""
     first = 0 if numbered else int(footage.number[0])
     count = int(footage.number[-1]) - first + 1
     if count > _MOST_FRAMES:
@@ -103,7 +103,7 @@ def _counted(footage: Footage, numbered: bool) -> Index:
 
 
 def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:
-    """What `detect` wrote of the pictures, beside the detections that the result was made from."""
+    """The pictures that `detect` noted beside the detections that the result was made from."""
     if detections is not None:
         file = detections / FOOTAGE if detections.is_dir() else detections
         if not file.is_file():

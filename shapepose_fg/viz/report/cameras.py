@@ -1,4 +1,4 @@
-"""The page of cameras that were calibrated or refined: where they stand, stood before, and people over them."""
+"""The page of calibrated or refined cameras: poses now and before, and people over them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ _SCENE_BYTES = 4_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPage:
-    """A self-contained page of cameras, and of people whom they see."""
+    """A self-contained page of cameras, and of the people in their views."""
 
     rig: Rig
     """The cameras."""
@@ -31,21 +31,21 @@ class CameraPage:
     points: Array
     """(P, J, 3) people's joints, metres."""
     frame: Index
-    """(P,) the frame of each."""
+    """(P,) frame of each person."""
     time_s: Array
-    """(T,) when frames were taken."""
+    """(T,) times of the frames, seconds."""
     skeleton: Skeleton
-    """Whose core joints `points` are."""
+    """Skeleton of whose core joints `points` are."""
     heads: Sequence[str]
-    """What the figures are."""
+    """Headings of the figures."""
     rows: Sequence[tuple[str, Sequence[str]]]
-    """Each camera's name and figures."""
+    """Name and figures of each camera."""
     missed_px: Mapping[str, Array]
     """(N, V) distances of joints from where other cameras put them, under a name; NaN where unknown."""
     lines: Sequence[str]
-    """The figures' caption, and what is said above them."""
+    """The figures' caption, and lines above them."""
     remarks: Sequence[str] = ()
-    """What is weak, a sentence each."""
+    """Notes on what is weakly observed, a sentence each."""
 
     def write(self, file: Path) -> None:
         """Write the page."""

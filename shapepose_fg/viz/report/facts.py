@@ -1,4 +1,4 @@
-"""What run.json says of a result, in words; entries that are not what they should be say nothing."""
+"""The entries of run.json in words; invalid entries are left out."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -11,7 +11,7 @@ Run = Mapping[str, Any]
 
 
 def told_by(run: Run) -> dict[str, Any]:
-    """The entries of a run that the page shows, by the names that its template uses."""
+    """The entries of a run that the page shows, by the names in its template."""
     people, time = objects(run.get("people")), objects(run.get("time"))
     problems, spans = people.get("problems"), covered_frames(run) or []
     return {
@@ -49,9 +49,9 @@ def objects(value: object) -> Mapping[str, Any]:
 
 
 def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
-    """Settings that are not the default: dotted name, value, default; a dash where there is none any more.
+    """Settings that differ from the default: dotted name, value, default; a dash where there is none any more.
 
-    Tables of an older program, of which everything was written down, are left out.
+    Tables of older versions, which wrote all settings down, are left out.
     """
     usual = dict(_flat(asdict(PipelineConfig())))
     given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
@@ -63,21 +63,21 @@ def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
 
 
 def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
-    """Why somebody was left out: reason, how many, and in which frames, as far as there is room."""
+    """Reasons for leaving people out: reason, number, and frames, as far as there is room."""
     counts = {reason: number(count) for reason, count in reasons.items()}
     told = [(reason, int(count)) for reason, count in counts.items() if count is not None]
     return [(reason, count, _frames_words(frames.get(reason))) for reason, count in told]
 
 
 def _probabilities(listed: object) -> dict[int, float]:
-    """How probable it is that each person was there, by number; empty frame by frame."""
+    """Probability of each person by number; empty frame by frame."""
     entries = [objects(each) for each in lists(listed)]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
     return {int(who): value for who, value in found.items() if who is not None and value is not None}
 
 
 def _time(seconds: Run) -> str:
-    """How long the stages took, the longest first; empty where that is not said."""
+    """Times of the stages, the longest first; empty where they are missing."""
     spent = {name: value for name, each in seconds.items() if (value := number(each)) is not None}
     longest = sorted((each for each in spent.items() if each[1] >= 0.05), key=lambda each: -each[1])
     listed = ", ".join(f"{name} {value:.1f}" for name, value in longest)
@@ -99,7 +99,7 @@ def _flat(table: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _text(value: object) -> str:
-    """A setting as it is compared and shown: lists and tuples alike, 1 and 1.0 alike."""
+    """A setting for comparison and display: lists equal tuples, and 1 equals 1.0."""
     if isinstance(value, list | tuple):
         return ", ".join(map(_text, value))
     told = number(value)

@@ -1,4 +1,4 @@
-"""The figures of a report: what became of each camera's detections, how joints are known, and the first five."""
+"""The figures of a report: each camera's detections, how joints are known, and the five main figures."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.viz.report.facts import lists, number, objects
 
 _BINS = 60
-"""Points of a line over time: as many as can be told apart in a cell of a table."""
+"""Number of points of a line over time: as many as can be distinguished in a cell of a table."""
 KINDS = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
-"""The ways in which joints are known, the surest first."""
+"""How joints are known, from the most to the least certain."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Residual:
     """Distances of projected joints to their detections, pixels."""
 
     median_px: float | None
-    """Half of them are nearer; None where there are none."""
+    """Median; None where there are none."""
     high_px: float | None
-    """Nine of ten are nearer."""
+    """90th percentile; None where there are none."""
 
     @classmethod
     def of(cls, px: Real) -> "Residual":
@@ -37,24 +37,24 @@ class Residual:
 
 @dataclass(frozen=True)
 class CameraFigures:
-    """What became of one camera's detections."""
+    """Statistics of one camera's detections."""
 
     name: str
-    """Its name."""
+    """Name of the camera."""
     given: int
-    """Detections that were given to people."""
+    """Number of detections that were assigned to people."""
     gates: dict[Gate, int]
-    """How many of them were used, and how many were not for which reason."""
+    """Number of these by gate: used, or the reason why not."""
     all: Residual
     """Residuals of all detections that were assigned to people."""
     used: Residual
     """Residuals of the detections that were used."""
     trend_px: list[float | None]
-    """Median over time of all that were given to people: equal segments of the recording."""
+    """Medians of all assigned detections over time, in equal segments of the recording."""
     offered: float | None = None
-    """Detections in all, given to people or not; None where run.json does not say."""
+    """Number of all detections, assigned or not; None where run.json does not state it."""
     left_out_px: float | None = None
-    """Median distance to where the other cameras alone put the joint; None where run.json does not say."""
+    """Median distance to where the other cameras alone put the joint; None where run.json does not state it."""
     left_out_mm: float | None = None
     """Median of the same distances as lengths at the depth of the joint, mm; None where run.json does not say."""
 
@@ -89,7 +89,7 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
 
 
 def overall(people: Reconstruction) -> dict[str, Any]:
-    """The figures by which a result is judged first, by the template's names; shares 0 to 1, None of nothing."""
+    """The main figures of a result, by the template's names; shares 0 to 1, None where there is nothing."""
     table, known = people.observations, people.known[people.known != Known.UNKNOWN]
     sigma = sigma_m(people.covariance)
     sigma = sigma[np.isfinite(sigma)]
@@ -114,7 +114,9 @@ def overall(people: Reconstruction) -> dict[str, Any]:
 
 
 def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:
-    """How many joints are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the rows."""
+    """Number of joints that are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the
+    rows.
+    """
     kinds = people.known[..., None] == np.array(KINDS)
     if by is None:
         return kinds.sum(axis=0)
@@ -128,7 +130,7 @@ def _share(true: Mask) -> float | None:
 
 
 def _segments(table: ObservationTable) -> Index:
-    """(N,) which segment of the recording each row is in."""
+    """(N,) segment of the recording of each row."""
     if len(table) == 0:
         return np.zeros(0, dtype=np.intp)
     first, last = int(table.frame.min()), int(table.frame.max())

@@ -1,4 +1,4 @@
-"""The page of a report: data/page.html filled in; one text with everything in it."""
+"""The page of a report: data/page.html filled in, as one self-contained text."""
 
 import base64
 import hashlib
@@ -16,15 +16,15 @@ from shapepose_fg.viz.report.figures import KINDS, camera_figures, known_counts,
 from shapepose_fg.viz.report.scene import Scene
 
 _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
-"""In the order in which they are loaded."""
+"""Scripts in the order in which they are loaded."""
 
 
 def page_text(
     title: str, people: Reconstruction, tracks: Sequence[TrackSummary], scene: Scene | None, remarks: Sequence[str]
 ) -> str:
-    """The page of a result as HTML: self-contained, with no address of anything else in it.
+    """The page of a result as HTML: self-contained, without addresses of anything else.
 
-    `tracks` are its identities, `scene` is drawn where there is one, and `remarks` say what the page lacks.
+    `tracks` are its identities, `scene` is drawn where there is one, and `remarks` state what the page lacks.
     """
     by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
     by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
@@ -80,7 +80,7 @@ def _dash(value: float | None, text: str, none: str = "–") -> str:
 
 
 def _share(count: int, total: int) -> str:
-    """A share that is neither 0 nor 1 is not shown as if it were; a dash of nothing."""
+    """A share in words, in which only 0 is shown as 0 and only 1 as 1; a dash where there is nothing."""
     if count in (0, total):
         return "–" if total == 0 else f"{100 * count / total:.0f} %"
     percent = 100 * count / total
@@ -88,7 +88,7 @@ def _share(count: int, total: int) -> str:
 
 
 def _percent(share: float | None) -> str:
-    """A share of 0 to 1 in three digits; one that is under 1 is not shown as if it were all."""
+    """A share of 0 to 1 in three digits, in which only 1 is shown as 100 %."""
     return "–" if share is None else f"{min(100 * share, 99.9) if share < 1 else 100:.3g} %"
 
 

@@ -1,4 +1,4 @@
-"""The 3D scene of a report: people, bodies, cameras and floor as small arrays for the page's own drawing."""
+"""The 3D scene of a report: people, bodies, cameras and floor as small arrays for the page's script."""
 
 import base64
 from dataclasses import dataclass
@@ -16,41 +16,43 @@ from shapepose_fg.io.export.skinned import BONES, motion_of
 from shapepose_fg.io.export.take import Take, z_up
 
 _MISSING = -32768
-"""In place of a coordinate that is not known."""
+"""Value of an unknown coordinate."""
 _FINEST_MM = 1.0
-"""Places are rounded to this, or more coarsely where the room is more than 65 m wide."""
+"""Resolution of positions, mm; coarser where the scene is more than 65 m wide."""
 _OCTAVE, _LEVELS = 8, 63
-"""Sigma is one of 63 levels, eight to each doubling, from 1 mm on: 9 % apart, in six bits."""
+"""Standard deviations have 63 levels, eight per doubling, from 1 mm on: 9 % apart, in six bits."""
 _FLOOR_M = 0.3
-"""The floor is drawn at height 0 where people's feet are within this of it."""
+"""Height of feet within which the floor is drawn at 0, m."""
 CELL_M = 0.05
-"""A body has a vertex per so many metres: 860 of the open body's 12,488, which a page can draw in every frame."""
+"""Size of cells with one vertex of a body each, m: 860 of the open body's 12,488, which a page can draw in
+every frame."""
 _ROW_BYTES = 8 * BONES + 6
-"""A body in a frame: quaternions and the pelvis."""
+"""Size of a body in a frame, bytes: quaternions and the pelvis."""
 _MOST_BONES = 4
-"""Bones that bend a vertex, the strongest."""
+"""Maximum number of bones of a vertex; the strongest are kept."""
 _TURN = 32767
-"""A quaternion's entries are whole numbers of one part in so many."""
+"""Scale of a quaternion's entries, which are stored as integers."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a page draws, and which of a recording's frames that is."""
+    """Data of a page, and the frames of the recording that it has."""
 
     data: dict[str, Any]
-    """What the page's script reads: plain values for JSON."""
+    """The data for the page's script: plain values for JSON."""
     every: int
-    """One frame in so many is there."""
+    """Step between the frames that it has."""
     kept: int
-    """How many that is."""
+    """Number of these frames."""
     frames: int
-    """How many the recording has."""
+    """Number of frames of the recording."""
 
 
 def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
-    """The scene in at most about `most_bytes`, for which every second, third ... frame is taken if need be.
+    """The scene in at most about `most_bytes`, with every second, third ... frame if need be.
 
-    The page's axes are those of the world turned so that z is up. Bodies where `arrays`, the body model, is given.
+    The page's axes are those of the world rotated so that z is up. Bodies where `arrays`, the body model, is
+    given.
     """
     J = len(take.people.joint_names)
     row_bytes = 4 / 3 * (6 * J + J + 2 + (_ROW_BYTES if arrays is not None else 0))
@@ -91,12 +93,12 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
 
 @dataclass(frozen=True)
 class _Packing:
-    """Places as whole numbers of a unit from an origin."""
+    """Positions as integers of a unit from an origin."""
 
     origin: Array
-    """(3,) metres."""
+    """(3,) origin, metres."""
     unit_m: float
-    """Metres."""
+    """Unit, metres."""
 
     def __call__(self, points: Array) -> Array:
         """(..., 3) whole numbers of points (..., 3); missing where a point is not known or too far."""
@@ -106,7 +108,7 @@ class _Packing:
 
 
 def _packing(joints: Array) -> _Packing:
-    """How places are rounded."""
+    """The unit and origin for some joints."""
     placed = joints[np.isfinite(joints).all(axis=-1)]
     if len(placed) == 0:
         return _Packing(np.zeros(3), 1e-3 * _FINEST_MM)
@@ -117,9 +119,10 @@ def _packing(joints: Array) -> _Packing:
 
 
 def _known_and_sigma(known: NDArray[np.uint8], sigma: Array) -> NDArray[np.uint8]:
-    """How a joint is known in the two low bits, its sigma's level in the six above; level 0 is not known.
+    """Codes with how a joint is known in the two low bits, and the level of its sigma in the six above; 0 is
+    unknown.
 
-    A joint that is seen weakly is drawn like one that the body places.
+    A weakly seen joint is drawn like one from the body.
     """
     known = np.where(known == Known.WEAK, Known.BODY, known)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -129,7 +132,7 @@ def _known_and_sigma(known: NDArray[np.uint8], sigma: Array) -> NDArray[np.uint8
 
 
 def _floor(joints: Array) -> float:
-    """Height of the floor, metres: 0 where feet are near it, else where the lowest joints are."""
+    """Height of the floor, metres: 0 where feet are near it, else that of the lowest joints."""
     height = joints[..., 2]
     placed = np.isfinite(height)
     if not placed.any():
@@ -140,7 +143,7 @@ def _floor(joints: Array) -> float:
 
 
 def _view(joints: Array, centres: Array) -> dict[str, Any]:
-    """Where the people are, for the first look: the box around them, and how far they and the cameras reach."""
+    """The initial view: the box around people, and the extent of people and cameras."""
     points = joints.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
@@ -208,5 +211,5 @@ def _bodies(
 
 
 def _base64(values: NDArray[Any], kind: str) -> str:
-    """Numbers as the page's script reads them into a typed array."""
+    """Numbers as the page's script decodes them into a typed array."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")

@@ -1,4 +1,4 @@
-"""A result's report.html, from a result in memory or in its folder."""
+"""Writes a result's report.html, from a result in memory or in its folder."""
 
 from pathlib import Path
 from typing import get_args
@@ -20,11 +20,12 @@ from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
 
 MOST_ROWS = 40_000
-"""Rows that check and report look at, about 400 MB: of longer results every second, third ... frame."""
+"""Maximum number of rows that check and report use, about 400 MB: of longer results every second, third ...
+frame."""
 REPORT = "report.html"
 """The report of a result, beside its people.npz."""
 SCENE_BYTES = 8_000_000
-"""What people and bodies may take: a page of 10 MB opens at once and still fits in a mail."""
+"""Maximum size of people and bodies in a page, bytes: a page of 10 MB opens at once and fits in a mail."""
 
 
 def write_report(
@@ -38,11 +39,10 @@ def write_report(
 ) -> Path:
     """Write report.html of `people` into `folder`, whole or not at all; returns its path.
 
-    `rig` are the cameras; where they are not known the axis that is up, or None for the one along which people
-    stand. `fps` takes the place of the result's times. `body` is the body model's file where it is no longer where
-    run.json says. `people` are those of every frame of the result, or of `every` so many; of longer recordings the
-    scene has every second, third ... frame. Where people cannot be put on one timeline, the page has no scene and
-    says why.
+    `rig` are the cameras; where they are unknown the axis that is up, or None for the one along which people
+    stand. `fps` replaces the result's times. `body` is the body model's file where it has moved since run.json was
+    written. `people` are those of every frame of the result, or of every `every`-th; of longer recordings the
+    scene has every second, third ... frame. Where people have no timeline, the page has no scene and says why.
     """
     arrays, remarks = _body(people, body)
     if every > 1:
@@ -72,7 +72,7 @@ def write_report(
 def report_of(
     results: Path, *, up: Axis | None = None, fps: float | None = None, body: Path | None = None
 ) -> Path:
-    """Write report.html of the saved result at `results` anew; InputError where it cannot be read."""
+    """Write report.html of the saved result at `results` again; InputError where it cannot be read."""
     folder = results_folder(results)
     with Reconstruction.open(results) as opened:
         people, every = opened.thinned(MOST_ROWS)
@@ -89,7 +89,7 @@ def th(number: int) -> str:
 
 
 def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None, list[str]]:
-    """The body model of a result; None, and a remark, where its file is not there any more."""
+    """The body model of a result; None, and a remark, where its file is missing."""
     try:
         return body_of(people.run, given), []
     except InputError as error:
@@ -99,7 +99,7 @@ def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None
 
 
 def _timed(people: Reconstruction) -> bool:
-    """Whether a result says when its frames were taken: by two times, or by a time and the rate."""
+    """Whether a result has times of its frames: two times, or a time and the rate."""
     times = np.unique(people.time_s[np.isfinite(people.time_s)])
     rate = people.run.get("time", {}).get("fps")
     return len(times) > 1 or (len(times) == 1 and rate is not None and rate > 0)

@@ -129,7 +129,7 @@ def test_pictures_whose_numbers_are_no_frames_are_refused(filmed):
     ("words", "message"),
     [
         (["--videos", "cam0=gone.mp4"], "gone.mp4: there is no such file"),
-        (["--images", "cam9=x"], "the calibration has no camera 'cam9'"),
+        (["--images", "cam9=x"], "there is no camera 'cam9'"),
     ],
 )
 def test_pictures_that_are_not_there_are_one_sentence(saved, capsys, words, message):

@@ -1,0 +1,48 @@
+"""Dataclasses of arrays of one length: some of their rows, rows written over others, several joined."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any, Self, cast
+
+import numpy as np
+
+
+class Rows:
+    """Base of dataclasses of arrays of one length, or of `Rows` again; any other field is about all rows."""
+
+    def _columns(self) -> dict[str, Any]:
+        columns = ((each.name, getattr(self, each.name)) for each in fields(cast(Any, self)))
+        return {name: value for name, value in columns if isinstance(value, np.ndarray | Rows)}
+
+    def __len__(self) -> int:
+        return len(next(iter(self._columns().values())))
+
+    def rows(self, index: Any) -> Self:
+        """The rows `index`: places (R,), a mask (N,) or a slice."""
+        chosen = {
+            name: value.rows(index) if isinstance(value, Rows) else value[index]
+            for name, value in self._columns().items()
+        }
+        return replace(cast(Any, self), **chosen)
+
+    def put(self, index: Any, other: Self) -> None:
+        """Write the rows of `other` over the rows `index` (R,)."""
+        for name, values in self._columns().items():
+            values[index] = getattr(other, name)
+
+    def with_rows(self, index: Any, other: Self) -> Self:
+        """Return a copy whose rows `index` (R,) are those of `other`."""
+        changed = replace(cast(Any, self), **{name: value.copy() for name, value in self._columns().items()})
+        changed.put(index, other)
+        return changed
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """The rows of one or more parts, one after the other; what is for all rows is the first part's."""
+        joined = {
+            name: type(value).concatenate([getattr(part, name) for part in parts])
+            if isinstance(value, Rows)
+            else np.concatenate([getattr(part, name) for part in parts])
+            for name, value in parts[0]._columns().items()
+        }
+        return replace(cast(Any, parts[0]), **joined)
