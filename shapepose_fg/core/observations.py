@@ -52,7 +52,7 @@ class Observations(Table):
     def of(cls, candidate: Index, detections: Detections, initial: Array, **others: Any) -> "Observations":
         """The detections `candidate` (N, J, V) of one frame, -1 for none, as observations; with other columns."""
         seen = candidate >= 0
-        xy, (confidence, mirrored) = np.zeros((*seen.shape, 2)), np.zeros((2, *seen.shape))
+        xy, confidence, mirrored = np.zeros((*seen.shape, 2)), np.zeros(seen.shape), np.zeros(seen.shape)
         xy[seen], confidence[seen] = detections.xy[candidate[seen]], detections.confidence[candidate[seen]]
         mirrored[seen] = detections.mirrored[candidate[seen]]
         return cls(xy, confidence, initial, candidate=candidate, mirrored=mirrored, **others)

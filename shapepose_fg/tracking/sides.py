@@ -31,6 +31,9 @@ _FITS = 3.0
 """Mean squared distance in variances up to which a 2D person is that of a predicted one."""
 _EXCHANGED = 0.02
 """Probability that a view has a person's sides, or a part's, exchanged: on Shelf 22 of 1,573 times."""
+_SURE = 6.0
+"""Log odds against sides as they are from which on they are exchanged. At 0 the mean error of three crowds before
+three cameras is 54 mm, with 6 it is 43, without any exchange 40."""
 _AGREES = 0.99
 """Least probability with which another view must have a part's sides as predicted, where they are exchanged."""
 _CHANGES_HZ = 0.05
@@ -88,7 +91,8 @@ class _Compared:
         states = exchanges(skeleton)
         right = np.exp(self.log) @ ~states > _AGREES
         same = (self.who[:, None] == self.who) & (self.who >= 0)
-        found = states[self.log.argmax(axis=1)]
+        sure = self.log.max(axis=1) > self.log[:, 0] + _SURE
+        found = states[np.where(sure, self.log.argmax(axis=1), 0)]
         return found & ((same @ right) | ~(same @ ~found) & (same.sum(axis=1, keepdims=True) > 1))
 
     def of_person(self, number: int) -> Array:

@@ -106,7 +106,7 @@ class JointTargets(Rows):
     @classmethod
     def solved(cls, joints: Array, covariance: Array) -> "JointTargets":
         """Targets at `joints` (B, J, 3), metres, known to `covariance` (B, J, 3, 3); none where either is NaN."""
-        known = np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
+        known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
         information = np.zeros(covariance.shape)
         information[known] = np.linalg.inv(covariance[known])
         return cls(np.where(known[..., None], joints, 0.0), (information + information.mT) / 2)
