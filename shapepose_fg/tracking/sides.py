@@ -33,11 +33,10 @@ _EXCHANGED = 0.02
 """Probability that a view has a person's sides, or a part's, exchanged: on Shelf 22 of 1,573 times."""
 _SURE = 6.0
 """Log odds against sides as they are from which on they are exchanged. At 0 the mean error of three crowds before
-three cameras is 54 mm, with 6 it is 43, without any exchange 40."""
+three cameras is 54 mm, with 6 it is 43, without any exchange 40. A memory of what a view had exchanged makes it
+worse."""
 _AGREES = 0.99
 """Least probability with which another view must have a part's sides as predicted, where they are exchanged."""
-_CHANGES_HZ = 0.05
-"""How often that changes, a second."""
 _LOST = 0.001
 """Probability that a followed person's sides, or a part's, are exchanged from one comparison to the next."""
 _LOOK_S = 0.3
@@ -57,9 +56,7 @@ class _Compared:
     than the predicted person."""
 
     @classmethod
-    def of(
-        cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton, memory: "_Memory"
-    ) -> "_Compared":
+    def of(cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton) -> "_Compared":
         """2D people of a frame and the people `ids` (A,) whose `joints` (A) are predicted there."""
         found, rig, mirror, part = given.detections, given.rig, np.array(skeleton.mirror), paired_parts(skeleton)
         states = exchanges(skeleton)
@@ -81,9 +78,8 @@ class _Compared:
             best = int(apart_of.argmin())
             if apart_of[best] < _FITS:
                 who[number] = ids[best]
-                log[number] = memory.with_more(
-                    (int(ids[best]), view), float(given.time_s.mean()), states @ (same - turned)[best, 1:] / 2
-                )
+                log[number] = _prior(len(states)) + states @ (same - turned)[best, 1:] / 2
+                log[number] -= np.logaddexp.reduce(log[number])
         return cls(groups, who, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
@@ -125,26 +121,6 @@ class _Compared:
         return replace(given, detections=held)
 
 
-class _Memory(dict[tuple[int, int], tuple[float, Array]]):
-    """When a view saw a person last, seconds, and log probabilities (S,) of what it had exchanged."""
-
-    def with_more(self, of: tuple[int, int], time_s: float, likelihood: Array) -> Array:
-        """(S,) log probabilities after a frame with this log-likelihood (S,), which is kept."""
-        prior = _prior(len(likelihood))
-        if of in self:
-            last_s, before = self[of]
-            change = min(_CHANGES_HZ * abs(time_s - last_s), 1.0)
-            prior = (
-                np.logaddexp(np.log1p(-change) + before, np.log(max(change, 1e-9)) + prior)
-                if change < 1
-                else prior
-            )
-        log = prior + likelihood
-        log -= np.logaddexp.reduce(log)
-        self[of] = time_s, log
-        return log
-
-
 @dataclass(frozen=True)
 class _Look:
     """Where a person was when some view had sides exchanged."""
@@ -162,10 +138,10 @@ class _Look:
 def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Input]:
     """The frames with people's sides held over time, beginning with the people of the frame before."""
     tracks, sought_s, count = replace(carried, ids=np.arange(len(carried))), -np.inf, len(carried)
-    compared, looks, memory = list[_Compared](), dict[int, list[_Look]](), _Memory()
+    compared, looks = list[_Compared](), dict[int, list[_Look]]()
     for n, each in enumerate(frames):
         time_s, skeleton = float(each.time_s.mean()), tracker.skeleton
-        seen = _Compared.of(each, tracks.ids, tracker.ahead(tracks, time_s), skeleton, memory)
+        seen = _Compared.of(each, tracks.ids, tracker.ahead(tracks, time_s), skeleton)
         frame = seen.corrected(each, {}, skeleton)
         candidate = np.zeros((0, len(skeleton), len(frame.rig)), dtype=np.intp)
         if len(tracks) > 0:
@@ -179,7 +155,7 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
                 new = count + np.arange(len(places))
                 others = tracker.at(places, new, 0 * new, time_s)
                 tracks, count = Tracks.concatenate([replace(tracks, time_s=time_s), others]), count + len(new)
-                seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton, memory)
+                seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton)
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):
             views, before = seen.of_person(number), looks.get(number, [])
@@ -202,7 +178,7 @@ def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool =
     `followed` says whether people had their sides right most probably before this frame.
     """
     joints, skeleton = tracker.ahead(tracks, float(given.time_s.mean())), tracker.skeleton
-    seen, own = _Compared.of(given, tracks.ids, joints, skeleton, _Memory()), dict[int, tuple[Mask, Array]]()
+    seen, own = _Compared.of(given, tracks.ids, joints, skeleton), dict[int, tuple[Mask, Array]]()
     mean, covariance = tracks.joints.mean.copy(), tracks.joints.covariance.copy()
     for row, number in enumerate(tracks.ids.tolist()):
         views = seen.of_person(number)
