@@ -1,9 +1,10 @@
 """Left and right of a person: a detector exchanges them for a while in some views, or arms, legs or face alone.
 
-Nobody turns inside out between two frames, so 2D people whose sides are not as a followed person has them are
-exchanged back, whatever most views say. Whether the person has them right is inferred from the body: with arms,
-legs or face exchanged no body fits, and with the whole person exchanged knees, feet and nose point backwards.
-Detections keep the probability that they are of the other side (`Detections.mirrored`).
+Nobody turns inside out between two frames. A 2D person whose sides are surely not those of the tracked person
+is corrected if another view has the sides as predicted, or if all views have them exchanged. Whether the person
+has them right is inferred from the body: with arms, legs or face exchanged no body fits, and with the whole person
+exchanged knees, feet and nose point backwards. Detections keep the probability that they are of the other side
+(`Detections.mirrored`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -235,7 +236,8 @@ def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array
 def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
     """Whether the sides of most joints are uncertain, by the probability (K,) that a part's are wrong.
 
-    The person may be a mixture of views, or people, that contradict each other, and is left as it is.
+    Joints in the middle count with the last part: with a count of none a crowd before three cameras is worse. The
+    person may be a mixture of views, or people, that contradict each other, and is left as it is.
     """
     return bool(np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED)
 

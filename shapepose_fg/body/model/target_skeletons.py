@@ -1,5 +1,6 @@
 """Which points of a body a detector's joints are: one list of all, and the skeletons as parts of it."""
 
+from shapepose_fg.core.joint_names import mirrored
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
 
 HEAD_TOP = "Head"
@@ -16,17 +17,7 @@ TARGET_SKELETONS: dict[str, tuple[str, ...]] = {
 }
 """Names of the joints of each skeleton, in its own order, as `BODY_POINTS` calls them."""
 
-
-def _mirrored(name: str) -> str:
-    """Return the corresponding point on the other side of the body."""
-    if name in SMPL_24:
-        side, _, part = name.partition("_")
-        swap = {"left": "right", "right": "left"}
-        return f"{swap[side]}_{part}" if side in swap else name
-    return BODY_25.joints[BODY_25.mirror[BODY_25.index(name)]] if name in BODY_25.joints else name
-
-
-MIRROR: tuple[int, ...] = tuple(BODY_POINTS.index(_mirrored(name)) for name in BODY_POINTS)
+MIRROR: tuple[int, ...] = tuple(BODY_POINTS.index(mirrored(name)) for name in BODY_POINTS)
 """(K,) index of the corresponding point on the other side of the body; of itself for points in the middle."""
 
 
