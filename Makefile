@@ -10,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # One thread each, too. A file's tests share what they have made: one process runs them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-all lint check format benchmark clean
+.PHONY: demo test test-all lint check format benchmark install clean
 .DEFAULT_GOAL := demo
 
 ## Reconstruct the built-in scene: prints a table against the truth, leaves a picture in demo/.
@@ -41,22 +41,28 @@ benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
 
 # Of what is installed, what is imported is compiled then, a quarter of it.
-FETCH := install -qq --disable-pip-version-check --no-compile $(PIP_ARGS)
-INSTALL := $(BIN)/python -m pip $(FETCH) -c constraints.txt
+PIP := install -q --disable-pip-version-check --no-compile $(PIP_ARGS)
+UV := $(BIN)/uv pip install -q --python $(BIN)/python $(PIP_ARGS)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv --without-pip $(VENV)
-	# The newest pip: older ones take twice as long to find out what to install.
-	$(PYTHON) -m pip --python $(BIN)/python $(FETCH) pip || $(BIN)/python -m ensurepip
-	$(INSTALL) -e ".[dev]"
+	# uv needs a quarter of pip's time. It does not know pip's settings: where they are needed, pip installs.
+	$(PYTHON) -m pip --python $(BIN)/python $(PIP) uv && $(UV) -c constraints.txt -e ".[dev]" || \
+		$(MAKE) --no-print-directory EXTRA=dev install
 	# Done at the first start otherwise, or at every one where nothing can be written.
 	$(BIN)/python -m compileall -q -j $(JOBS) shapepose_fg factors
 	-$(BIN)/shapepose-fg compile
 	touch $@
 
+# By pip: PyTorch comes from where its settings say, as a small build for processors.
 $(VENV)/installed-all: $(VENV)/installed
-	$(INSTALL) -e ".[ci]"
+	$(MAKE) --no-print-directory EXTRA=ci install
 	touch $@
+
+# The newest pip: older ones take twice as long to find out what to install.
+install:
+	$(PYTHON) -m pip --python $(BIN)/python $(PIP) pip || $(BIN)/python -m ensurepip
+	$(BIN)/python -m pip $(PIP) -c constraints.txt -e ".[$(EXTRA)]"
 
 clean:
 	rm -rf $(VENV) demo build *.egg-info .pytest_cache .ruff_cache

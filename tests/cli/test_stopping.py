@@ -1,0 +1,53 @@
+"""Requests to end: they are obeyed wherever the program is at that moment."""
+
+import signal
+import sys
+import time
+
+import pytest
+
+from shapepose_fg.cli.stopping import Stopped, stoppable
+
+
+class SignalsAsItGoes:
+    """An object in whose finaliser the signal arrives."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+class Breaks:
+    """An object whose finaliser is wrong."""
+
+    def __del__(self) -> None:
+        raise ValueError("of a finaliser")
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_signal_in_a_finaliser_is_obeyed(times, capsys):
+    with pytest.raises(Stopped) as stopped, stoppable():
+        for _ in range(times):
+            SignalsAsItGoes()
+        time.sleep(10)
+        pytest.fail("the signal was lost")
+    assert stopped.value.exit_code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "", "nothing is printed of it"
+
+
+def test_a_second_signal_does_not_disturb_the_clean_up():
+    cleaned = False
+    with pytest.raises(Stopped), stoppable():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+            cleaned = True
+    assert cleaned
+
+
+def test_other_errors_of_finalisers_are_reported_as_before(monkeypatch):
+    reported = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: reported.append(unraisable.exc_type))
+    with stoppable():
+        Breaks()
+    assert reported == [ValueError]
