@@ -13,7 +13,7 @@ from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.core.storage.npz import read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
-from shapepose_fg.io.detections.csv_people import body_parts, people_in
+from shapepose_fg.io.detections.csv_people import body_parts, taken
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 
 _FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF5", "DeepLabCut's HDF5"
@@ -89,12 +89,10 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
 
     def blocks() -> Iterator[PeopleBlock]:
         for start in range(0, shape[1], BLOCK_FRAMES):
-            part = np.array(own[start : start + BLOCK_FRAMES, :body], dtype=np.float64)
-            seen = np.asarray(np.isfinite(part[..., :2]).all(axis=2))
-            score = np.nan_to_num(part[..., 2]) if scored else np.ones(seen.shape)
-            points = np.concatenate([np.nan_to_num(part[..., :2]), np.where(seen, score, 0.0)[..., None]], axis=2)
-            frame = np.flatnonzero(seen.any(axis=1))
-            yield PeopleBlock(frame + start, points[frame])
+            part = np.array(own[start : start + BLOCK_FRAMES, None, :body], dtype=np.float64)
+            score = part[..., 2:] if scored else np.ones((*part.shape[:3], 1))
+            points = np.concatenate([part[..., :2], score], axis=3)
+            yield PeopleBlock.dense(np.arange(start, start + len(part)), points)
 
     joints = "mediapipe" if body == _BLAZEPOSE else None
     return CameraPeople(path, _FREEMOCAP, blocks(), 0, shape[1] - 1, rerun=_RERUN, joints=joints)
@@ -160,10 +158,10 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
         raise InputError(
             f"{path}: has {len(rows)} frames, and its columns are not those it names; export it again"
         )
-    row, people = people_in(values.astype(np.float64), picked)
-    first, last = int(frame[0]), int(frame[-1])
-    blocks = iter([PeopleBlock(frame[row].astype(np.intp), people)] if len(row) > 0 else [])
-    return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+    block = PeopleBlock.dense(frame.astype(np.intp), taken(values.astype(np.float64), picked))
+    return CameraPeople(
+        path, _DEEPLABCUT, iter([block]), int(frame[0]), int(frame[-1]), rerun=_RERUN, joints=joints
+    )
 
 
 def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
@@ -212,17 +210,10 @@ def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
         raise InputError(
             f"{path}: tracks are {xy.shape}, and there are {len(joints)} node_names; export it again with SLEAP"
         )
-    seen = np.asarray(np.isfinite(xy).all(axis=3))
-    score = np.where(seen, np.where(np.isfinite(score), score, 1.0), 0.0)
-    points = np.concatenate([np.where(seen[..., None], xy, 0.0), score[..., None]], axis=3)
-
-    def blocks() -> Iterator[PeopleBlock]:
-        for start in range(0, len(points), BLOCK_FRAMES):
-            part = slice(start, start + BLOCK_FRAMES)
-            frame, track = np.nonzero(seen[part].any(axis=2))
-            yield PeopleBlock(frame + start, points[part][frame, track])
-
-    return CameraPeople(path, _SLEAP, blocks(), 0, len(points) - 1, rerun=_RERUN, joints=joints)
+    points = np.concatenate([xy, np.where(np.isfinite(score), score, 1.0)[..., None]], axis=3)
+    parts = (slice(start, start + BLOCK_FRAMES) for start in range(0, len(points), BLOCK_FRAMES))
+    blocks = (PeopleBlock.dense(np.arange(len(points))[part], points[part]) for part in parts)
+    return CameraPeople(path, _SLEAP, blocks, 0, len(points) - 1, rerun=_RERUN, joints=joints)
 
 
 def _dataset(h5py: Any, file: Any, name: str) -> Any:

@@ -58,7 +58,7 @@ def read_deeplabcut(path: Path) -> CameraPeople:
     joints, picked = body_parts(path, zip(whose, heads["bodyparts"], heads["coords"], strict=False))
     width = count + 1
 
-    frames, found, first, last = list[Index](), list[Array](), 0, -1
+    blocks, first, last = list[PeopleBlock](), 0, -1
     while len(some := list(islice(rows, _LINES))) > 0:
         numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[:, 0]
         if (np.diff(numbers, prepend=last) <= 0).any():
@@ -66,13 +66,10 @@ def read_deeplabcut(path: Path) -> CameraPeople:
             raise InputError(f"{path}: line {line}: frames must rise; {_RERUN}")
         first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
         values = np.array([_numbers(path, line, row, width) for line, row in some])
-        row, people = people_in(values, picked)
-        frames.append(numbers[row])
-        found.append(people)
+        blocks.append(PeopleBlock.dense(numbers, taken(values, picked)))
     if last < 0:
         raise InputError(f"{path}: no frames under the heads; {_RERUN}")
-    blocks = (PeopleBlock(*each) for each in zip(frames, found, strict=True) if len(each[0]) > 0)
-    return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+    return CameraPeople(path, _DEEPLABCUT, iter(blocks), first, last, rerun=_RERUN, joints=joints)
 
 
 def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tuple[str, ...], Index]:
@@ -95,12 +92,9 @@ def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tup
     return joints, np.array(picked)
 
 
-def people_in(values: Array, columns: Index) -> tuple[Index, Array]:
-    """The row of each person who is seen in a table `values` (T, C), and keypoints (N, J, 3), by `body_parts`."""
-    taken = np.where(columns > 0, values[:, columns], 1.0)  # no likelihood: as sure as any
-    seen = np.asarray(np.isfinite(taken).all(axis=3))
-    row, person = np.nonzero(seen.any(axis=2))
-    return row, np.where(seen[..., None], taken, 0.0)[row, person]
+def taken(values: Array, columns: Index) -> Array:
+    """(T, P, J, 3) keypoints of each person in a table `values` (T, C), by the `columns` of `body_parts`."""
+    return np.where(columns > 0, values[:, columns], 1.0)  # no likelihood: as sure as any
 
 
 def cameras_of_caliscope(path: Path) -> list[str]:
