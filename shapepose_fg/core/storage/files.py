@@ -62,16 +62,20 @@ def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> No
         _check_size(path, status.st_size, most)
 
 
+def is_inside(folder: Path, name: str | Path) -> bool:
+    """Whether `folder / name` lies in the folder, links followed; False where no file can have that name."""
+    try:
+        return (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # links that lead to each other, a zero byte
+        return False
+
+
 def inside(folder: Path, name: str) -> Path:
     """`folder / name`; InputError where a link there leads out of the folder, so that nothing is written there."""
-    place = folder / name
-    try:
-        stays = place.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # links that lead to each other
-        stays = False
-    if not stays:
-        raise InputError(f"{place}: this is a link that leads out of its folder; remove it, or give that folder")
-    return place
+    if not is_inside(folder, name):
+        cure = "remove it, or give that folder"
+        raise InputError(f"{folder / name}: this is a link that leads out of its folder; {cure}")
+    return folder / name
 
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
