@@ -277,7 +277,6 @@ COCO_18 = _layout("COCO_18", f"Nose Neck {_ARMS} {_LEGS} REye LEye REar LEar")
 """OpenPose's COCO model; mid-hip is made."""
 HALPE_26 = _layout("HALPE_26", _HALPE)
 """HALPE's body with feet, AlphaPose's and RTMPose's."""
-HALPE_136 = _layout("HALPE_136", _HALPE, passed_over=110)
 """HALPE's whole body; face and hands are passed over."""
 COCO_133 = _layout("COCO_133", f"{_COCO} {_FEET}", passed_over=110)
 """COCO-WholeBody; neck and mid-hip are made, face and hands are passed over."""
@@ -292,7 +291,7 @@ SKELETONS = {
         COCO_18,
         HALPE_26,
         COCO_133,
-        HALPE_136,
+        _layout("HALPE_136", _HALPE, passed_over=110),
         BODY_25B,
         _layout("BODY_135", f"{_COCO} head Head {_FEET}", passed_over=110),
         _layout("COCO_23", f"{_COCO} {_FEET}"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.core.storage.files import open_regular, text_pieces
 from shapepose_fg.io.camera_names import MOST_FRAME, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
@@ -17,8 +18,8 @@ from shapepose_fg.io.validation import is_number
 _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
 _MOST_COLUMNS = 10_000
-_BLAZEPOSE = 33
-"""Caliscope's number of MediaPipe's points of the body; those of hands and face have other numbers."""
+BLAZEPOSE = SKELETONS["BLAZEPOSE_33"].keypoint_count
+"""Number of MediaPipe's points of the body; those of hands and face come after them."""
 _LINES = 4096
 """Number of lines that are processed together."""
 
@@ -111,9 +112,9 @@ def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeo
     table = _points(path)
     ports = np.unique(table[:, 1].astype(np.intp)).tolist()
     own = table[table[:, 1] == _port(path, camera, cameras, ports)]
-    own = own[own[:, 2] < _BLAZEPOSE]
+    own = own[own[:, 2] < BLAZEPOSE]
     frame, place = np.unique(own[:, 0].astype(np.intp), return_inverse=True)
-    keypoints = np.zeros((len(frame), _BLAZEPOSE, 3))
+    keypoints = np.zeros((len(frame), BLAZEPOSE, 3))
     keypoints[place, own[:, 2].astype(np.intp)] = np.column_stack([own[:, 3:], np.ones(len(own))])
     first, last = int(table[:, 0].min()), int(table[:, 0].max())
     blocks = iter([PeopleBlock(frame, keypoints)])
@@ -140,7 +141,7 @@ def _points(path: Path) -> Array:
             raise InputError(f"{path}: line {line} must hold whole numbers and pixels; export it again")
         parts.append(values)
     table = np.concatenate(parts) if parts else np.zeros((0, 5))
-    if table[:, 2].max(initial=0) > _BLAZEPOSE and not (table[:, 2] == 0).any():
+    if table[:, 2].max(initial=0) > BLAZEPOSE and not (table[:, 2] == 0).any():
         table = table[:0]
     if len(table) == 0:
         raise InputError(f"{path}: no points of a person's body; track with Caliscope's POSE or HOLISTIC")

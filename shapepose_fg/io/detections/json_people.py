@@ -19,7 +19,7 @@ from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
+from shapepose_fg.core.storage.files import BIG, LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
 from shapepose_fg.io.camera_names import MOST_FRAME, in_order
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock, check_one_model, frame_blocks
@@ -407,7 +407,7 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
 
 def _by_picture(path: Path) -> CameraPeople | None:
     """AlphaPose's file of --format open and cmu, people by the name of their picture; None where it is another."""
-    content = read_json(path, most=2**28)
+    content = read_json(path, most=BIG)
     kinds = {key for each in content.values() for key in (each if isinstance(each, dict) else ())}
     if len(content) == 0 or not kinds & {"people", "bodies"}:
         return None
