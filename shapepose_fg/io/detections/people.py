@@ -46,7 +46,7 @@ class PeopleBlock:
     @classmethod
     def dense(cls, frame: Index, points: Array) -> "PeopleBlock":
         """Block of `points` (F, P, K, 3) of P people in the frames `frame` (F,), rising; NaN is not seen."""
-        seen = np.isfinite(points).all(axis=3)
+        seen = np.asarray(np.isfinite(points).all(axis=3))
         row, person = np.nonzero(seen.any(axis=2))
         return cls(frame[row], np.where(seen[..., None], points, 0.0)[row, person])
 

@@ -42,8 +42,8 @@ def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
         lines = enumerate(read_text(file, may_be_empty=True, most=MIDDLE).splitlines(), start=1)
         return [_person(file, line, text.split(), image_size) for line, text in lines if text.strip()]
 
-    blocks, how = frame_blocks(folder, _YOLO, numbered, read), {"every_frame": False, "lists_people": True}
-    return CameraPeople(folder, _YOLO, blocks, numbered[0][0], numbered[-1][0], **how, rerun=_RERUN)
+    blocks, ends = frame_blocks(folder, _YOLO, numbered, read), (numbered[0][0], numbered[-1][0])
+    return CameraPeople(folder, _YOLO, blocks, *ends, every_frame=False, lists_people=True, rerun=_RERUN)
 
 
 def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]) -> list[float]:
