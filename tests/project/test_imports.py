@@ -58,7 +58,7 @@ LEVELS = (
     "live.outputs viz.report",
     "evaluation",
     "cli.options",
-    "cli.pictures cli.found_cameras",
+    "cli.pictures cli.found_cameras cli.setup_table",
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
