@@ -10,7 +10,7 @@ import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
 from shapepose_fg.core.arrays import Array, Index, Real
-from shapepose_fg.core.decompositions import is_rotation, nearest_rotation
+from shapepose_fg.core.decompositions import is_rotation, nearest_rotation, rigid
 from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
 from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
 
@@ -102,10 +102,8 @@ class Camera:
         R = np.asarray(cTw[:3, :3])
         if not (np.isfinite(cTw).all() and is_rotation(R)):
             raise ValueError(f"camera {name}: the rotation must be orthonormal with determinant 1, and finite")
-        wTc = np.eye(4)
-        wTc[:3, :3] = nearest_rotation(R).T
-        wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
-        coefficients = padded_distortion(distortion, lens)
+        R, coefficients = nearest_rotation(R).T, padded_distortion(distortion, lens)
+        wTc = rigid(R, -R @ cTw[:3, 3])
         return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
 
     @cached_property

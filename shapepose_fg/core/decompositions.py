@@ -21,6 +21,13 @@ def is_rotation(R: Array) -> bool:
     return bool(np.abs(R @ R.mT - np.eye(3)).max() <= ROTATION_TOLERANCE and (np.linalg.det(R) >= 0).all())
 
 
+def rigid(R: Array, t: Array) -> Array:
+    """(..., 4, 4) matrices that rotate by R (..., 3, 3), then move by t (..., 3)."""
+    found = np.zeros((*np.shape(t)[:-1], 4, 4))
+    found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = R, t, 1.0
+    return found
+
+
 def symmetric_root(matrix: Array) -> Array:
     """Symmetric square roots (..., n, n) of positive semi-definite matrices; negative rounding counts as zero."""
     values, vectors = np.linalg.eigh(matrix)

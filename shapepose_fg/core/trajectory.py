@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.decompositions import is_rotation
+from shapepose_fg.core.decompositions import is_rotation, rigid
 
 DRIFT = 0.01
 """Drift of an odometry that states no errors, per metre: wheels and cameras drift by about 1 % of the distance."""
@@ -94,12 +94,11 @@ class Trajectory:
         """
         from scipy.spatial.transform import Rotation
 
-        flat, pose = np.ravel(time_s), np.tile(np.eye(4), (np.size(time_s), 1, 1))
+        flat = np.ravel(time_s)
         before, part = self._place(flat)
         R, last = self.wTb[before, :3, :3], self.wTb[before + 1, :3, :3]
         turn = part[:, None] * Rotation.from_matrix(R.mT @ last).as_rotvec()
-        pose[:, :3, :3] = R @ Rotation.from_rotvec(turn).as_matrix()
-        pose[:, :3, 3] = self._between(self.wTb[:, :3, 3], flat)
+        pose = rigid(R @ Rotation.from_rotvec(turn).as_matrix(), self._between(self.wTb[:, :3, 3], flat))
         return pose.reshape(*np.shape(time_s), 4, 4)
 
     def covariance_at(self, time_s: Array) -> Array:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
 from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
@@ -52,8 +53,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     late = np.flatnonzero(np.diff(pose[:, 0]) < _SHORTEST_S)
     if len(late) > 0:
         raise InputError(f"{path}: line {lines[late[0] + 1]} must be later than the pose before; sort by time")
-    wTb = np.tile(np.eye(4), (len(pose), 1, 1))
-    wTb[:, :3, :3], wTb[:, :3, 3] = Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4]
+    wTb = rigid(Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4])
     covariance = None
     if any(each in columns for each in COVARIANCE):
         zero = np.zeros(len(pose))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera
-from shapepose_fg.core.decompositions import ROTATION_TOLERANCE, nearest_rotation
+from shapepose_fg.core.decompositions import ROTATION_TOLERANCE, nearest_rotation, rigid
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.lens import Lens, padded_distortion
 from shapepose_fg.core.trajectory import Trajectory
@@ -206,10 +206,9 @@ def pose(
         raise InputError(f"{place}: the rotation of {key} mirrors (determinant -1); {cure}")
     if off >= _EXACT:
         R = nearest_rotation(R)
-    wTc = np.eye(4)
-    wTc[:3, :3] = R if world_from_camera else R.T
-    wTc[:3, 3] = t if world_from_camera or centre else -R.T @ t
-    return wTc
+    if world_from_camera:
+        return rigid(R, t)
+    return rigid(R.T, t if centre else -R.T @ t)
 
 
 def rotation_of(quaternion: ArrayLike, key: str, place: str) -> Array:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.trajectory import MOST_METRES, MOST_VARIANCE, UNIT_LENGTH, Trajectory
 from shapepose_fg.io.ros.definitions import type_name
@@ -150,9 +151,7 @@ def _matrix(pose: Array, place: str) -> Array:
         raise InputError(f"{place}: a pose must be finite, its quaternion of length 1; leave it out")
     if np.abs(pose[:3]).max() > MOST_METRES:
         raise InputError(f"{place}: a pose is over {MOST_METRES:g} m away; write metres")
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
-    return found
+    return rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
 
 
 def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
