@@ -9,16 +9,17 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Index
 
-_LONGEST_NAME = 64
+LONGEST_NAME = 64
+"""Maximum number of characters of a joint's name."""
 
 
 def check_joint_names(names: Iterable[str]) -> None:
     """ValueError for a name that breaks the lines of other programs' files, or is a formula in their tables."""
     for name in names:
-        if not (0 < len(name) <= _LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
+        if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
             raise ValueError(
-                f"joint_names must be 1 to {_LONGEST_NAME} letters in one line, the first none of = + - @, got"
-                f" {name[:_LONGEST_NAME]!r}"
+                f"joint_names must be 1 to {LONGEST_NAME} letters in one line, the first none of = + - @, got"
+                f" {name[:LONGEST_NAME]!r}"
             )
 
 

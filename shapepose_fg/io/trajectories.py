@@ -6,12 +6,11 @@ import numpy as np
 
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.frame_times import MOST_FPS
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
 from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
 from shapepose_fg.io.number_table import read_number_table
 from shapepose_fg.io.validation import is_number
-
-_SHORTEST_S = 1e-6
 
 
 def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
@@ -50,7 +49,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     if wrong.any():
         got = f"line {lines[wrong][0]}: the quaternion qx qy qz qw must have length 1, got {length[wrong][0]:.4g}"
         raise InputError(f"{path}: {got}; write time x y z qx qy qz qw, qw last")
-    late = np.flatnonzero(np.diff(pose[:, 0]) < _SHORTEST_S)
+    late = np.flatnonzero(np.diff(pose[:, 0]) < 1 / MOST_FPS)
     if len(late) > 0:
         raise InputError(f"{path}: line {lines[late[0] + 1]} must be later than the pose before; sort by time")
     wTb = rigid(Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4])

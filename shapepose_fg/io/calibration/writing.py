@@ -19,7 +19,7 @@ from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import wanted_tables
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
-from shapepose_fg.io.calibration.reading import FORMATS
+from shapepose_fg.io.calibration.reading import FORMATS, recognised
 from shapepose_fg.io.calibration.rewriting import REWRITTEN, numbers_of
 from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 
@@ -87,9 +87,7 @@ def check_target(source: Path, target: Path) -> None:
 def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
     """The content of `source`, its format, and its cameras."""
     content = load(source)
-    read = ((each, each.read(content)) for each in FORMATS)
-    found = next(((form, written) for form, written in read if written is not None), None)
-    if found is None:
+    if (found := recognised(content)) is None:
         raise InputError(f"{source}: no calibration is here any more; read it again")
     return content, *found
 
