@@ -9,8 +9,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.calibration.reading import is_calibration
-from shapepose_fg.io.camera_names import listing
-from shapepose_fg.io.detections.json_people import frame_files, frame_number
+from shapepose_fg.io.camera_names import listing, numbered
+from shapepose_fg.io.detections.json_people import FRAME_FILE
 from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.footage.footage import glance
 from shapepose_fg.io.footage.places import VIDEOS
@@ -103,8 +103,8 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         fps, origin = (rate, f", as {CONFIG} says") if given else next((e for e in told if e[0] > 0), assumed)
         said = f"{fps:g} frames a second{origin}"
     # Results have the numbers of the files' names, 0 where they have none, from the first that all have.
-    folders = [frame_files(each) for each in detections.iterdir() if each.is_dir()]
-    numbers = (min(map(frame_number, files)) for files in folders if len(files) > 0)
+    folders = [numbered(each, FRAME_FILE) for each in detections.iterdir() if each.is_dir()]
+    numbers = (files[0][0] for files in folders if len(files) > 0)
     return Pose2SimProject(
         folder,
         calibration,
@@ -214,7 +214,7 @@ def _detections(folder: Path, has_videos: bool) -> Path:
     """The folder of 2D detections; InputError with the command that makes them where there are videos only."""
 
     def is_pose(path: Path) -> bool:
-        there = len(frame_files(path)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
+        there = len(numbered(path, FRAME_FILE)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
         return there and not path.name.startswith(".")
 
     for place in (folder / name for name in _POSES):

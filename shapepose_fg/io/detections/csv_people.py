@@ -11,7 +11,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.core.storage.files import open_regular, text_pieces
-from shapepose_fg.io.camera_names import MOST_FRAME, match_names
+from shapepose_fg.io.camera_names import MOST_FRAME, last_number, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.validation import is_number
 
@@ -186,15 +186,10 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _frame(path: Path, line: int, word: str) -> int:
     """The frame's number: the first field, or the last number in a picture's name."""
-    digits = ""
-    for each in reversed(word.strip().rsplit(".", 1)[0]):
-        if each.isdigit() and each.isascii():
-            digits = each + digits
-        elif digits:
-            break
-    if digits and len(digits) <= len(str(MOST_FRAME)):
-        return int(digits)
-    raise InputError(f"{path}: line {line} begins with no frame's number, {word[:40]!r}; {_RERUN}")
+    number = last_number(word.strip().rsplit(".", 1)[0])
+    if number is None or number == MOST_FRAME:
+        raise InputError(f"{path}: line {line} begins with no frame's number, {word[:40]!r}; {_RERUN}")
+    return number
 
 
 def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:

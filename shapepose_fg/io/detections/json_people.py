@@ -6,7 +6,6 @@ Pose2Sim (RTMLib's people written in OpenPose's way) leaves `_keypoints` out of 
 that it dropped, and `{}` for people that a camera does not see.
 """
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from itertools import chain, islice, pairwise
@@ -20,7 +19,7 @@ from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, TypeAdapter
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import BIG, LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
-from shapepose_fg.io.camera_names import MOST_FRAME, in_order
+from shapepose_fg.io.camera_names import MOST_FRAME, in_order, last_number, numbered
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock, check_one_model, frame_blocks
 from shapepose_fg.io.json_items import JsonItems
@@ -44,12 +43,8 @@ _LONGEST_GAP = 1000
 """Largest ratio of missing to existing frames: more are numbers of something else."""
 _LOOKED_AT = 100
 """Maximum number of files without people that are read to recognise the program."""
-_LONGEST_NAME = 4096
-"""Maximum number of characters of a picture's path: the time of the search grows with their square."""
-_FRAME_FILE = re.compile(r"(\d+)(_keypoints|(\.\w{1,5})?\.predictions)?\.json$")
-"""Pattern of the names of files of frames."""
-_FRAME_NUMBER = re.compile(r"(\d+)\D*$")
-"""The last number in the name of a picture."""
+FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
+"""What follows the number in the names of files of frames."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
 """AlphaPose's file of all frames, and its folder for a file a frame, of --format open and cmu."""
 _LISTS = ("annotations", "instance_info")
@@ -181,7 +176,7 @@ def read_json_people(place: Path) -> CameraPeople:
     """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
     if not place.is_dir():
         return read_one_file(place)
-    if (place / _SEP_JSON).is_dir() and len(frame_files(place)) == 0:
+    if (place / _SEP_JSON).is_dir() and len(numbered(place, FRAME_FILE)) == 0:
         return read_frame_files(place / _SEP_JSON)
     lists = _lists(place)
     if [each.name for each in lists] == [_ALL_FRAMES]:
@@ -228,28 +223,14 @@ def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple
 # A file per frame.
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """Files of a folder that are named after a frame, in order of their names."""
-    # macOS leaves ._000000_keypoints.json beside each file that it copies.
-    found = [each for each in folder.iterdir() if _FRAME_FILE.search(each.name) and not each.name.startswith(".")]
-    return sorted(each for each in found if each.is_file())
-
-
-def frame_number(file: Path) -> int:
-    """The number of the frame that one of `frame_files` is named after."""
-    match = _FRAME_FILE.search(file.name)
-    assert match is not None
-    return int(match[1])
-
-
 def read_frame_files(folder: Path) -> CameraPeople:
     """The frames that one camera saw; InputError naming file, key and cure.
 
     A frame's number is in its file's name. No people are seen in frames whose files are missing in between
     (`gaps`).
     """
-    files = frame_files(folder)
-    if len(files) == 0:
+    found = numbered(folder, FRAME_FILE)
+    if len(found) == 0:
         lists = sorted(each.name for each in _lists(folder))
         what = "no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run one of them into it"
         if len(lists) > 1:
@@ -257,15 +238,15 @@ def read_frame_files(folder: Path) -> CameraPeople:
             what = f"several JSON files without frame numbers ({names}); leave the one to be read"
         raise InputError(f"{folder}: {what}")
     program, joints = _OPENPOSE, None
-    if not files[0].name.endswith("_keypoints.json"):
-        program, joints = _program_of_frames(files)
-    numbered = in_order([(frame_number(file), file) for file in files])
-    first, last = numbered[0][0], numbered[-1][0]
-    if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
-        problem = f"{len(numbered)} files are numbered from {first} to {last}"
+    if not found[0][1].name.endswith("_keypoints.json"):
+        program, joints = _program_of_frames([file for _, file in found])
+    in_order(found)
+    first, last = found[0][0], found[-1][0]
+    if last - first + 1 > 2 * len(found) + _LONGEST_GAP:
+        problem = f"{len(found)} files are numbered from {first} to {last}"
         raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
-    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
-    blocks = frame_blocks(folder, program, numbered, partial(_people_of_file, program=program, joints=joints))
+    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(found) if other > one + 1)
+    blocks = frame_blocks(folder, program, found, partial(_people_of_file, program=program, joints=joints))
     return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints)
 
 
@@ -466,10 +447,9 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
             return image
         raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
     name = str(image) if name is None else name
-    match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
-    if match is None or len(match[1]) > len(str(MOST_FRAME)):
+    if (number := last_number(Path(name).stem)) in (None, MOST_FRAME):
         raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
-    return int(match[1])
+    return number
 
 
 def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:

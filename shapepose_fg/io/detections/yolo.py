@@ -1,34 +1,24 @@
 """People in YOLO's labels: a text file a frame, a line a person, everything as parts of the picture's size."""
 
-import re
 from pathlib import Path
 
 import numpy as np
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, read_text
-from shapepose_fg.io.camera_names import in_order
+from shapepose_fg.io.camera_names import in_order, numbered
 from shapepose_fg.io.detections.people import CameraPeople, frame_blocks
 from shapepose_fg.io.validation import is_number
 
 _YOLO = "YOLO's labels"
 _RERUN = "run yolo pose again with save_txt=True"
-_FRAME_FILE = re.compile(r"(\d+)\.txt$")
 _BOX = 5
 """Number of values in front of the keypoints: class, and middle, width and height of the box."""
 
 
 def label_files(folder: Path) -> list[tuple[int, Path]]:
     """The files of frames in a folder, or in its folder labels, with their numbers; none where there is none."""
-    for place in (folder, folder / "labels"):
-        if place.is_dir():
-            files = [each for each in place.iterdir() if not each.name.startswith(".")]
-            found = [
-                (match, each) for each in files if (match := _FRAME_FILE.search(each.name)) and each.is_file()
-            ]
-            if found:
-                return [(int(match[1]), each) for match, each in found]
-    return []
+    return numbered(folder, r"\.txt") or numbered(folder / "labels", r"\.txt")
 
 
 def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
@@ -36,13 +26,13 @@ def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
 
     Frames without people have no file. InputError naming file, line and cure.
     """
-    numbered = in_order(label_files(folder))
+    found = in_order(label_files(folder))
 
     def read(file: Path) -> list[list[float]]:
         lines = enumerate(read_text(file, may_be_empty=True, most=MIDDLE).splitlines(), start=1)
         return [_person(file, line, text.split(), image_size) for line, text in lines if text.strip()]
 
-    blocks, ends = frame_blocks(folder, _YOLO, numbered, read), (numbered[0][0], numbered[-1][0])
+    blocks, ends = frame_blocks(folder, _YOLO, found, read), (found[0][0], found[-1][0])
     return CameraPeople(folder, _YOLO, blocks, *ends, every_frame=False, lists_people=True, rerun=_RERUN)
 
 
