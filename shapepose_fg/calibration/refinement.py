@@ -11,7 +11,7 @@ import numpy as np
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.levelling import scaled
-from shapepose_fg.calibration.people import Footage, missed_px
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -24,8 +24,6 @@ from shapepose_fg.setup_check.small import Problem
 
 _ROUNDS = 4
 """Number of times that people are associated again with the cameras of the round before."""
-_LEAST_PEOPLE = 10
-"""Minimum number of people, one per frame, from which a camera is adjusted."""
 _SAME_PERSON = 2.5
 """Number of joints of one person in one view whose correlated errors count as one independent error."""
 _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
@@ -205,10 +203,10 @@ def _fitted(
     rig_now, adjusted = rig, None
     for step in range(_ROUNDS):
         people = footage.people(rig_now)
-        if len(people) < _LEAST_PEOPLE or not people.seen.any():
+        if len(people) < LEAST_PEOPLE or not people.seen.any():
             raise InputError(
                 f"only {len(people)} people are seen by two cameras at once, at the frames that were looked at;"
-                " cameras are refined by at least 10: film people where views overlap, or see"
+                f" cameras are refined by at least {LEAST_PEOPLE}: film people where views overlap, or see"
                 " shapepose-fg check-calibration"
             )
         spread = dilution(times.frame_s[np.unique(people.frame)])
@@ -240,7 +238,7 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     }
     notes = []
     for view, camera in enumerate(adjusted.rig.cameras):
-        if counts[view] < _LEAST_PEOPLE:
+        if counts[view] < LEAST_PEOPLE:
             few = f"sees {counts[view]} people whom another camera sees, too few"
             notes.append(f"camera {camera.name}: {few}; it stays")
             continue

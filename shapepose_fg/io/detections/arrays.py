@@ -10,7 +10,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import SMALL, open_regular
-from shapepose_fg.core.storage.npz import MOST_PACKED, read_npy_header
+from shapepose_fg.core.storage.npz import MOST_PACKED, SMALL_BYTES, read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.csv_people import BLAZEPOSE, body_parts, taken
@@ -20,10 +20,8 @@ _FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Maximum number of values in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
-_SMALL_BYTES = 2**27
-"""Size up to which an array of a compressed file counts as small, bytes."""
 _MOST_CAMERAS = 1000
-_MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
+_MOST_NAMES, _LONGEST_NAME = 1000, 1000
 _TABLE = "df_with_missing/table"
 """Path of the table of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
@@ -243,7 +241,7 @@ def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes
     stream.seek(address)
     head = stream.read(16)
     size = int.from_bytes(head[8:], "little")
-    if head[:4] != b"GCOL" or not 16 <= size <= _LARGEST_HEAP or length > _LONGEST_NAME:
+    if head[:4] != b"GCOL" or not 16 <= size <= SMALL or length > _LONGEST_NAME:
         raise ValueError("a text is not where it should be")
     heap, at = stream.read(size - 16), 0
     while at + 16 <= len(heap):
@@ -272,5 +270,5 @@ def _numbers(path: Path, dataset: Any) -> Array:
 
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
     """InputError where so many numbers are more than the file can hold."""
-    if 8 * count > max(_SMALL_BYTES, MOST_PACKED * path.stat().st_size):
+    if 8 * count > max(SMALL_BYTES, MOST_PACKED * path.stat().st_size):
         raise InputError(f"{path}: {shape} are too many numbers; export a part of the recording")
