@@ -3,7 +3,7 @@
 For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, cached_property
@@ -90,6 +90,16 @@ class Column:
         largest = max(np.fmax.reduce(array, axis=None), -np.fmin.reduce(array, axis=None))
         if largest > self.most:
             raise ValueError(f"{name} must be at most {self.most:g} or unknown (NaN), got {largest:g}")
+
+
+def checked_columns(
+    columns: Mapping[str, Column], arrays: Mapping[str, Any], sizes: dict[str, int]
+) -> dict[str, NDArray[Any]]:
+    """Arrays as their `columns` say, and in range; ValueError that names the first that is not."""
+    found = {name: column.checked(name, arrays[name], sizes) for name, column in columns.items()}
+    for name, column in columns.items():
+        column.check_range(name, found[name])
+    return found
 
 
 @cache
