@@ -37,12 +37,14 @@ class Rows:
         return changed
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """The rows of one or more parts, one after the other; what is for all rows is the first part's."""
+    def concatenate(cls, parts: Sequence[Self], **others: Any) -> Self:
+        """The rows of one or more parts, one after the other; what is for all rows is in `others`, or the first
+        part's.
+        """
         joined = {
             name: type(value).concatenate([getattr(part, name) for part in parts])
             if isinstance(value, Rows)
             else np.concatenate([getattr(part, name) for part in parts])
             for name, value in parts[0]._columns().items()
         }
-        return replace(cast(Any, parts[0]), **joined)
+        return replace(cast(Any, parts[0]), **joined, **others)

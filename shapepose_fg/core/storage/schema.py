@@ -4,7 +4,7 @@ For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self, cast, get_type_hints
@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self, cast, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.storage.npz import Pieces
 
 _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
@@ -110,7 +111,7 @@ def columns_of(kind: type) -> dict[str, Column]:
     return {name: mark for name, found in marks.items() for mark in found if isinstance(mark, Column)}
 
 
-class Table:
+class Table(Rows):
     """Base of frozen dataclasses whose fields are arrays, each annotated with its `Column`.
 
     ValueError that names the column where one has another shape or type.
@@ -129,8 +130,8 @@ class Table:
         if len(cls.ROWS) == 0:
             cls.ROWS = [name for name, column in columns_of(cls).items() if column.has_rows]
 
-    def __len__(self) -> int:
-        return len(getattr(self, self.ROWS[0]))
+    def _columns(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.ROWS}
 
     @classmethod
     def shared(cls) -> list[str]:
@@ -148,7 +149,7 @@ class Table:
         return cls(**values, **rows)
 
     @classmethod
-    def joined(cls, parts: Sequence[Self], **others: Any) -> Self:
+    def concatenate(cls, parts: Sequence[Self], **others: Any) -> Self:
         """The rows of parts (one at least), one after the other; what they share, and `others`, as it is.
 
         ValueError where two parts have not the same shared columns.
@@ -157,12 +158,7 @@ class Table:
             for name in cls.shared():
                 if not np.array_equal(getattr(part, name), getattr(parts[0], name)):
                     raise ValueError(f"parts must have the same {name}")
-        rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
-        return replace(cast(Any, parts[0]), **rows, **others)
-
-    def rows(self, index: Any) -> Self:
-        """The rows that `index` picks: a mask (N,) or row numbers."""
-        return replace(cast(Any, self), **{name: getattr(self, name)[index] for name in self.ROWS})
+        return super().concatenate(parts, **others)
 
     def check_ranges(self) -> None:
         """ValueError for what no result gives: negative frames, joints thousands of kilometres away."""
