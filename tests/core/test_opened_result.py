@@ -142,7 +142,7 @@ def test_many_people_in_many_frames_are_a_sentence(folder, monkeypatch):
     """A place for everybody in every frame: 12,000 people in as many frames took a gigabyte from 83 KB."""
     monkeypatch.setattr("shapepose_fg.io.export.take.free_memory", lambda: 1000)
     with pytest.raises(
-        InputError, match=r"people\.npz: \d+ people over \d+ frames would take .* \(--frames, --person\)"
+        InputError, match=r"people\.npz: \d+ people over \d+ frames need .* \(--frames, --person\)"
     ):
         read_take(folder, up="z")
 

@@ -79,10 +79,10 @@ def check_target(source: Path, target: Path) -> None:
     ending, own = target.suffix.lower(), source.suffix.lower()
     same = ending == own or (ending in _YAML and own in _YAML)
     if ending not in ("", ".json") and (several or not same):
-        name = "a folder, without ending," if several else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
+        name = "a folder (without a suffix)" if several else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
         raise InputError(
-            f"{target}: cameras that came as {form.name} are written so, or as our own rig file; call it {name} or"
-            " FILE.json"
+            f"{target}: cameras read as {form.name} can be written as that, or as a rig file; name the output"
+            f" {name} or FILE.json"
         )
 
 
@@ -92,7 +92,7 @@ def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
     read = ((each, each.read(content)) for each in FORMATS)
     found = next(((form, written) for form, written in read if written is not None), None)
     if found is None:
-        raise InputError(f"{source}: no calibration is here any more; read it again")
+        raise InputError(f"{source}: the calibration is not there any more; read it again")
     return content, *found
 
 
@@ -136,7 +136,7 @@ def _voxelpose(value: Any) -> list[dict[str, Any]]:
 
 
 _PLACES: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
-    "our own rig file": lambda value: value["cameras"],
+    "rig file": lambda value: value["cameras"],
     "CMU Panoptic's JSON": lambda value: value["cameras"],
     "VoxelPose's JSON": _voxelpose,
     "4D Association's calibration.json": lambda value: list(value.values()),

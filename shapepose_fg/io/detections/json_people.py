@@ -77,7 +77,7 @@ class _Instance(BaseModel, strict=True):
     def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint."""
         if len(self.keypoints) != len(self.keypoint_scores):
-            problem = f"{len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores"
+            problem = f"there are {len(self.keypoints)} keypoints, but {len(self.keypoint_scores)} keypoint_scores"
             raise InputError(f"{place}: {problem}; {_RERUN[program]}")
         pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
         return [number for (x, y), score in pairs for number in (x, y, score)]
@@ -124,7 +124,7 @@ class _Object(BaseModel, strict=True):
             return []
         scores = [1.0] * len(own.x) if own.visible is None else own.visible
         if not len(own.x) == len(own.y) == len(scores):
-            raise InputError(f"{place}.keypoints must have as many x, y and visible; {_RERUN[_YOLO]}")
+            raise InputError(f"{place}.keypoints must have the same number of x, y and visible; {_RERUN[_YOLO]}")
         rows = zip(own.x, own.y, scores, strict=True)
         return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
 
@@ -166,7 +166,7 @@ def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, 
     known |= {len(person) // 3 for person in people}
     if len(known) > 1:
         counts = " and ".join(map(str, sorted(known)))
-        what = f"recognised as {program}, with people of {counts} keypoints"
+        what = f"recognised as {program}, but people have {counts} keypoints"
         raise InputError(f"{source}: {what}; give the detections of one model")
 
 
@@ -244,10 +244,13 @@ def read_frame_files(folder: Path) -> CameraPeople:
     files = frame_files(folder)
     if len(files) == 0:
         lists = sorted(each.name for each in _lists(folder))
-        what = "no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run one of them into it"
+        what = (
+            "there is no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; write the"
+            " detections of one of them into it"
+        )
         if len(lists) > 1:
             names = " ".join(lists[:4])
-            what = f"several JSON files without frame numbers ({names}); leave the one to be read"
+            what = f"there are several JSON files without frame numbers ({names}); keep only one"
         raise InputError(f"{folder}: {what}")
     program, joints = _OPENPOSE, None
     if not files[0].name.endswith("_keypoints.json"):
@@ -318,7 +321,7 @@ def _people_of_frame(file: Path, program: str, joints: str | tuple[str, ...] | N
         if isinstance(content, dict):
             if _joints_of_meta(content.get("meta_info")) != joints:
                 raise InputError(
-                    f"{file}: meta_info names other joints than the first file; give one model's files"
+                    f"{file}: its meta_info names other joints than the first file; give the files of one model"
                 )
             content = content.get("instance_info")
         instances = validated_list(_INSTANCES, content, file, rerun)
@@ -359,8 +362,8 @@ def read_one_file(path: Path) -> CameraPeople:
     if not items.found or (items.key is None and first is not None and not _known(first)):
         found = "a list" if items.found else describe(items.value)
         raise InputError(
-            f"{path}: recognised as JSON ({found}), expected a list of people with image_id (COCO,"
-            " AlphaPose) or of frames with instances (MMPose); give one of these"
+            f"{path}: recognised as JSON ({found}), but a list of people with image_id (COCO, AlphaPose) or of"
+            " frames with instances (MMPose) is expected; give one of these"
         )
     again = every if first is None else chain([first], every)
     if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
@@ -425,7 +428,7 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
             continue
         one = validated(_PifPafFrame, parse_json(line, path), path, _RERUN[_PIFPAF])
         if one.frame <= last:
-            raise InputError(f"{path}: line {number}: frames must rise; {_RERUN[_PIFPAF]}")
+            raise InputError(f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}")
         last = one.frame
         place = f"{path}: line {number}"
         people.add([_checked(each.keypoints, place, _PIFPAF) for each in one.predictions])
@@ -478,7 +481,10 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     first: dict[int, int | str] = {}
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
-            problem = f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame}"
+            problem = (
+                f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} have the same frame"
+                f" number {frame}"
+            )
             raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
     listed = (min(first), max(first)) if first else (0, -1)
     joints = _joints_of_categories(others.get("categories"), categories)
@@ -501,7 +507,7 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
     if name is None and isinstance(image, int):
         if 0 <= image < MOST_FRAME:
             return image
-        raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
+        raise InputError(f"{place} '{image}' is not a frame number; {_RERUN[program]}, of numbered pictures")
     name = str(image) if name is None else name
     match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
     if match is None or len(match[1]) > len(str(MOST_FRAME)):

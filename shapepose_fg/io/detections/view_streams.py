@@ -99,7 +99,7 @@ def _any_frame(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, 
     count = max(view.first_number + view.frame_count for view in views) - start
     if all(view.first_number == start for view in views):
         return views, count, []
-    note = f"{views[0].source.parent}: frame 0 is number {start} of the files ({_spans(views)})"
+    note = f"{views[0].source.parent}: frame 0 has number {start} in the files ({_spans(views)})"
     return [_part(view, start - view.first_number, count) for view in views], count, [note]
 
 
@@ -114,12 +114,12 @@ def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, lis
         for view in views:  # what is wrong with their files goes first
             for _ in view.blocks:
                 pass
-        cure = "give the same frames of each, numbered alike"
-        raise InputError(f"{views[0].source.parent}: no frame is there of every camera ({spans}); {cure}")
+        cure = "give the same frames of each camera with the same numbers"
+        raise InputError(f"{views[0].source.parent}: no frame exists for all cameras ({spans}); {cure}")
     count, folder = stop - start, views[0].source.parent
     note = (
-        f"{folder}: cameras have different frames ({spans}); the {count} that all have, {start} to {stop - 1}, are"
-        " used; where cameras were started apart, `shapepose-fg synchronise` finds when"
+        f"{folder}: cameras have different frames ({spans}); the {count} common ones, {start} to {stop - 1},"
+        " are used; if the cameras are unsynchronised, run `shapepose-fg synchronise`"
     )
     return [_part(view, start - view.first_number, count) for view in views], count, [note]
 
@@ -223,7 +223,7 @@ class _LeftOut:
         joints = "joint" if self._count == 1 else "joints"
         share = f"{self._count} {joints} of {self._of} ({self._count / max(self._of, 1):.1%})"
         if self._count > self._most * self._of:
-            raise InputError(f"{self._first}; so are {share} of this camera; {self._cure}")
+            raise InputError(f"{self._first}; this holds for {share} of this camera; {self._cure}")
         return [f"{self._first}; {share} left out"] if self._count else []
 
 
@@ -233,7 +233,7 @@ class _Undistorted:
     def __init__(self, source: Path | str, camera: Camera) -> None:
         self.source, self.camera = source, camera
         self.reasons = (
-            _LeftOut("give detections made on pictures of the calibrated size", _STRAY),
+            _LeftOut("give detections from pictures of the calibrated size", _STRAY),
             _LeftOut("check the distortion coefficients in the calibration", _BENT),
         )
 
@@ -247,7 +247,7 @@ class _Undistorted:
         certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
         straight = camera.undistort(certain.seen.xy)
         undone = np.asarray(~np.isfinite(straight).all(axis=1))
-        why = f"where the distortion of camera {camera.name} cannot be undone"
+        why = f"where the distortion of camera {camera.name} cannot be inverted"
         self.reasons[1].add(undone, partial(self._words, certain, why))
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
 
