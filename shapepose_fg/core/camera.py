@@ -10,18 +10,16 @@ import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
 from shapepose_fg.core.arrays import Array, Index, Real
-from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.core.decompositions import is_rotation, nearest_rotation, rigid
 from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
-from shapepose_fg.core.trajectory import Carried, Trajectory
+from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, as a calibration names the direction that is up."""
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_MOST_PIXELS, _MOST_METRES, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 1e6, 200
+_MOST_PIXELS, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 200
 """No picture, room, lens or name is as large; what is computed of larger numbers overflows."""
-_ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of R Rᵀ from the identity: calibrations are printed with four to six digits."""
 LONGEST_READOUT_S = 0.1
 """Longest readout time that is accepted, s: rolling shutters take 5 to 30 ms."""
 
@@ -58,7 +56,7 @@ class Camera:
         if self.lens not in COEFFICIENTS:
             raise refuse(f"lens must be perspective or fisheye, got {self.lens!r}")
         lengths = [(count,) for count in COEFFICIENTS[self.lens]]
-        arrays = {"K": ([(3, 3)], _MOST_PIXELS)} | dict.fromkeys(("wTc", "bTc"), ([(4, 4)], _MOST_METRES))
+        arrays = {"K": ([(3, 3)], _MOST_PIXELS)} | dict.fromkeys(("wTc", "bTc"), ([(4, 4)], MOST_METRES))
         for name, (shapes, most) in (arrays | {"distortion": (lengths, _MOST_DISTORTION)}).items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in shapes:
@@ -71,7 +69,7 @@ class Camera:
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or np.any(np.abs(self.K[2] - (0, 0, 1)) > 1e-9):
             raise refuse("K must have positive focal lengths and a last row 0 0 1")
         for name, R in (("wTc", self.wTc[:3, :3]), ("bTc", self.bTc[:3, :3])):
-            if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            if not is_rotation(R):
                 raise refuse(f"the rotation of {name} must be orthonormal with determinant 1")
         width, height = self.image_size
         if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
@@ -102,16 +100,10 @@ class Camera:
         """
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
-        if (
-            not np.isfinite(cTw).all()
-            or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-            or np.linalg.det(R) < 0
-        ):
+        if not (np.isfinite(cTw).all() and is_rotation(R)):
             raise ValueError(f"camera {name}: the rotation must be orthonormal with determinant 1, and finite")
-        wTc = np.eye(4)
-        wTc[:3, :3] = nearest_rotation(R).T
-        wTc[:3, 3] = -wTc[:3, :3] @ cTw[:3, 3]
-        coefficients = padded_distortion(distortion, lens)
+        R, coefficients = nearest_rotation(R).T, padded_distortion(distortion, lens)
+        wTc = rigid(R, -R @ cTw[:3, 3])
         return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
 
     @cached_property

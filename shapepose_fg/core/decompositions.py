@@ -9,9 +9,23 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 
+ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of R Rᵀ from the identity: calibrations are printed with four to six digits."""
 _SIDE = np.sqrt([2.0, 3.0, 5.0])
 """Reference direction: axes point to its side, and no axis of a symmetrical arrangement is at right angles to
 it."""
+
+
+def is_rotation(R: Array) -> bool:
+    """Whether matrices (..., 3, 3) are rotations, up to `ROTATION_TOLERANCE`."""
+    return bool(np.abs(R @ R.mT - np.eye(3)).max() <= ROTATION_TOLERANCE and (np.linalg.det(R) >= 0).all())
+
+
+def rigid(R: Array, t: Array) -> Array:
+    """(..., 4, 4) matrices that rotate by R (..., 3, 3), then move by t (..., 3)."""
+    found = np.zeros((*np.shape(t)[:-1], 4, 4))
+    found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = R, t, 1.0
+    return found
 
 
 def symmetric_root(matrix: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 
-_LEAST_FPS, _MOST_FPS = 1e-3, 1e6
+LEAST_FPS, MOST_FPS = 1e-3, 1e6
 """Lowest and highest accepted frame rate, Hz."""
 ASSUMED_FPS = 30.0
 """Frame rate that is assumed where none is given, Hz."""
@@ -86,8 +86,8 @@ class FrameTimes:
     @classmethod
     def from_fps(cls, fps: float, frames: int) -> "FrameTimes":
         """`frames` frames at `fps` frames a second, frame 0 at 0 s (`typed_rate`)."""
-        if not _LEAST_FPS <= fps <= _MOST_FPS:
-            bounds = f"{_LEAST_FPS:g} to {_MOST_FPS:g}"
+        if not LEAST_FPS <= fps <= MOST_FPS:
+            bounds = f"{LEAST_FPS:g} to {MOST_FPS:g}"
             raise ValueError(f"fps must be a positive number of frames a second, {bounds}, got {fps}")
         return cls(np.arange(frames) / typed_rate(fps), source="fps")
 

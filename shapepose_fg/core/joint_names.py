@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 
-from shapepose_fg.core.skeleton import SKELETONS, Skeleton, body_skeleton
+from shapepose_fg.core.skeleton import LONGEST_NAME, SKELETONS, Skeleton, body_skeleton
 
 _ALIASES = {
     "BODY_25": "body25 openpose openposebody25",
@@ -41,8 +41,6 @@ def layouts_called(name: str) -> list[Skeleton]:
     ]
 
 
-_LONGEST = 64
-"""Maximum number of characters of a name that are read; no joint has a longer one."""
 _SIDED = {
     "Shoulder": "shoulder sho",
     "Elbow": "elbow elb",
@@ -110,7 +108,7 @@ def body_points(names: Sequence[str]) -> list[str]:
     the ankle where no ankle is named, and a head the top of the head where no top is. Bones mean the joint at
     which they begin where a thigh is named.
     """
-    short = (name[:_LONGEST] for name in names)
+    short = (name[:LONGEST_NAME] for name in names)
     every = [_words(re.sub(r"\(.*?\)", "", name) or name) for name in short]
     while len(every) > 1 and min(map(len, every)) > 1 and len({words[0] for words in every}) == 1:
         if every[0][0] in _SIDES:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 Run = dict[str, Any]
-_MOST_FRAMES = 10_000_000
+MOST_FRAMES = 10_000_000
 """Frames of a recording: over four days at 25 a second."""
 
 
@@ -124,8 +124,8 @@ def check_run(run: Mapping[str, Any]) -> None:
     spans = covered_frames(run) or []
     # The length of a range may be too large for `len`.
     count = sum(span.stop - span.start for span in spans)
-    if any(span.start < 0 or span.stop < span.start for span in spans) or count > _MOST_FRAMES:
-        raise refuse("frames", f"[start, stop] of at most {_MOST_FRAMES} frames", run["frames"])
+    if any(span.start < 0 or span.stop < span.start for span in spans) or count > MOST_FRAMES:
+        raise refuse("frames", f"[start, stop] of at most {MOST_FRAMES} frames", run["frames"])
     for way, value in _leaves(run):
         if isinstance(value, float) and not math.isfinite(value):  # 1e999, which could not be written again
             raise ValueError(f'"{way[:80]}" must be a finite number, got {value}')

@@ -9,16 +9,17 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Index
 
-_LONGEST_NAME = 64
+LONGEST_NAME = 64
+"""Maximum number of characters of a joint's name."""
 
 
 def check_joint_names(names: Iterable[str]) -> None:
     """ValueError for a name that breaks the lines of other programs' files, or is a formula in their tables."""
     for name in names:
-        if not (0 < len(name) <= _LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
+        if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
             raise ValueError(
-                f"joint_names must be 1 to {_LONGEST_NAME} letters in one line, the first none of = + - @, got"
-                f" {name[:_LONGEST_NAME]!r}"
+                f"joint_names must be 1 to {LONGEST_NAME} letters in one line, the first none of = + - @, got"
+                f" {name[:LONGEST_NAME]!r}"
             )
 
 
@@ -277,7 +278,6 @@ COCO_18 = _layout("COCO_18", f"Nose Neck {_ARMS} {_LEGS} REye LEye REar LEar")
 """OpenPose's COCO model; mid-hip is made."""
 HALPE_26 = _layout("HALPE_26", _HALPE)
 """HALPE's body with feet, AlphaPose's and RTMPose's."""
-HALPE_136 = _layout("HALPE_136", _HALPE, passed_over=110)
 """HALPE's whole body; face and hands are passed over."""
 COCO_133 = _layout("COCO_133", f"{_COCO} {_FEET}", passed_over=110)
 """COCO-WholeBody; neck and mid-hip are made, face and hands are passed over."""
@@ -292,7 +292,7 @@ SKELETONS = {
         COCO_18,
         HALPE_26,
         COCO_133,
-        HALPE_136,
+        _layout("HALPE_136", _HALPE, passed_over=110),
         BODY_25B,
         _layout("BODY_135", f"{_COCO} head Head {_FEET}", passed_over=110),
         _layout("COCO_23", f"{_COCO} {_FEET}"),

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.decompositions import is_rotation, rigid
 
 DRIFT = 0.01
 """Drift of an odometry that states no errors, per metre: wheels and cameras drift by about 1 % of the distance."""
 LONGEST_GAP_S = 0.5
 """Longest gap between poses that is interpolated, s: at a walk 0.7 m, at a turn 45 degrees."""
 _MOST_DRIFT = 1.0
+MOST_METRES = 1e6
+"""Largest coordinate of a place, m: farther away doubles are too coarse for joints."""
+UNIT_LENGTH = 0.01
+"""Largest deviation of the length of a quaternion from 1: files round to two digits and more."""
 _START_M, _START_RAD = 0.05, 0.02
 """Standard deviation per axis of an odometry's start in the world of the fixed cameras: metres, rad."""
 _M_A_RAD, _M_A_S = 0.5, 0.05
@@ -19,11 +24,8 @@ _M_A_RAD, _M_A_S = 0.5, 0.05
 _RAD_A_M = 0.5
 """Error of rotation, rad, per metre of translational error of an odometry: equal effect after a straight path
 of 10 m."""
-_ROTATION_TOLERANCE = 1e-3
 MOST_VARIANCE = 1e18
 """Largest entry of a pose's covariance, rad² or m²: what is known this badly is not known at all."""
-_MOST_METRES = 1e6
-"""Largest coordinate of a place, m, as in `core.camera`: farther away doubles are too coarse for joints."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,12 @@ class Trajectory:
             )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
-        if (most := float(np.abs(wTb[:, :3, 3]).max())) > _MOST_METRES:
-            raise refuse(f"poses must be at most {_MOST_METRES:g} m away, got {most:.3g}")
+        if (most := float(np.abs(wTb[:, :3, 3]).max())) > MOST_METRES:
+            raise refuse(f"poses must be at most {MOST_METRES:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
             raise refuse(f"times must rise, at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1} they do not")
         R = wTb[:, :3, :3]
-        if np.abs(R @ R.mT - np.eye(3)).max() > _ROTATION_TOLERANCE or (np.linalg.det(R) < 0).any():
+        if not is_rotation(R):
             raise refuse("rotations must be orthonormal with determinant 1")
         if not 0 < self.drift <= _MOST_DRIFT:
             raise refuse(f"drift must be above 0 and at most {_MOST_DRIFT:g}, got {self.drift}")
@@ -92,12 +94,11 @@ class Trajectory:
         """
         from scipy.spatial.transform import Rotation
 
-        flat, pose = np.ravel(time_s), np.tile(np.eye(4), (np.size(time_s), 1, 1))
+        flat = np.ravel(time_s)
         before, part = self._place(flat)
         R, last = self.wTb[before, :3, :3], self.wTb[before + 1, :3, :3]
         turn = part[:, None] * Rotation.from_matrix(R.mT @ last).as_rotvec()
-        pose[:, :3, :3] = R @ Rotation.from_rotvec(turn).as_matrix()
-        pose[:, :3, 3] = self._between(self.wTb[:, :3, 3], flat)
+        pose = rigid(R @ Rotation.from_rotvec(turn).as_matrix(), self._between(self.wTb[:, :3, 3], flat))
         return pose.reshape(*np.shape(time_s), 4, 4)
 
     def covariance_at(self, time_s: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
-from shapepose_fg.core.storage.files import read_toml
+from shapepose_fg.core.storage.files import is_inside, read_toml
 from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork
 from shapepose_fg.detection2d.download import NamedNetwork, named_networks
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
@@ -89,10 +89,7 @@ def read_form(path: Path) -> KeypointForm:
 
 def _beside(path: Path, key: str, name: str) -> str:
     """A file in the folder of the TOML file, or below it."""
-    try:
-        found = path.parent / name
-        if name and found.resolve().is_relative_to(path.parent.resolve()):
-            return str(found)
-    except (OSError, RuntimeError, ValueError):  # links in a circle, a zero byte
-        pass
-    raise InputError(f"{path}: {key} {name[:80]!r} must be a file in the same folder; put it there and name it")
+    if not (name and is_inside(path.parent, name)):
+        cure = "put it there and name it"
+        raise InputError(f"{path}: {key} {name[:80]!r} must be a file in the same folder; {cure}")
+    return str(path.parent / name)

@@ -74,6 +74,20 @@ def listing(names: Sequence[str], nothing: str = "nothing") -> str:
     return (" ".join(names[:8]) or nothing) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
 
 
+def last_number(name: str) -> int | None:
+    """The last number in the name of a picture, its frame's; at most `MOST_FRAME`, and None if there is none."""
+    found = _NUMBERS.findall(name)
+    return min(int(found[-1][-1000:]), MOST_FRAME) if found else None
+
+
+def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:
+    """The files of a folder whose names end with a frame's number and the pattern `ending`, in their order."""
+    # macOS leaves ._000000_keypoints.json beside each file that it copies.
+    files = [each for each in folder.iterdir() if not each.name.startswith(".")] if folder.is_dir() else []
+    found = ((re.search(rf"(\d+){ending}$", each.name), each) for each in files)
+    return sorted((int(match[1]), each) for match, each in found if match is not None and each.is_file())
+
+
 def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
     """Files sorted by their frame numbers; InputError where a number is invalid or occurs twice."""
     ordered = sorted(files)

@@ -8,7 +8,7 @@ import numpy as np
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError, naming, optional
-from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.files import BIG, open_regular
 from shapepose_fg.io.detections.reading import camera_names
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import per_camera
@@ -18,7 +18,6 @@ _NARROWEST, _WIDEST = 5.0, 150.0
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF")
 """Pillow's names of the supported formats: its other readers, of which some start programs, are disabled."""
-_MOST_BYTES = 2**28
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """The tags of EXIF's own directory in a photo, and of FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
@@ -89,7 +88,7 @@ def _focal_of_photo(file: Path) -> float:
     """
     image = optional("PIL.Image", "photos")
     cure = "give an unedited photo of the camera, or degrees"
-    with open_regular(file, cure, _MOST_BYTES) as stream, warnings.catch_warnings():
+    with open_regular(file, cure, BIG) as stream, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's on large pictures: none is unpacked here
         try:
             with image.open(stream, formats=_FORMATS) as photo:

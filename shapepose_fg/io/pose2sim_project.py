@@ -9,8 +9,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.calibration.reading import is_calibration
-from shapepose_fg.io.camera_names import listing
-from shapepose_fg.io.detections.json_people import frame_files, frame_number
+from shapepose_fg.io.camera_names import listing, numbered
+from shapepose_fg.io.detections.json_people import FRAME_FILE
 from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.footage.footage import glance
 from shapepose_fg.io.footage.places import VIDEOS
@@ -103,8 +103,8 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         fps, origin = (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
         said = f"{fps:g} Hz{origin}"
     # Results have the numbers of the files' names, 0 where they have none, from the first that all have.
-    folders = [frame_files(each) for each in detections.iterdir() if each.is_dir()]
-    numbers = (min(map(frame_number, files)) for files in folders if len(files) > 0)
+    folders = [numbered(each, FRAME_FILE) for each in detections.iterdir() if each.is_dir()]
+    numbers = (files[0][0] for files in folders if len(files) > 0)
     return Pose2SimProject(
         folder,
         calibration,
@@ -176,7 +176,9 @@ def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{own}: there is no such file; give the folder of a Pose2Sim project, which contains it")
     trials = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
     if len(trials) > 0 and not any((folder / name).is_dir() for name in (*_POSES, "videos")):
-        raise InputError(f"{folder}: this is a session of several trials; give one of them: {listing(trials)}")
+        raise InputError(
+            f"{folder}: this is this is a session of several trials; give one of them: {listing(trials)}"
+        )
     config = read_toml(own, may_be_empty=True)
     if not above.is_file():
         return config, folder
@@ -216,7 +218,7 @@ def _detections(folder: Path, has_videos: bool) -> Path:
     """The folder of 2D detections; InputError with the command that makes them where there are videos only."""
 
     def is_pose(path: Path) -> bool:
-        there = len(frame_files(path)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
+        there = len(numbered(path, FRAME_FILE)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
         return there and not path.name.startswith(".")
 
     for place in (folder / name for name in _POSES):
@@ -227,7 +229,9 @@ def _detections(folder: Path, has_videos: bool) -> Path:
         problem = f"there are neither 2D detections ({' '.join(_POSES)}) nor videos"
         raise InputError(f"{folder}: {problem}; put the videos into {videos} and detect people in them")
     command = shlex.join(["shapepose-fg", "detect", "--project", str(folder.resolve()), "--network", "NETWORK"])
-    raise InputError(f"{pose}: there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}")
+    raise InputError(
+        f"{pose}: there are there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}"
+    )
 
 
 def footage_of(folder: Path) -> tuple[Path, Path, Path]:

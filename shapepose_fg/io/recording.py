@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.core.storage.files import BIG, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
@@ -19,7 +19,6 @@ from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.detections.view_streams import in_moments
 from shapepose_fg.io.timestamps import read_own_times, read_timestamps
 
-_MOST_BYTES = 2**28
 TIMES = "times.csv"
 """Name of the file with the times of detections, beside them."""
 
@@ -87,7 +86,7 @@ def write_moments(file: Path, rig: Rig, picture: Index) -> None:
 
 def read_moments(file: Path) -> dict[str, Index]:
     """Read a file of `write_moments`: (T,) pictures by the camera's name; InputError on anything else."""
-    lines = [re.split(r",\s*", line) for line in read_text(file, most=_MOST_BYTES).splitlines()]
+    lines = [re.split(r",\s*", line) for line in read_text(file, most=BIG).splitlines()]
     names, *rows = lines if len(lines) > 0 else [[""]]
     try:
         numbers = np.array(rows, dtype=np.intp).reshape(len(rows), len(names))

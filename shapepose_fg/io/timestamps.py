@@ -10,7 +10,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.frame_times import MOST_FPS, FrameTimes
 from shapepose_fg.core.moments import CameraClock, Moments, align
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.number_table import MISSING, read_number_table
@@ -18,8 +18,8 @@ from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 1e-6, 10.0
-"""Shortest and longest time between frames, s: outside of these the file has another unit."""
+_LONGEST_STEP_S = 10.0
+"""Longest time between frames, s: beyond it the file has another unit."""
 
 
 def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
@@ -128,7 +128,7 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
         what = f"line {lines[int(np.argmax(steps <= 0)) + 1]} must be later than the frame before"
         raise InputError(f"{path}: {what}; sort frames by time")
     step = float(np.median(steps)) if len(steps) > 0 else np.inf
-    if len(steps) > 0 and not _SHORTEST_STEP_S <= step <= _LONGEST_STEP_S:
+    if len(steps) > 0 and not 1 / MOST_FPS <= step <= _LONGEST_STEP_S:
         raise InputError(f"{path}: frames are {step:.3g} s apart; write seconds")
     if len(there) > 0 and len(time_s) == 0:
         raise InputError(f"{path}: camera {name} has no times; leave it out with --without")

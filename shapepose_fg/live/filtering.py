@@ -4,7 +4,7 @@ Tracking, searching and measuring are those of recordings (`tracking/`). Without
 deaths are decided by the same evidence as it comes in.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.following import observed
 from shapepose_fg.tracking.presence import APPEARS_S, LEAST_S, own_evidence, weighed
@@ -38,7 +39,7 @@ _LONGEST_S = 0.1
 
 
 @dataclass(frozen=True)
-class Gone:
+class Gone(Rows):
     """G tracks that ended and may be re-identified."""
 
     identity: Whole
@@ -172,13 +173,9 @@ class Filter:
         known = left.count >= LEAST_ROWS
         bones = np.where(known, left.length_m / np.maximum(left.count, 1), np.nan)
         centre = self._trace(self.placed(left)).centre
-        gone, more = now.gone, (left.identity, left.tracks.evident_s, centre, bones)
-        recent = now.tracks.time_s - gone.time_s <= self.stitching.longest_gap_s
-        columns: Any = [
-            np.concatenate([getattr(gone, each.name)[recent], new])[-_MOST_GONE:]
-            for each, new in zip(fields(Gone), more, strict=True)
-        ]
-        return replace(now.rows(stays), gone=Gone(*columns)), candidate[stays]
+        recent = now.gone.rows(now.tracks.time_s - now.gone.time_s <= self.stitching.longest_gap_s)
+        gone = Gone.concatenate([recent, Gone(left.identity, left.tracks.evident_s, centre, bones)])
+        return replace(now.rows(stays), gone=gone.rows(slice(-_MOST_GONE, None))), candidate[stays]
 
     def _with_newcomers(self, now: Moment, candidate: Index, given: Input) -> tuple[Moment, Index]:
         """Add the tracks of people found in detections that no track uses."""
@@ -229,8 +226,7 @@ class Filter:
             if name == ON_TRIAL:
                 name, next_identity = next_identity, next_identity + 1
             identity[row] = name
-        stays = ~np.isin(gone.identity, identity)
-        gone = Gone(*(getattr(gone, each.name)[stays] for each in fields(Gone)))
+        gone = gone.rows(~np.isin(gone.identity, identity))
         return replace(now, identity=identity, next_identity=next_identity, gone=gone)
 
     def _may_be_back(self, now: Moment, row: int) -> bool:

@@ -17,6 +17,7 @@ from typing import IO, Any
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import SMALL
 from shapepose_fg.io.detections.lines import read_view_line
 from shapepose_fg.io.ros.mcap_files import read_views
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
@@ -24,8 +25,6 @@ from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 Push = Callable[..., None]
 """Function that accepts what `OnlineReconstructor.push_view` does, and raises ValueError where it refuses."""
 Note = Callable[[str], None]
-_LONGEST_LINE = 2**20
-"""Maximum length of a line of detections, bytes: 600 people."""
 _PIECE = 2**16
 """Bytes that are read at a time."""
 _MOST_BAD = 10
@@ -125,7 +124,7 @@ class _Sender:
 
     def _read(self, line: bytes | None, place: str) -> tuple[Any, ...] | None:
         if line is None:
-            raise InputError(f"{place}: it is longer than {_LONGEST_LINE} bytes; write a line for each picture")
+            raise InputError(f"{place}: it is longer than {SMALL} bytes; write a line for each picture")
         try:
             text = line.decode()
         except UnicodeDecodeError as error:
@@ -146,14 +145,14 @@ class _Lines:
         *ended, begun = piece.split(b"\n") if piece else (b"", b"")
         for part in ended:
             self._begun += part
-            if len(self._begun) > _LONGEST_LINE and not self._too_long:
+            if len(self._begun) > SMALL and not self._too_long:
                 yield None
             elif not self._too_long:
                 yield bytes(self._begun)
             self._begun.clear()
             self._too_long = False
         self._begun += begun
-        if len(self._begun) > _LONGEST_LINE:
+        if len(self._begun) > SMALL:
             if not self._too_long:
                 yield None
             self._begun.clear()

@@ -2,16 +2,15 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.pieces import solved
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, nearby
 
@@ -76,7 +75,7 @@ def _spans(skeleton: Skeleton, longest_m: tuple[float, ...]) -> tuple[Index, Arr
 
 
 @dataclass(frozen=True)
-class PossiblePeople:
+class PossiblePeople(Rows):
     """H people who may be there."""
 
     places: Array
@@ -86,28 +85,12 @@ class PossiblePeople:
     gap_m: Array
     """(H, J, V) how far from the joint the detection's ray passes; NaN where there is none, or no place."""
 
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def rows(self, index: NDArray) -> "PossiblePeople":
-        """Some of them."""
-        return PossiblePeople(*(each[index] for each in self._arrays))
-
-    def with_more(self, other: "PossiblePeople") -> "PossiblePeople":
-        """These and others."""
-        both = zip(self._arrays, other._arrays, strict=True)
-        return PossiblePeople(*(np.concatenate(each) for each in both))
-
     def completed(self, person: int, part: "PossiblePeople") -> "PossiblePeople":
         """Return the hypotheses with the joints that `person` lacks taken from `part`, a single one."""
         lacks = np.zeros((*self.places.shape[:2], 1), dtype=bool)
         lacks[person] = np.isnan(self.places[person, :, :1]) & np.isfinite(part.places[0, :, :1])
-        both = zip(self._arrays, part._arrays, strict=True)
+        both = zip(vars(self).values(), vars(part).values(), strict=True)
         return PossiblePeople(*(np.where(lacks, new, old) for old, new in both))
-
-    @property
-    def _arrays(self) -> tuple[NDArray[Any], ...]:
-        return self.places, self.chosen, self.gap_m
 
     @classmethod
     def none(cls, frame: Frame) -> "PossiblePeople":

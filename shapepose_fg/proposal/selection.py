@@ -155,7 +155,7 @@ def _greedy(
         new = pool.rows(best)
         taken[new.chosen[new.chosen >= 0]] = True
         whole = _whole(new.places[0], people.places, frame)
-        people = people.with_more(new) if whole is None else people.completed(whole, new)
+        people = PossiblePeople.concatenate([people, new]) if whole is None else people.completed(whole, new)
     return None if people is before else people
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from shapepose_fg.cli.reconstruct.request import Request
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
-from shapepose_fg.core.storage.files import read_toml
+from shapepose_fg.core.storage.files import is_inside, read_toml
 from shapepose_fg.io.config import config_from
 from shapepose_fg.io.validation import describe
 
@@ -97,16 +97,13 @@ def _located(request: Request, path: Path, place: str) -> Request:
 
 def _inside(given: Path, path: Path, place: str) -> Path:
     """A path relative to the table's folder, inside it; or an absolute one."""
-    found = path.parent / given  # itself, where it is absolute
-    try:
-        inside = found.resolve().is_relative_to(path.parent.resolve())
-    except (OSError, RuntimeError, ValueError):  # links in a circle, a zero byte
-        raise InputError(f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it") from None
-    if not (inside or given.is_absolute()):
+    if "\0" in str(given):
+        raise InputError(f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it")
+    if not (is_inside(path.parent, given) or given.is_absolute()):
         raise InputError(
             f"{path}: {place}: {given} is outside the table's folder; if this is intended, give an absolute path"
         )
-    return found
+    return path.parent / given  # itself, where it is absolute
 
 
 def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
-from rich.text import Text
 
 from shapepose_fg.cli.reconstruct.request import Prepared
+from shapepose_fg.cli.setup_table import use_table
 from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
@@ -17,7 +17,6 @@ from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
 from shapepose_fg.setup_check.report import ResultCheck, SetupReport, unseen
 from shapepose_fg.setup_check.report import check_setup as check_detections
-from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Probability below which people are listed."""
@@ -135,10 +134,5 @@ def show_check(checked: ResultCheck) -> None:
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))
-        meaning = (
-            "error: median / 90 % of all detections assigned to people; used: the same after gating;\n"
-            "left out: median distance from where the other cameras alone place the joint"
-        )
-        show(Text(meaning, style="dim"))
     for each in checked.warnings:
         warn(each)

@@ -16,12 +16,13 @@ from typing import Any, BinaryIO
 
 from shapepose_fg.core.errors import InputError
 
-SMALL, MIDDLE, LARGE = 2**20, 2**26, 2**32
-"""Maximum size of a file, bytes: settings and tables of a few lines; cameras, or one frame; a recording."""
-PIECE = 2**20
+SMALL, MIDDLE, BIG, LARGE = 2**20, 2**26, 2**28, 2**32
+"""Maximum size of a file, bytes: settings and tables of a few lines; cameras, or one frame; times of a recording;
+detections."""
+PIECE = SMALL
 """Number of bytes that are read at a time where a file may be larger than memory."""
-_MOST_DEPTH = 64
-"""Maximum depth of nested lists and objects: no format has a fifth of it."""
+MOST_DEPTH = 64
+"""Maximum depth of nested lists and objects: no format has a fifth of it, and libyaml's loader is recursive."""
 _MOST_DOTS = 100
 """Maximum number of dots in a line of TOML: the parser's time grows with the square of the parts of a dotted
 key."""
@@ -62,16 +63,20 @@ def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> No
         _check_size(path, status.st_size, most)
 
 
+def is_inside(folder: Path, name: str | Path) -> bool:
+    """Whether `folder / name` lies in the folder, links followed; False where no file can have that name."""
+    try:
+        return (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # links that lead to each other, a zero byte
+        return False
+
+
 def inside(folder: Path, name: str) -> Path:
     """`folder / name`; InputError where a link there leads out of the folder, so that nothing is written there."""
-    place = folder / name
-    try:
-        stays = place.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # links that lead to each other
-        stays = False
-    if not stays:
-        raise InputError(f"{place}: this is a link that leads out of its folder; remove it, or give that folder")
-    return place
+    if not is_inside(folder, name):
+        cure = "remove it, or give that folder"
+        raise InputError(f"{folder / name}: this is a link that leads out of its folder; {cure}")
+    return folder / name
 
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
@@ -194,8 +199,8 @@ def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
     waiting: list[tuple[tuple[Any, ...], Any]] = [((), value)]
     while len(waiting) > 0:
         way, each = waiting.pop()
-        if len(way) > _MOST_DEPTH:
-            raise InputError(f"{path}: its lists are over {_MOST_DEPTH} deep; write the file again")
+        if len(way) > MOST_DEPTH:
+            raise InputError(f"{path}: its lists are over {MOST_DEPTH} deep; write the file again")
         items = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list) else ()
         for key, child in items:
             if isinstance(child, dict | list):

@@ -15,16 +15,14 @@ from numpy.typing import DTypeLike, NDArray
 
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.files import PIECE, open_regular
 
-_WRITTEN_BYTES = 1 << 20
-"""Bytes that the compressor receives at a time, whatever the size of an array's pieces."""
 _LEVEL = 1
 """Level of compression: half the time of zlib's usual 6 for files that are 3 % larger."""
 _SMALL_BYTES = 2**28
 """Maximum total size of the arrays of a small file, bytes, whatever their compression: NaN compresses 1000 to
 1."""
-_MOST_PACKED = 50
+MOST_PACKED = 50
 """Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
 _BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
 """Bytes of the rows that are unpacked at a time, and of those that are skipped at a time."""
@@ -62,8 +60,8 @@ class Pieces:
             if piece.size > 0:
                 raw = np.ascontiguousarray(piece, dtype=self.dtype).reshape(-1).view(np.uint8)
                 at = 0
-                while len(waiting) + len(raw) - at >= _WRITTEN_BYTES:
-                    stop = at + _WRITTEN_BYTES - len(waiting)
+                while len(waiting) + len(raw) - at >= PIECE:
+                    stop = at + PIECE - len(waiting)
                     yield waiting + raw[at:stop].tobytes()
                     at, waiting = stop, b""
                 waiting += raw[at:].tobytes()
@@ -240,7 +238,7 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
     if len({member.filename for member in members}) < len(members):
         raise ValueError("an array is there twice")
     total = sum(member.file_size for member in members)
-    if total > max(_SMALL_BYTES, _MOST_PACKED * size):
+    if total > max(_SMALL_BYTES, MOST_PACKED * size):
         raise ValueError(f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file")
 
 

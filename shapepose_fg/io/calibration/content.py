@@ -16,7 +16,15 @@ import numpy as np
 import yaml
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import MIDDLE, bounded, parse_toml, read_bytes, read_json, read_text
+from shapepose_fg.core.storage.files import (
+    MIDDLE,
+    MOST_DEPTH,
+    bounded,
+    parse_toml,
+    read_bytes,
+    read_json,
+    read_text,
+)
 
 Syntax = Literal["JSON", "TOML", "XML", "OpenCV", "YAML", "text", "folder", "pickle"]
 """Syntax of a file; "OpenCV" is the YAML or XML of its FileStorage."""
@@ -31,8 +39,6 @@ _YAML_VERSION = re.compile(r"\A%YAML[^\n]*\n")
 _ARRAY_TAGS = ("opencv-matrix", "opencv-nd-matrix")
 _MOST_CHARACTERS = 2**23
 """Maximum number of characters of a calibration; a camera has a thousand."""
-_MOST_DEPTH = 64
-"""Maximum depth of nested nodes: libyaml's loader is recursive and crashes the interpreter on very deep ones."""
 _MOST_DIGITS = 100
 """Maximum number of digits of a number: the time that YAML's base 60 takes grows with their square."""
 
@@ -113,8 +119,8 @@ def _refuse_hostile(path: Path, text: str) -> None:
         if isinstance(event, yaml.AliasEvent):
             raise InputError(f"{line} refers to a node by *name; write it out")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > _MOST_DEPTH:
-            raise InputError(f"{line}: nodes are over {_MOST_DEPTH} deep; write the file again")
+        if depth > MOST_DEPTH:
+            raise InputError(f"{line}: nodes are over {MOST_DEPTH} deep; write the file again")
 
 
 def _parse_xml(path: Path, text: str) -> ET.Element:
@@ -131,10 +137,10 @@ def _parse_xml(path: Path, text: str) -> ET.Element:
     except ValueError as error:
         raise InputError(f"{path}: cannot be read as XML ({error}); write the file again") from None
     level = [root]
-    for _ in range(_MOST_DEPTH):
+    for _ in range(MOST_DEPTH):
         level = [child for each in level for child in each]
     if len(level) > 0:
-        raise InputError(f"{path}: elements are over {_MOST_DEPTH} deep; write the file again")
+        raise InputError(f"{path}: elements are over {MOST_DEPTH} deep; write the file again")
     return root
 
 

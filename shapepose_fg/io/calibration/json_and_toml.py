@@ -14,6 +14,7 @@ from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.rig_file import RIG_FORMAT
+from shapepose_fg.core.storage.files import is_inside
 from shapepose_fg.core.trajectory import DRIFT, Trajectory
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import Format, Node, Unit, WrittenCamera, WrittenRig, intrinsics
@@ -108,7 +109,7 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
 
 def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
     """The trajectory in the file `name` beside the rig file, in the rig's world."""
-    if Path(name).is_absolute() or ".." in Path(name).parts:
+    if Path(name).is_absolute() or not is_inside(path.parent, name):
         raise InputError(
             f"{path}: trajectory {name[:80]} must be in the folder of the rig file or below; move it there"
         )

@@ -13,7 +13,7 @@ from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import JSON_AND_TOML
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV, ROS
-from shapepose_fg.io.calibration.written import METRES, Format, Unit
+from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 from shapepose_fg.io.calibration.xml_files import QUALISYS, VICON
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.trajectories import read_trajectory
@@ -58,10 +58,9 @@ def read_rig(
             f"{path}: this is a Python pickle (as OpenCap writes), which could run any program when opened; if"
             " you trust it, convert it to a rig file as in docs/conventions.md"
         )
-    tried = ((each, each.read(content)) for each in FORMATS)
-    form, written = next((both for both in tried if both[1] is not None), (FORMATS[0], None))
-    if written is None:
+    if (known := recognised(content)) is None:
         raise InputError(_unknown(content))
+    form, written = known
     with naming(path):
         wanted = choose([camera.name for camera in written.cameras], cameras, without)
     unwanted = [camera.name for camera in written.cameras if camera.name not in wanted]
@@ -84,6 +83,12 @@ def read_rig(
         trajectories = tuple(each for each in written.trajectories if each.name in carriers)
         notes = tuple(f"{path}: {each}" for each in written.notes)
         return carried(Rig(finished, up, trajectories=trajectories, notes=notes, unwanted=tuple(unwanted)))
+
+
+def recognised(content: Content) -> tuple[Format, WrittenRig] | None:
+    """The first format that has this content, and the cameras; None where it is none. InputError where damaged."""
+    read = ((each, each.read(content)) for each in FORMATS)
+    return next(((form, written) for form, written in read if written is not None), None)
 
 
 def carried(rig: Rig) -> Rig:
@@ -126,7 +131,7 @@ def is_calibration(path: Path) -> bool:
     except InputError:
         return False
     try:
-        return content.syntax != "pickle" and any(each.read(content) is not None for each in FORMATS)
+        return content.syntax != "pickle" and recognised(content) is not None
     except InputError:
         return True
 

@@ -5,7 +5,6 @@ file.
 import json
 import re
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import wanted_tables
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
-from shapepose_fg.io.calibration.reading import FORMATS
+from shapepose_fg.io.calibration.reading import FORMATS, recognised
 from shapepose_fg.io.calibration.rewriting import REWRITTEN, numbers_of
 from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 
@@ -47,9 +46,8 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
     if [each.name for each in written.cameras] != list(rig.names):
         return _own(rig, target)
     metres = METRES[unit or written.unit or "m"]
-    place = _PLACES.get(form.name)
-    if place is not None:
-        for camera, entry in zip(rig.cameras, place(content.value), strict=True):
+    if content.syntax == "JSON":
+        for camera, entry in zip(rig.cameras, _entries(content.value), strict=True):
             _fill(entry, camera, metres)
         files = {source: json.dumps(content.value, indent=1)}
     elif content.syntax == "TOML":
@@ -89,9 +87,7 @@ def check_target(source: Path, target: Path) -> None:
 def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
     """The content of `source`, its format, and its cameras."""
     content = load(source)
-    read = ((each, each.read(content)) for each in FORMATS)
-    found = next(((form, written) for form, written in read if written is not None), None)
-    if found is None:
+    if (found := recognised(content)) is None:
         raise InputError(f"{source}: the calibration is not there any more; read it again")
     return content, *found
 
@@ -129,19 +125,14 @@ def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
     return True
 
 
-def _voxelpose(value: Any) -> list[dict[str, Any]]:
-    if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
-        value = next(iter(value.values()))
-    return value if isinstance(value, list) else list(value.values())
-
-
-_PLACES: dict[str, Callable[[Any], list[dict[str, Any]]]] = {
-    "rig file": lambda value: value["cameras"],
-    "CMU Panoptic's JSON": lambda value: value["cameras"],
-    "VoxelPose's JSON": _voxelpose,
-    "4D Association's calibration.json": lambda value: list(value.values()),
-}
-"""Functions that return the cameras in each format of JSON, in the order in which they are read."""
+def _entries(value: Any) -> list[dict[str, Any]]:
+    """The cameras in JSON, in the order in which they are read: a list or an object of them, or a list in one."""
+    if isinstance(value, dict):
+        lists = [
+            each for key, each in value.items() if isinstance(each, list) and (key == "cameras" or len(value) == 1)
+        ]
+        value = lists[0] if lists else list(value.values())
+    return value
 
 
 def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Camera
-from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.core.decompositions import ROTATION_TOLERANCE, nearest_rotation, rigid
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.lens import Lens, padded_distortion
 from shapepose_fg.core.trajectory import Trajectory
@@ -23,8 +23,6 @@ Unit = Literal["m", "cm", "mm"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit, metres."""
 
-_ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of R Rᵀ from the identity: calibrations are printed with four to six digits."""
 _EXACT = 1e-12
 """Deviation below which a rotation is kept as written, so that a rig that is written and read stays the same."""
 _MOST_COEFFICIENTS = 14
@@ -200,7 +198,7 @@ def pose(
     R, t = np.asarray(R, dtype=np.float64).ravel(), np.asarray(t, dtype=np.float64).ravel()
     R = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64) if R.size == 3 else R.reshape(3, 3)
     off = np.abs(R @ R.T - np.eye(3)).max()
-    if not off <= _ROTATION_TOLERANCE:
+    if not off <= ROTATION_TOLERANCE:
         problem = f"the rotation of {key} is not orthonormal (R Rᵀ is off by {off:.2g})"
         raise InputError(f"{place}: {problem}; give a pure rotation without scale, row by row")
     if np.linalg.det(R) < 0:
@@ -208,16 +206,15 @@ def pose(
         raise InputError(f"{place}: the rotation of {key} is a reflection (determinant -1); {cure}")
     if off >= _EXACT:
         R = nearest_rotation(R)
-    wTc = np.eye(4)
-    wTc[:3, :3] = R if world_from_camera else R.T
-    wTc[:3, 3] = t if world_from_camera or centre else -R.T @ t
-    return wTc
+    if world_from_camera:
+        return rigid(R, t)
+    return rigid(R.T, t if centre else -R.T @ t)
 
 
 def rotation_of(quaternion: ArrayLike, key: str, place: str) -> Array:
     """The rotation matrix (3, 3) of a quaternion x y z w; InputError where it is not of length 1."""
     length = float(np.sqrt(np.square(quaternion).sum()))
-    if not abs(length - 1) <= _ROTATION_TOLERANCE:
+    if not abs(length - 1) <= ROTATION_TOLERANCE:
         raise InputError(f"{place}: the quaternion {key} must have length 1, got {length:.4g}; write it again")
     x, y, z, w = np.asarray(quaternion, dtype=np.float64) / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

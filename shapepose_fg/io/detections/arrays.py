@@ -9,28 +9,25 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
-from shapepose_fg.core.storage.files import open_regular
-from shapepose_fg.core.storage.npz import read_npy_header
+from shapepose_fg.core.storage.files import SMALL, open_regular
+from shapepose_fg.core.storage.npz import MOST_PACKED, read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
-from shapepose_fg.io.detections.csv_people import body_parts, people_in
+from shapepose_fg.io.detections.csv_people import BLAZEPOSE, body_parts, taken
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 
 _FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF5", "DeepLabCut's HDF5"
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Maximum number of values in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
-_SMALL_BYTES, _MOST_PACKED = 2**27, 50
-"""Size up to which an array of a compressed file counts as small, bytes, and maximum compression ratio of
-larger ones."""
+_SMALL_BYTES = 2**27
+"""Size up to which an array of a compressed file counts as small, bytes."""
 _MOST_CAMERAS = 1000
 _MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
-_TABLE, _LONGEST_LIST = "df_with_missing/table", 2**20
-"""Path of the table of DeepLabCut and AniPose, and maximum size of the list of its columns, bytes."""
+_TABLE = "df_with_missing/table"
+"""Path of the table of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
 """HDF5's reference to a text of variable length: its length, and its place."""
-_BLAZEPOSE = 33
-"""Number of MediaPipe's points of the body, which come first; hands and face follow."""
 _HDF5 = "an HDF5 file, of which only SLEAP's analysis files and DeepLabCut's tables are supported; give the CSV"
 _FREEMOCAP_3D = (
     "FreeMoCap's table of 3D points, but its 2D points are needed; give the recording's folder, or"
@@ -83,20 +80,18 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
     order = "F" if fortran else "C"
     every = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=shape, order=order)
     own = every[camera]
-    body = _BLAZEPOSE if "mediapipe" in path.name.lower() and shape[2] >= _BLAZEPOSE else shape[2]
+    body = BLAZEPOSE if "mediapipe" in path.name.lower() and shape[2] >= BLAZEPOSE else shape[2]
     third = own[:, :body, 2] if shape[3] == 3 else None
     scored = third is not None and not ((third < 0) | (third > 1)).any() and bool(np.isfinite(third).any())
 
     def blocks() -> Iterator[PeopleBlock]:
         for start in range(0, shape[1], BLOCK_FRAMES):
-            part = np.array(own[start : start + BLOCK_FRAMES, :body], dtype=np.float64)
-            seen = np.asarray(np.isfinite(part[..., :2]).all(axis=2))
-            score = np.nan_to_num(part[..., 2]) if scored else np.ones(seen.shape)
-            points = np.concatenate([np.nan_to_num(part[..., :2]), np.where(seen, score, 0.0)[..., None]], axis=2)
-            frame = np.flatnonzero(seen.any(axis=1))
-            yield PeopleBlock(frame + start, points[frame])
+            part = np.array(own[start : start + BLOCK_FRAMES, None, :body], dtype=np.float64)
+            score = part[..., 2:] if scored else np.ones((*part.shape[:3], 1))
+            points = np.concatenate([part[..., :2], score], axis=3)
+            yield PeopleBlock.dense(np.arange(start, start + len(part)), points)
 
-    joints = "mediapipe" if body == _BLAZEPOSE else None
+    joints = "mediapipe" if body == BLAZEPOSE else None
     return CameraPeople(path, _FREEMOCAP, blocks(), 0, shape[1] - 1, rerun=_RERUN, joints=joints)
 
 
@@ -160,10 +155,10 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
         raise InputError(
             f"{path}: has {len(rows)} frames, and its columns do not match their names; export it again"
         )
-    row, people = people_in(values.astype(np.float64), picked)
-    first, last = int(frame[0]), int(frame[-1])
-    blocks = iter([PeopleBlock(frame[row].astype(np.intp), people)] if len(row) > 0 else [])
-    return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+    block = PeopleBlock.dense(frame.astype(np.intp), taken(values.astype(np.float64), picked))
+    return CameraPeople(
+        path, _DEEPLABCUT, iter([block]), int(frame[0]), int(frame[-1]), rerun=_RERUN, joints=joints
+    )
 
 
 def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
@@ -173,7 +168,7 @@ def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
     ValueError where it is anything else.
     """
     kind = attributes.get_id(name)
-    if kind.dtype.kind != "S" or kind.shape != () or kind.dtype.itemsize > _LONGEST_LIST:
+    if kind.dtype.kind != "S" or kind.shape != () or kind.dtype.itemsize > SMALL:
         raise ValueError(f"{name} is not text")
     known, rows, row, last = dict[Any, str](), list[list[str]](), list[str](), ""
     for operation, value, _ in pickletools.genops(bytes(attributes[name])):
@@ -212,17 +207,10 @@ def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
         raise InputError(
             f"{path}: tracks are {xy.shape}, but there are {len(joints)} node_names; export it again with SLEAP"
         )
-    seen = np.asarray(np.isfinite(xy).all(axis=3))
-    score = np.where(seen, np.where(np.isfinite(score), score, 1.0), 0.0)
-    points = np.concatenate([np.where(seen[..., None], xy, 0.0), score[..., None]], axis=3)
-
-    def blocks() -> Iterator[PeopleBlock]:
-        for start in range(0, len(points), BLOCK_FRAMES):
-            part = slice(start, start + BLOCK_FRAMES)
-            frame, track = np.nonzero(seen[part].any(axis=2))
-            yield PeopleBlock(frame + start, points[part][frame, track])
-
-    return CameraPeople(path, _SLEAP, blocks(), 0, len(points) - 1, rerun=_RERUN, joints=joints)
+    points = np.concatenate([xy, np.where(np.isfinite(score), score, 1.0)[..., None]], axis=3)
+    parts = (slice(start, start + BLOCK_FRAMES) for start in range(0, len(points), BLOCK_FRAMES))
+    blocks = (PeopleBlock.dense(np.arange(len(points))[part], points[part]) for part in parts)
+    return CameraPeople(path, _SLEAP, blocks, 0, len(points) - 1, rerun=_RERUN, joints=joints)
 
 
 def _dataset(h5py: Any, file: Any, name: str) -> Any:
@@ -284,5 +272,5 @@ def _numbers(path: Path, dataset: Any) -> Array:
 
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
     """InputError where so many numbers are more than the file can hold."""
-    if 8 * count > max(_SMALL_BYTES, _MOST_PACKED * path.stat().st_size):
+    if 8 * count > max(_SMALL_BYTES, MOST_PACKED * path.stat().st_size):
         raise InputError(f"{path}: its arrays {shape} are too large; export a part of the recording")

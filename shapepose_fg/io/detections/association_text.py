@@ -14,15 +14,13 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
-from shapepose_fg.core.storage.files import text_pieces
+from shapepose_fg.core.storage.files import SMALL, text_pieces
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import OVERSHOOT
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
 from shapepose_fg.io.validation import is_number
 from shapepose_fg.proposal.assignment import match_best_first
 
-_LONGEST_WORD = 2**20
-"""Maximum number of characters of a number."""
 _SPACE = " \n\t"
 """Characters at which pieces end, so that no number, letter or end of line is cut."""
 SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
@@ -73,7 +71,7 @@ def _whole_words(path: Path) -> Iterator[str]:
     for piece in text_pieces(path):
         left += piece
         cut = 1 + max(left.rfind(space) for space in _SPACE)
-        if cut == 0 and len(left) > _LONGEST_WORD:
+        if cut == 0 and len(left) > SMALL:
             cut = len(left)
         if cut > 0:
             yield left[:cut]

@@ -9,16 +9,17 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.core.storage.files import open_regular, text_pieces
-from shapepose_fg.io.camera_names import MOST_FRAME, match_names
+from shapepose_fg.io.camera_names import MOST_FRAME, last_number, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 from shapepose_fg.io.validation import is_number
 
 _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
 _MOST_COLUMNS = 10_000
-_BLAZEPOSE = 33
-"""Caliscope's number of MediaPipe's points of the body; those of hands and face have other numbers."""
+BLAZEPOSE = SKELETONS["BLAZEPOSE_33"].keypoint_count
+"""Number of MediaPipe's points of the body; those of hands and face come after them."""
 _LINES = 4096
 """Number of lines that are processed together."""
 
@@ -60,7 +61,7 @@ def read_deeplabcut(path: Path) -> CameraPeople:
     joints, picked = body_parts(path, zip(whose, heads["bodyparts"], heads["coords"], strict=False))
     width = count + 1
 
-    frames, found, first, last = list[Index](), list[Array](), 0, -1
+    blocks, first, last = list[PeopleBlock](), 0, -1
     while len(some := list(islice(rows, _LINES))) > 0:
         numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[:, 0]
         if (np.diff(numbers, prepend=last) <= 0).any():
@@ -68,13 +69,10 @@ def read_deeplabcut(path: Path) -> CameraPeople:
             raise InputError(f"{path}: line {line}: frame numbers must increase; {_RERUN}")
         first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
         values = np.array([_numbers(path, line, row, width) for line, row in some])
-        row, people = people_in(values, picked)
-        frames.append(numbers[row])
-        found.append(people)
+        blocks.append(PeopleBlock.dense(numbers, taken(values, picked)))
     if last < 0:
         raise InputError(f"{path}: there are no frames below the headings; {_RERUN}")
-    blocks = (PeopleBlock(*each) for each in zip(frames, found, strict=True) if len(each[0]) > 0)
-    return CameraPeople(path, _DEEPLABCUT, blocks, first, last, rerun=_RERUN, joints=joints)
+    return CameraPeople(path, _DEEPLABCUT, iter(blocks), first, last, rerun=_RERUN, joints=joints)
 
 
 def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tuple[str, ...], Index]:
@@ -97,12 +95,9 @@ def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tup
     return joints, np.array(picked)
 
 
-def people_in(values: Array, columns: Index) -> tuple[Index, Array]:
-    """The row of each person who is seen in a table `values` (T, C), and keypoints (N, J, 3), by `body_parts`."""
-    taken = np.where(columns > 0, values[:, columns], 1.0)  # no likelihood: as sure as any
-    seen = np.asarray(np.isfinite(taken).all(axis=3))
-    row, person = np.nonzero(seen.any(axis=2))
-    return row, np.where(seen[..., None], taken, 0.0)[row, person]
+def taken(values: Array, columns: Index) -> Array:
+    """(T, P, J, 3) keypoints of each person in a table `values` (T, C), by the `columns` of `body_parts`."""
+    return np.where(columns > 0, values[:, columns], 1.0)  # no likelihood: as sure as any
 
 
 def cameras_of_caliscope(path: Path) -> list[str]:
@@ -119,9 +114,9 @@ def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeo
     table = _points(path)
     ports = np.unique(table[:, 1].astype(np.intp)).tolist()
     own = table[table[:, 1] == _port(path, camera, cameras, ports)]
-    own = own[own[:, 2] < _BLAZEPOSE]
+    own = own[own[:, 2] < BLAZEPOSE]
     frame, place = np.unique(own[:, 0].astype(np.intp), return_inverse=True)
-    keypoints = np.zeros((len(frame), _BLAZEPOSE, 3))
+    keypoints = np.zeros((len(frame), BLAZEPOSE, 3))
     keypoints[place, own[:, 2].astype(np.intp)] = np.column_stack([own[:, 3:], np.ones(len(own))])
     first, last = int(table[:, 0].min()), int(table[:, 0].max())
     blocks = iter([PeopleBlock(frame, keypoints)])
@@ -150,11 +145,11 @@ def _points(path: Path) -> Array:
             raise InputError(f"{path}: line {line} must hold whole numbers and pixels; export it again")
         parts.append(values)
     table = np.concatenate(parts) if parts else np.zeros((0, 5))
-    if table[:, 2].max(initial=0) > _BLAZEPOSE and not (table[:, 2] == 0).any():
+    if table[:, 2].max(initial=0) > BLAZEPOSE and not (table[:, 2] == 0).any():
         table = table[:0]
     if len(table) == 0:
         raise InputError(
-            f"{path}: there are no points of a person's body; track with Caliscope's POSE or HOLISTIC"
+            f"{path}: there are there are no points of a person's body; track with Caliscope's POSE or HOLISTIC"
         )
     return table
 
@@ -199,15 +194,10 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _frame(path: Path, line: int, word: str) -> int:
     """The frame's number: the first field, or the last number in a picture's name."""
-    digits = ""
-    for each in reversed(word.strip().rsplit(".", 1)[0]):
-        if each.isdigit() and each.isascii():
-            digits = each + digits
-        elif digits:
-            break
-    if digits and len(digits) <= len(str(MOST_FRAME)):
-        return int(digits)
-    raise InputError(f"{path}: line {line} must begin with a frame number, got {word[:40]!r}; {_RERUN}")
+    number = last_number(word.strip().rsplit(".", 1)[0])
+    if number is None or number == MOST_FRAME:
+        raise InputError(f"{path}: line {line} must begin with a frame number, got {word[:40]!r}; {_RERUN}")
+    return number
 
 
 def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:

@@ -6,22 +6,22 @@ Pose2Sim (RTMLib's people written in OpenPose's way) leaves `_keypoints` out of 
 that it dropped, and `{}` for people that a camera does not see.
 """
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from itertools import chain, islice, pairwise
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, TypeAdapter
+from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
-from shapepose_fg.io.camera_names import MOST_FRAME, in_order
+from shapepose_fg.core.storage.files import BIG, LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
+from shapepose_fg.io.camera_names import MOST_FRAME, in_order, last_number, numbered
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
-from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock, check_one_model, frame_blocks
 from shapepose_fg.io.json_items import JsonItems
 from shapepose_fg.io.validation import describe, validated, validated_list
 
@@ -43,12 +43,8 @@ _LONGEST_GAP = 1000
 """Largest ratio of missing to existing frames: more are numbers of something else."""
 _LOOKED_AT = 100
 """Maximum number of files without people that are read to recognise the program."""
-_LONGEST_NAME = 4096
-"""Maximum number of characters of a picture's path: the time of the search grows with their square."""
-_FRAME_FILE = re.compile(r"(\d+)(_keypoints|(\.\w{1,5})?\.predictions)?\.json$")
-"""Pattern of the names of files of frames."""
-_FRAME_NUMBER = re.compile(r"(\d+)\D*$")
-"""The last number in the name of a picture."""
+FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
+"""What follows the number in the names of files of frames."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
 """AlphaPose's file of all frames, and its folder for a file a frame, of --format open and cmu."""
 _LISTS = ("annotations", "instance_info")
@@ -59,13 +55,21 @@ array."""
 
 
 class _Person(BaseModel, strict=True, extra="allow"):
-    """A person of a frame of OpenPose; hands and face are passed over."""
+    """A person of OpenPose, or of AlphaPose's formats `open` and `cmu`; hands and face are passed over."""
 
     pose_keypoints_2d: list[float] | None = None
+    joints: list[float] | None = None
+
+    def flat(self, place: str, program: str) -> list[float]:
+        """x, y and score of each keypoint; nothing where the person has none."""
+        values = self.joints if self.pose_keypoints_2d is None else self.pose_keypoints_2d
+        if values is None and self.model_extra:
+            raise InputError(f"{place}.pose_keypoints_2d is missing; {_RERUN[program]}")
+        return _checked(values or [], f"{place}.pose_keypoints_2d", program)
 
 
 class _Frame(BaseModel, strict=True):
-    people: list[_Person]
+    people: list[_Person] = Field(validation_alias=AliasChoices("people", "bodies"))
 
 
 class _Instance(BaseModel, strict=True):
@@ -90,18 +94,28 @@ class _VideoFrame(BaseModel, strict=True):
     instances: list[_Instance]
 
 
-class _Result(BaseModel, strict=True):
-    """A person of COCO's results."""
-
-    image_id: int | str
-    keypoints: Annotated[list[float], Field(min_length=1)]
-    category_id: int | str | None = None
-
-
 class _Flat(BaseModel, strict=True):
     """A person of OpenPifPaf."""
 
     keypoints: Annotated[list[float], Field(min_length=1)]
+
+    def flat(self, place: str, program: str) -> list[float]:
+        """x, y and score of each keypoint."""
+        return _checked(self.keypoints, f"{place}.keypoints", program)
+
+
+class _Result(_Flat):
+    """A person of COCO's results."""
+
+    image_id: int | str
+    category_id: int | str | None = None
+
+
+class _PifPafFrame(BaseModel, strict=True):
+    """A frame of OpenPifPaf's video."""
+
+    frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
+    predictions: list[_Flat]
 
 
 class _Columns(BaseModel, strict=True):
@@ -117,37 +131,24 @@ class _Object(BaseModel, strict=True):
 
     keypoints: _Columns | None = None
 
-    def flat(self, place: str) -> list[float]:
+    def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint; those that are hardly seen are at 0 0."""
         own = self.keypoints
         if own is None:
             return []
         scores = [1.0] * len(own.x) if own.visible is None else own.visible
         if not len(own.x) == len(own.y) == len(scores):
-            raise InputError(f"{place}.keypoints must have the same number of x, y and visible; {_RERUN[_YOLO]}")
+            raise InputError(f"{place}.keypoints must have the same number of x, y and visible; {_RERUN[program]}")
         rows = zip(own.x, own.y, scores, strict=True)
         return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
 
 
-class _Body(BaseModel, strict=True):
-    """A person of AlphaPose's --format cmu."""
-
-    joints: Annotated[list[float], Field(min_length=1)]
-
-
-class _Bodies(BaseModel, strict=True):
-    bodies: list[_Body]
-
-
-class _PifPafFrame(BaseModel, strict=True):
-    """A frame of OpenPifPaf's video."""
-
-    frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
-    predictions: list[_Flat]
-
-
-_INSTANCES = TypeAdapter(list[_Instance])
-_FLAT, _OBJECTS = TypeAdapter(list[_Flat]), TypeAdapter(list[_Object])
+_LIST_OF = {
+    _PIFPAF: TypeAdapter(list[_Flat]),
+    _YOLO: TypeAdapter(list[_Object]),
+    _PICTURES: TypeAdapter(list[_Instance]),
+}
+"""The people of a frame, by the programs that write them as a list; others write an object, a `_Frame`."""
 _RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
 
 
@@ -161,20 +162,21 @@ def _checked(values: list[float], place: str, program: str) -> list[float]:
     return values
 
 
-def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, program: str) -> None:
-    """Add numbers of keypoints to `known`; InputError where there are several."""
-    known |= {len(person) // 3 for person in people}
-    if len(known) > 1:
-        counts = " and ".join(map(str, sorted(known)))
-        what = f"recognised as {program}, but people have {counts} keypoints"
-        raise InputError(f"{source}: {what}; give the detections of one model")
+def _people(content: Any, place: object, program: str) -> list[list[float]]:
+    """Flat keypoints of the people of a frame; people without keypoints are left out."""
+    if program in _LIST_OF:
+        key, people = "", validated_list(_LIST_OF[program], content, place, _RERUN[program])
+    else:
+        key, people = "people", validated(_Frame, content, place, _RERUN[program]).people
+    every = (each.flat(f"{place}: {key}[{number}]", program) for number, each in enumerate(people))
+    return [each for each in every if each]
 
 
 def read_json_people(place: Path) -> CameraPeople:
     """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
     if not place.is_dir():
         return read_one_file(place)
-    if (place / _SEP_JSON).is_dir() and len(frame_files(place)) == 0:
+    if (place / _SEP_JSON).is_dir() and len(numbered(place, FRAME_FILE)) == 0:
         return read_frame_files(place / _SEP_JSON)
     lists = _lists(place)
     if [each.name for each in lists] == [_ALL_FRAMES]:
@@ -221,28 +223,14 @@ def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple
 # A file per frame.
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """Files of a folder that are named after a frame, in order of their names."""
-    # macOS leaves ._000000_keypoints.json beside each file that it copies.
-    found = [each for each in folder.iterdir() if _FRAME_FILE.search(each.name) and not each.name.startswith(".")]
-    return sorted(each for each in found if each.is_file())
-
-
-def frame_number(file: Path) -> int:
-    """The number of the frame that one of `frame_files` is named after."""
-    match = _FRAME_FILE.search(file.name)
-    assert match is not None
-    return int(match[1])
-
-
 def read_frame_files(folder: Path) -> CameraPeople:
     """The frames that one camera saw; InputError naming file, key and cure.
 
     A frame's number is in its file's name. No people are seen in frames whose files are missing in between
     (`gaps`).
     """
-    files = frame_files(folder)
-    if len(files) == 0:
+    found = numbered(folder, FRAME_FILE)
+    if len(found) == 0:
         lists = sorted(each.name for each in _lists(folder))
         what = (
             "there is no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; write the"
@@ -253,15 +241,15 @@ def read_frame_files(folder: Path) -> CameraPeople:
             what = f"there are several JSON files without frame numbers ({names}); keep only one"
         raise InputError(f"{folder}: {what}")
     program, joints = _OPENPOSE, None
-    if not files[0].name.endswith("_keypoints.json"):
-        program, joints = _program_of_frames(files)
-    numbered = in_order([(frame_number(file), file) for file in files])
-    first, last = numbered[0][0], numbered[-1][0]
-    if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
-        problem = f"{len(numbered)} files are numbered from {first} to {last}"
+    if not found[0][1].name.endswith("_keypoints.json"):
+        program, joints = _program_of_frames([file for _, file in found])
+    in_order(found)
+    first, last = found[0][0], found[-1][0]
+    if last - first + 1 > 2 * len(found) + _LONGEST_GAP:
+        problem = f"{len(found)} files are numbered from {first} to {last}"
         raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
-    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
-    blocks = _frame_blocks(folder, program, numbered, joints)
+    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(found) if other > one + 1)
+    blocks = frame_blocks(folder, program, found, partial(_people_of_file, program=program, joints=joints))
     return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints)
 
 
@@ -290,49 +278,16 @@ def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | 
     return program, joints
 
 
-def _frame_blocks(
-    folder: Path, program: str, numbered: list[tuple[int, Path]], joints: str | tuple[str, ...] | None
-) -> Iterator[PeopleBlock]:
-    """The people of the files, block by block."""
-    counts = set[int]()
-    for start in range(0, len(numbered), BLOCK_FRAMES):
-        frames, people = list[int](), list[list[float]]()
-        for number, file in numbered[start : start + BLOCK_FRAMES]:
-            found = _people_of_frame(file, program, joints)
-            people += found
-            frames += [number] * len(found)
-        _of_one_model(counts, people, folder, program)
-        yield PeopleBlock.of(frames, people)
-
-
-def _people_of_frame(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
-    """Flat keypoints of the people of a frame; people without keypoints are left out."""
-    content, rerun, found = read_json(file, most=MIDDLE), _RERUN[program], list[list[float]]()
-    if program in (_PIFPAF, _SEPARATE):
-        if program == _PIFPAF:
-            flat = [each.keypoints for each in validated_list(_FLAT, content, file, rerun)]
-        else:
-            flat = [each.joints for each in validated(_Bodies, content, file, rerun).bodies]
-        return [_checked(each, f"{file}: [{number}]", program) for number, each in enumerate(flat)]
-    if program == _YOLO:
-        objects = validated_list(_OBJECTS, content, file, rerun)
-        return [own for number, each in enumerate(objects) if (own := each.flat(f"{file}: [{number}]"))]
-    if program == _PICTURES:
-        if isinstance(content, dict):
-            if _joints_of_meta(content.get("meta_info")) != joints:
-                raise InputError(
-                    f"{file}: its meta_info names other joints than the first file; give the files of one model"
-                )
-            content = content.get("instance_info")
-        instances = validated_list(_INSTANCES, content, file, rerun)
-        return [person.flat(f"{file}: [{number}]", program) for number, person in enumerate(instances)]
-    for number, person in enumerate(validated(_Frame, content, file, rerun).people):
-        values, place = person.pose_keypoints_2d, f"{file}: people[{number}].pose_keypoints_2d"
-        if values is None and person.model_extra:
-            raise InputError(f"{place} is missing; {rerun}")
-        if values:
-            found.append(_checked(values, place, program))
-    return found
+def _people_of_file(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
+    """Flat keypoints of the people of a frame."""
+    content = read_json(file, most=MIDDLE)
+    if program == _PICTURES and isinstance(content, dict):
+        if _joints_of_meta(content.get("meta_info")) != joints:
+            raise InputError(
+                f"{file}: its meta_info names other joints than the first file; give the files of one model"
+            )
+        content = content.get("instance_info")
+    return _people(content, file, program)
 
 
 # One file with all frames.
@@ -388,7 +343,7 @@ class _Collected:
 
     def add(self, rows: list[list[float]]) -> None:
         """Add people with flat keypoints."""
-        _of_one_model(self._counts, rows, self.path, self.program)
+        check_one_model(self._counts, rows, self.path, self.program)
         if len(rows) > 0:
             self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
 
@@ -431,31 +386,24 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
             raise InputError(f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}")
         last = one.frame
         place = f"{path}: line {number}"
-        people.add([_checked(each.keypoints, place, _PIFPAF) for each in one.predictions])
+        people.add([each.flat(place, _PIFPAF) for each in one.predictions])
         frames += [one.frame] * len(one.predictions)
     return people.camera(frames, (min(frames, default=0), last), None)
 
 
 def _by_picture(path: Path) -> CameraPeople | None:
     """AlphaPose's file of --format open and cmu, people by the name of their picture; None where it is another."""
-    content = read_json(path, most=2**28)
+    content = read_json(path, most=BIG)
     kinds = {key for each in content.values() for key in (each if isinstance(each, dict) else ())}
     if len(content) == 0 or not kinds & {"people", "bodies"}:
         return None
-    people, numbered = _Collected(path, _SEPARATE), list[tuple[int, list[list[float]]]]()
+    people, numbers, frames = _Collected(path, _SEPARATE), list[int](), list[int]()
     for name, frame in content.items():
-        place, rerun = f"{path}: {name[:40]!r}", _RERUN[_SEPARATE]
-        number = _number(name, None, place, _SEPARATE)
-        if "bodies" in kinds:
-            flat = [each.joints for each in validated(_Bodies, frame, path, rerun).bodies]
-        else:
-            flat = [each.pose_keypoints_2d or [] for each in validated(_Frame, frame, path, rerun).people]
-        numbered.append((number, [_checked(each, place, _SEPARATE) for each in flat if each]))
-    for _, flat in numbered:
-        people.add(flat)
-    listed = [number for number, _ in numbered]
-    frames = [number for number, flat in numbered for _ in flat]
-    return people.camera(frames, (min(listed), max(listed)), "openpose coco")
+        place = f"{path}: {name[:40]!r}"
+        numbers.append(_number(name, None, place, _SEPARATE))
+        people.add(flat := _people(frame, place, _SEPARATE))
+        frames += [numbers[-1]] * len(flat)
+    return people.camera(frames, (min(numbers), max(numbers)), "openpose coco")
 
 
 def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
@@ -468,9 +416,7 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     for start, results in people.valid(_RESULTS, items):
         images += [person.image_id for person in results]
         categories |= {person.category_id for person in results}
-        places = (f"{path}: [{index}].keypoints" for index in range(start, start + len(results)))
-        pairs = zip(results, places, strict=True)
-        people.add([_checked(person.keypoints, place, program) for person, place in pairs])
+        people.add([person.flat(f"{path}: [{index}]", program) for index, person in enumerate(results, start)])
     names = _names(others, path, program)
     frames: dict[int | str, int] = {}
     known = [(image, f"[{index}].image_id") for index, image in enumerate(images)]
@@ -509,10 +455,9 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
             return image
         raise InputError(f"{place} '{image}' is not a frame number; {_RERUN[program]}, of numbered pictures")
     name = str(image) if name is None else name
-    match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
-    if match is None or len(match[1]) > len(str(MOST_FRAME)):
+    if (number := last_number(Path(name).stem)) in (None, MOST_FRAME):
         raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
-    return int(match[1])
+    return number
 
 
 def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
@@ -42,11 +43,42 @@ class PeopleBlock:
         keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
         return cls(np.array(frames, dtype=np.intp), keypoints)
 
+    @classmethod
+    def dense(cls, frame: Index, points: Array) -> "PeopleBlock":
+        """Block of `points` (F, P, K, 3) of P people in the frames `frame` (F,), rising; NaN is not seen."""
+        seen = np.asarray(np.isfinite(points).all(axis=3))
+        row, person = np.nonzero(seen.any(axis=2))
+        return cls(frame[row], np.where(seen[..., None], points, 0.0)[row, person])
+
     @property
     def scores(self) -> Array:
         """(S,) scores of the keypoints that were seen."""
         every = self.keypoints[..., 2].ravel()
         return every[np.isfinite(every) & (every > 0)]
+
+
+def check_one_model(known: set[int], people: Sequence[list[float]], source: Path, program: str) -> None:
+    """Add numbers of keypoints to `known`; InputError where there are several."""
+    known |= {len(person) // 3 for person in people}
+    if len(known) > 1:
+        counts = " and ".join(map(str, sorted(known)))
+        what = f"recognised as {program}, with people of {counts} keypoints"
+        raise InputError(f"{source}: {what}; give the detections of one model")
+
+
+def frame_blocks(
+    folder: Path, program: str, files: Sequence[tuple[int, Path]], read: Callable[[Path], list[list[float]]]
+) -> Iterator[PeopleBlock]:
+    """The people of numbered files of frames, block by block; `read` gives flat keypoints of a file's people."""
+    counts = set[int]()
+    for start in range(0, len(files), BLOCK_FRAMES):
+        frames, people = list[int](), list[list[float]]()
+        for number, file in files[start : start + BLOCK_FRAMES]:
+            found = read(file)
+            people += found
+            frames += [number] * len(found)
+        check_one_model(counts, people, folder, program)
+        yield PeopleBlock.of(frames, people)
 
 
 @dataclass(frozen=True)

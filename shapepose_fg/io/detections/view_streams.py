@@ -78,7 +78,7 @@ def assemble(
     views are empty in missing ones. Raises InputError where there are none, or where the views do not fit their
     pictures.
     """
-    views, count, said = _any_frame(views) if own_frames else _common(views)
+    views, count, said = _aligned(views, own_frames)
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
     for n, blocks in enumerate(zip_longest(*(view.blocks for view in views), fillvalue=_NOTHING)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
@@ -93,35 +93,28 @@ def assemble(
     return replace(table, picture=np.column_stack(has))
 
 
-def _any_frame(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
-    """The frames that any view has, how many there are, and a note where views begin at different numbers."""
-    start = min(view.first_number for view in views)
-    count = max(view.first_number + view.frame_count for view in views) - start
-    if all(view.first_number == start for view in views):
-        return views, count, []
-    note = f"{views[0].source.parent}: frame 0 has number {start} in the files ({_spans(views)})"
-    return [_part(view, start - view.first_number, count) for view in views], count, [note]
-
-
-def _common(views: Sequence[ViewStream]) -> tuple[Sequence[ViewStream], int, list[str]]:
-    """The frames that all views have, their number, and notes where some have others."""
-    start = max(view.first_number for view in views)
-    stop = min(view.first_number + view.frame_count for view in views)
-    if all(view.first_number == start and view.frame_count == stop - start for view in views):
+def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[ViewStream], int, list[str]]:
+    """The frames that all views have, or with `own_frames` any; their number, a note where some have others."""
+    starts, stops = zip(
+        *((each.first_number, each.first_number + each.frame_count) for each in views), strict=True
+    )
+    start, stop = (min(starts), max(stops)) if own_frames else (max(starts), min(stops))
+    if {*starts} == {start} and (own_frames or {*stops} == {stop}):
         return views, stop - start, []
-    spans = _spans(views)
+    spans, folder = _spans(views), views[0].source.parent
     if start >= stop:
         for view in views:  # what is wrong with their files goes first
             for _ in view.blocks:
                 pass
         cure = "give the same frames of each camera with the same numbers"
-        raise InputError(f"{views[0].source.parent}: no frame exists for all cameras ({spans}); {cure}")
-    count, folder = stop - start, views[0].source.parent
-    note = (
-        f"{folder}: cameras have different frames ({spans}); the {count} common ones, {start} to {stop - 1},"
-        " are used; if the cameras are unsynchronised, run `shapepose-fg synchronise`"
-    )
-    return [_part(view, start - view.first_number, count) for view in views], count, [note]
+        raise InputError(f"{folder}: no frame exists for all cameras ({spans}); {cure}")
+    note = f"{folder}: frame 0 has number {start} in the files ({spans})"
+    if not own_frames:
+        note = (
+            f"{folder}: cameras have different frames ({spans}); the {stop - start} that all have, {start} to"
+            f" {stop - 1}, are used; where cameras were started apart, `shapepose-fg synchronise` finds when"
+        )
+    return [_part(view, start - view.first_number, stop - start) for view in views], stop - start, [note]
 
 
 def _spans(views: Sequence[ViewStream]) -> str:

@@ -10,7 +10,7 @@ from rich.filesize import decimal
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_times import rate_of, typed_rate
+from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS, rate_of, typed_rate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
 from shapepose_fg.core.result_files import free_memory
 from shapepose_fg.core.run_summary import covered_frames
@@ -37,8 +37,6 @@ _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
 """Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
 _FAR_M = 1000.0
 """Largest coordinate that a float of 32 bits keeps to a tenth of a millimetre, metres."""
-_SHORTEST_S, _LONGEST_S = 1e-6, 1e5
-"""Shortest and longest time between frames, s; outside of these, times have another unit."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class Take:
             )
         times = _times(people, frames, fps)
         steps = np.diff(times) / np.diff(frames)
-        if len(steps) > 0 and not _SHORTEST_S <= np.median(steps) <= _LONGEST_S:
+        if len(steps) > 0 and not 1 / MOST_FPS <= np.median(steps) <= 1 / LEAST_FPS:
             raise ValueError(f"frames are {np.median(steps):g} s apart by time_s; give --fps")
         rate = rate_of(times) if len(steps) > 0 else typed_rate(fps or _fps_of(people))
         return cls(people, persons.astype(np.int64), rows, frames, times, rate, up, rig)

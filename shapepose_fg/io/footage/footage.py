@@ -1,7 +1,6 @@
 """The pictures of one camera, frame by frame: from a video, a folder of pictures, or a single picture."""
 
 import os
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_bytes
-from shapepose_fg.io.camera_names import in_order
+from shapepose_fg.io.camera_names import in_order, last_number
 from shapepose_fg.io.footage.places import PICTURES
 
 Picture = NDArray[np.uint8]
@@ -33,7 +32,6 @@ _MOST_BYTES = 2**29
 """Maximum size of a picture's file, bytes."""
 _LARGEST = 16384
 """Longest side of a picture, pixels: a file with a larger one is damaged, or malicious."""
-_LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
 def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
@@ -146,14 +144,16 @@ class PictureFiles:
             raise InputError(
                 f"{path}: there are no pictures in this folder; known formats are {' '.join(sorted(PICTURES))}"
             )
-        found = [_LAST_NUMBER.search(each.stem) for each in files]
+        found = [last_number(each.stem) for each in files]
         if path.is_file() or (len(files) == 1 and found[0] is None):
             return cls(path, _size(files[0]), tuple(files), np.zeros(1, dtype=np.intp))
         if None in found:
             unnumbered = files[found.index(None)]
             raise InputError(f"{unnumbered}: its name has no frame number; number the pictures")
         pairs = zip(found, files, strict=True)
-        numbers, paths = zip(*in_order([(int(match[0]), file) for match, file in pairs if match]), strict=True)
+        numbers, paths = zip(
+            *in_order([(number, file) for number, file in pairs if number is not None]), strict=True
+        )
         count = numbers[-1] - numbers[0] + 1
         notes = (f"{path}: {count - len(files)} of {count} pictures are missing",) if count > len(files) else ()
         return cls(path, _size(paths[0]), paths, np.array(numbers, dtype=np.intp), notes)
