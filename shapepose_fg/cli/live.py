@@ -64,7 +64,7 @@ def live(
                 publish("settled", people.settled())
             if report.jumps > jumps:
                 jumps = report.jumps
-                of_cameras(f"the times of the times of all cameras jumped to {view[2]:.2f} s")
+                of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
             said = _say(people, said, of_cameras)
 
         try:

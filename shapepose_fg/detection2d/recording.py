@@ -186,7 +186,7 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
             )
     elif unfinished.exists() and any(unfinished.iterdir()):
         raise InputError(
-            f"{unfinished}: this is this is not a run of this program; delete the folder, or give another --output"
+            f"{unfinished}: this is not a run of this program; delete the folder, or give another --output"
         )
     elif there := [place for place in places if place.exists()]:
         raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")

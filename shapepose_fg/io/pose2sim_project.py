@@ -176,9 +176,7 @@ def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{own}: there is no such file; give the folder of a Pose2Sim project, which contains it")
     trials = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
     if len(trials) > 0 and not any((folder / name).is_dir() for name in (*_POSES, "videos")):
-        raise InputError(
-            f"{folder}: this is this is a session of several trials; give one of them: {listing(trials)}"
-        )
+        raise InputError(f"{folder}: this is a session of several trials; give one of them: {listing(trials)}")
     config = read_toml(own, may_be_empty=True)
     if not above.is_file():
         return config, folder
@@ -229,9 +227,7 @@ def _detections(folder: Path, has_videos: bool) -> Path:
         problem = f"there are neither 2D detections ({' '.join(_POSES)}) nor videos"
         raise InputError(f"{folder}: {problem}; put the videos into {videos} and detect people in them")
     command = shlex.join(["shapepose-fg", "detect", "--project", str(folder.resolve()), "--network", "NETWORK"])
-    raise InputError(
-        f"{pose}: there are there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}"
-    )
+    raise InputError(f"{pose}: there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}")
 
 
 def footage_of(folder: Path) -> tuple[Path, Path, Path]:

@@ -49,7 +49,7 @@ def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
         what = (
             "several skeletons have this name; give"
             if called
-            else ("this is this is neither a file nor a known skeleton; give")
+            else ("this is neither a file nor a known skeleton; give")
         )
         raise InputError(f"{name}: {what} {'one of' if called else 'a TOML file, or one of'} {names}")
     return read_skeleton(name)

@@ -138,7 +138,7 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network))
     (tmp_path / "other" / "unfinished").mkdir(parents=True)
     (tmp_path / "other" / "unfinished" / "thesis.txt").write_text("mine")
-    with pytest.raises(InputError, match="this is this is not a run of this program"):
+    with pytest.raises(InputError, match="this is not a run of this program"):
         run_detection(run_of(rolled_rig, pictures, tmp_path / "other", painted_network))
     assert (tmp_path / "other" / "unfinished" / "thesis.txt").read_text() == "mine"
 

@@ -263,7 +263,7 @@ def _ros_pose(path: Path, value: Any) -> Array:
     """World from camera, of a message with translation and rotation."""
     message = message_of(value)
     if message is None:
-        raise InputError(f"{path}: this is this is neither a camera_info nor a pose of ROS; {_POSE_CURE}")
+        raise InputError(f"{path}: this is neither a camera_info nor a pose of ROS; {_POSE_CURE}")
     child = str(value.get("child_frame_id", ""))
     if child and "optical" not in child:
         raise InputError(

@@ -149,7 +149,7 @@ def _points(path: Path) -> Array:
         table = table[:0]
     if len(table) == 0:
         raise InputError(
-            f"{path}: there are there are no points of a person's body; track with Caliscope's POSE or HOLISTIC"
+            f"{path}: there are no points of a person's body; track with Caliscope's POSE or HOLISTIC"
         )
     return table
 

@@ -62,7 +62,7 @@ def check_one_model(known: set[int], people: Sequence[list[float]], source: Path
     known |= {len(person) // 3 for person in people}
     if len(known) > 1:
         counts = " and ".join(map(str, sorted(known)))
-        what = f"recognised as {program}, with people of {counts} keypoints"
+        what = f"recognised as {program}, but people have {counts} keypoints"
         raise InputError(f"{source}: {what}; give the detections of one model")
 
 

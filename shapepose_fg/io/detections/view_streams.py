@@ -111,8 +111,8 @@ def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[Vi
     note = f"{folder}: frame 0 has number {start} in the files ({spans})"
     if not own_frames:
         note = (
-            f"{folder}: cameras have different frames ({spans}); the {stop - start} that all have, {start} to"
-            f" {stop - 1}, are used; where cameras were started apart, `shapepose-fg synchronise` finds when"
+            f"{folder}: cameras have different frames ({spans}); the {stop - start} common ones, {start} to"
+            f" {stop - 1}, are used; if the cameras are unsynchronised, run `shapepose-fg synchronise`"
         )
     return [_part(view, start - view.first_number, stop - start) for view in views], stop - start, [note]
 
