@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.from_people import Undetermined, calibrate
 from shapepose_fg.calibration.levelling import Measured, scale_of, sigma_of_scale
 from shapepose_fg.calibration.people import Footage
-from shapepose_fg.calibration.relative import Relative, cross, refined_pose
+from shapepose_fg.calibration.relative import Relative, refined_pose
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Recording
@@ -183,9 +184,7 @@ def test_a_wrong_pair_gives_way():
 
 def _rotation(turn: np.ndarray) -> np.ndarray:
     """(3, 3) of a rotation vector."""
-    angle = np.linalg.norm(turn)
-    K = cross(turn / max(angle, 1e-12))
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+    return exp_so3(np.asarray(turn, dtype=np.float64))
 
 
 def test_lenses_by_their_field_of_view(tmp_path):

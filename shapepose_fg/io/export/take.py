@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.filesize import decimal
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS, rate_of, typed_rate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
-from shapepose_fg.core.result_files import free_memory
+from shapepose_fg.core.result_files import check_memory
 from shapepose_fg.core.run_summary import covered_frames
 
 _TO_Y_UP: dict[Axis, list[list[int]]] = {
@@ -168,12 +167,8 @@ def _moved(rig: Rig, origin: Array) -> Rig:
 
 def _check_memory(persons: int, frames: int) -> None:
     """InputError where joints of all people in all frames, and one person's body, do not fit in memory."""
-    needed, free = frames * (2 * 8 * persons + _BODY_BYTES), free_memory()
-    if free is not None and needed > free:
-        raise InputError(
-            f"people.npz: {persons} people over {frames} frames need {decimal(needed)} of memory, and"
-            f" {decimal(free)} are free; read fewer frames or people at a time (--frames, --person)"
-        )
+    what = f"people.npz: {persons} people over {frames} frames"
+    check_memory(what, frames * (2 * 8 * persons + _BODY_BYTES), "--frames, --person")
 
 
 def _seen(people: Reconstruction) -> Reconstruction:
