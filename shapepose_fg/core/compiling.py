@@ -38,7 +38,7 @@ def compile_beside(kernels: Sequence[Any]) -> None:
     with _alone():
         missing = [each for each in kernels if not each.is_kept]
         lasts_s = _work(missing) / _BYTES_S
-        count = min(_cores(), _MOST, len(missing)) if lasts_s > _WORTH_S and place is not None else 1
+        count = min(cores(), _MOST, len(missing)) if lasts_s > _WORTH_S and place is not None else 1
         what = f"compiling {len(missing)} functions for this machine, about {max(lasts_s / count, 1):.0f} s"
         if place != wanted_folder():
             cure = "set NUMBA_CACHE_DIR to a folder that can be written"
@@ -144,5 +144,6 @@ def _pieces(function: Any) -> set[Any]:
     return known
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

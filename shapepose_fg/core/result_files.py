@@ -182,28 +182,21 @@ class SavedTable(ExitStack, Generic[T]):
 
     def read(self, index: Index | None, **others: Any) -> T:
         """The rows `index` (R,), rising, or all, and `others`; InputError where they are no table, or too many."""
-        self._check_memory(self.count if index is None else len(index))
+        count = self.count if index is None else len(index)
+        needed = 2 * count * sum(map(self._npz.row_bytes, self._rows))  # and as much again to work with them
+        check_memory(f"{self.file}: {count} rows", needed, "--frames, --person, or Reconstruction.open")
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
         with naming(self.file, self.cure):
             table = self.kind(**{name: read(name) for name in self._rows}, **self._shared)
             table.check_ranges()
             return replace(cast(Any, table), **others) if others else table
 
-    def _check_memory(self, count: int) -> None:
-        """InputError where this many rows, and as much again to work with them, do not fit in memory."""
-        needed, free = 2 * count * sum(map(self._npz.row_bytes, self._rows)), free_memory()
-        if free is not None and needed > free:
-            raise InputError(
-                f"{self.file}: {count} rows would take {decimal(needed)} of memory, and {decimal(free)} are free;"
-                " take some frames or people at a time (--frames, --person, or Reconstruction.open)"
-            )
 
+def check_memory(what: str, needed: int, options: str) -> None:
+    """InputError where more bytes of memory are `needed` than are free; `options` take a part."""
+    import psutil
 
-def free_memory() -> int | None:
-    """Available memory in bytes; None where the system does not state it."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    found = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    return 1024 * int(found[0]) if found else None
+    free = psutil.virtual_memory().available
+    if needed > free:
+        space = f"need {decimal(needed)} of memory, and {decimal(free)} are free"
+        raise InputError(f"{what} {space}; read fewer frames or people at a time ({options})")
