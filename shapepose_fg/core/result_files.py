@@ -198,5 +198,5 @@ def check_memory(what: str, needed: int, options: str) -> None:
 
     free = psutil.virtual_memory().available
     if needed > free:
-        space = f"would take {decimal(needed)} of memory, and {decimal(free)} are free"
-        raise InputError(f"{what} {space}; take some frames or people at a time ({options})")
+        space = f"need {decimal(needed)} of memory, and {decimal(free)} are free"
+        raise InputError(f"{what} {space}; read fewer frames or people at a time ({options})")

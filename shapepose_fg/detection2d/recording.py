@@ -158,7 +158,7 @@ def _read_block(file: Path, views: int, name: str) -> list[Any]:
     values = block.get(name) if isinstance(block, dict) else None
     kind = str if name == "text" else int
     if not isinstance(values, list) or len(values) != views or {*map(type, values)} != {kind}:
-        raise InputError(f"{file}: not a block of this version; delete the folder that it is in")
+        raise InputError(f"{file}: this is not a block of this version; delete its folder")
     return values
 
 
@@ -180,18 +180,23 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
     """
     names = [each.camera.name for each in run.cameras]
     if Path(FOOTAGE).stem in names:
-        raise InputError(f"camera {Path(FOOTAGE).stem!r}: {FOOTAGE} is another file; rename it in the calibration")
+        raise InputError(
+            f"camera {Path(FOOTAGE).stem!r}: this name would conflict with {FOOTAGE}; rename the"
+            " camera in the calibration"
+        )
     places = [run.output / f"{name}{suffix}" for name in names for suffix in (".txt", ".json")]
     if (unfinished / _SETTINGS).is_file():
         before, now = read_json(unfinished / _SETTINGS), run.settings
         if before != now:
             differ = [key for key in now if not isinstance(before, dict) or before.get(key) != now[key]]
             raise InputError(
-                f"{unfinished}: a run that differs in its {' and '.join(differ)} was stopped here; start it as it"
-                " was to go on, or delete this folder"
+                f"{unfinished}: there is an interrupted run with different {' and '.join(differ)}; start it with"
+                " the same options to continue, or delete this folder"
             )
     elif unfinished.exists() and any(unfinished.iterdir()):
-        raise InputError(f"{unfinished}: not a run of this program; delete the folder, or give another --output")
+        raise InputError(
+            f"{unfinished}: this is not a run of this program; delete the folder, or give another --output"
+        )
     elif there := [place for place in places if place.exists()]:
         raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
 

@@ -66,7 +66,7 @@ def told_by_parts(
         return None
     found = [paths[index] for index in chosen]
     pairs = ", ".join(f"{camera} is {path.name}" for camera, path in zip(cameras, found, strict=True))
-    return found, [f"{folder}: cameras were told by parts of the names: {pairs}"]
+    return found, [f"{folder}: cameras were matched by parts of the file names: {pairs}"]
 
 
 def listing(names: Sequence[str], nothing: str = "nothing") -> str:
@@ -92,8 +92,10 @@ def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
     """Files sorted by their frame numbers; InputError where a number is invalid or occurs twice."""
     ordered = sorted(files)
     if ordered[-1][0] >= MOST_FRAME:
-        raise InputError(f"{ordered[-1][1]}: no frame has so high a number; number them by the recording's frames")
+        raise InputError(
+            f"{ordered[-1][1]}: this frame number is too large; number the files by the frames of the recording"
+        )
     for (number, file), (following, other) in pairwise(ordered):
         if following == number:
-            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording in a folder")
+            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording per folder")
     return ordered

@@ -33,8 +33,8 @@ def read_config(path: str | Path, kind: type[T]) -> T:
     return config_from(read_toml(Path(path), may_be_empty=True), kind, path)
 
 
-_CURE = "`shapepose-fg config` shows the defaults"
-ANOTHER_VERSION = "another version of this program wrote it; reconstruct the recording again"
+_CURE = "`shapepose-fg config` prints the defaults"
+ANOTHER_VERSION = "it was written by another version of this program; reconstruct the recording again"
 """Cure for settings that a program wrote."""
 
 

@@ -22,7 +22,7 @@ CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
 _PART = f".{UNCORRECTED}.part"
 """Name of the folder of the uncorrected result while it is created, or deleted."""
 _FILES = (PEOPLE, RUN, OBSERVATIONS)
-_CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to begin anew"
+_CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to start again"
 
 Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
 
@@ -50,15 +50,16 @@ def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
     if not file.is_file():
         if (Path(folder) / UNCORRECTED).exists():
             raise InputError(
-                f"{file}: it is missing beside {UNCORRECTED}, so a correction was stopped half way; copy the files"
-                f" of {UNCORRECTED} back and delete that folder, or only delete it if people.npz is of a later run"
+                f"{file}: this file is missing beside {UNCORRECTED}, so a correction was interrupted; copy the"
+                f" files of {UNCORRECTED} back and delete that folder, or only delete it if people.npz is"
+                " of a later run"
             )
         return ()
     content = validated(_File, read_json(file), file, _CURE)
     with naming(file, _CURE):
         edits = tuple(Edit(**edit.model_dump()) for edit in content.edits)
     if content.people != _checksum(Path(folder)):
-        raise InputError(f"{file}: people.npz is not what these corrections led to; {_CURE}")
+        raise InputError(f"{file}: people.npz is not the result of these corrections; {_CURE}")
     return edits
 
 
@@ -95,7 +96,7 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     folder = Path(folder)
     edits = _kept_edits(folder)
     if len(edits) == 0:
-        raise InputError(f"{folder}: there is no correction to take back; see shapepose-fg tracks {folder}")
+        raise InputError(f"{folder}: there is no correction to undo; see shapepose-fg tracks {folder}")
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)
@@ -128,8 +129,8 @@ def _kept_edits(folder: Path) -> tuple[Edit, ...]:
     """`read_corrections`; InputError where the uncorrected result is missing."""
     edits, file = read_corrections(folder), inside(folder, UNCORRECTED) / PEOPLE
     if len(edits) > 0 and not file.is_file():
-        cure = f"put it back, or delete {CORRECTIONS} to keep the result as it is now"
-        raise InputError(f"{file}: the result as it was before the corrections is not there; {cure}")
+        cure = f"restore it, or delete {CORRECTIONS} to keep the result as it is now"
+        raise InputError(f"{file}: the uncorrected result is missing; {cure}")
     return edits
 
 

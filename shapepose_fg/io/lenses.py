@@ -44,11 +44,9 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     for name, field in given.items():
         picture = size or sizes.get(name)
         if field is None:
-            raise InputError(f"--field-of-view: camera {name} has none; give {name}=DEGREES")
+            raise InputError(f"--field-of-view: missing for camera {name}; give {name}=DEGREES")
         if picture is None:
-            raise InputError(
-                f"camera {name}: nothing says how large its pictures are; pass --image-size WIDTHxHEIGHT"
-            )
+            raise InputError(f"camera {name}: the size of its pictures is unknown; pass --image-size WIDTHxHEIGHT")
         with naming(detections):
             cameras.append(_camera(name, picture, _degrees(field, picture)))
     with naming(detections):
@@ -89,7 +87,7 @@ def _focal_of_photo(file: Path) -> float:
     picture with the same diagonal (EXIF 2.3, 4.6.5).
     """
     image = optional("PIL.Image", "photos")
-    cure = "give a photo as the camera wrote it, or degrees"
+    cure = "give an unedited photo of the camera, or degrees"
     with open_regular(file, cure, BIG) as stream, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's on large pictures: none is unpacked here
         try:
@@ -100,5 +98,5 @@ def _focal_of_photo(file: Path) -> float:
         except Exception as error:  # of damaged files the library raises anything: SyntaxError, struct.error
             raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
     if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
-        raise InputError(f"{file}: its EXIF does not say FocalLengthIn35mmFilm; {cure}")
+        raise InputError(f"{file}: its EXIF data have no FocalLengthIn35mmFilm; {cure}")
     return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))

@@ -26,7 +26,7 @@ TIMES = "times.csv"
 def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -> Path | None:
     """The file with the times of the frames: the given one, or without a rate the one beside; or none."""
     if fps is not None and timestamps is not None:
-        raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
+        raise InputError("--fps and --timestamps: both determine the times of frames; give one of them")
     beside = detections / TIMES
     return timestamps or (beside if fps is None and beside.is_file() else None)
 
@@ -62,7 +62,7 @@ def read_recording(
     if moments is None:
         return recording, times
     together = in_moments(recording, moments.picture, InFolder(kept / "moments"))
-    what = f"{file}: pictures of the same times are put together: {len(moments)} frames"
+    what = f"{file}: pictures of equal times are combined into {len(moments)} frames"
     return replace(together, notes=(*recording.notes, what, *moments.notes)), times
 
 
@@ -91,7 +91,7 @@ def read_moments(file: Path) -> dict[str, Index]:
     try:
         numbers = np.array(rows, dtype=np.intp).reshape(len(rows), len(names))
     except ValueError:
-        raise InputError(f"{file}: not whole numbers, as many in each line; reconstruct again") from None
+        raise InputError(f"{file}: lines must have the same number of whole numbers; reconstruct again") from None
     if names[0] != "frame" or (numbers[:, 0] != np.arange(len(rows))).any() or (numbers[:, 1:] < -1).any():
-        raise InputError(f"{file}: not a line for each frame from 0 on; reconstruct again")
+        raise InputError(f"{file}: there must be a line for each frame from 0 on; reconstruct again")
     return dict(zip(names[1:], numbers.T[1:], strict=True))

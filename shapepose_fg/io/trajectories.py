@@ -43,7 +43,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     pose = np.column_stack([columns[each] for each in POSE])
     far = np.abs(pose[:, 1:4]).max(axis=1) > MOST_METRES
     if far.any():
-        raise InputError(f"{path}: line {lines[far][0]} is over {MOST_METRES:g} m away; write metres")
+        raise InputError(f"{path}: line {lines[far][0]} is more than {MOST_METRES:g} m away; write metres")
     length = np.linalg.norm(pose[:, 4:], axis=1)
     wrong = ~(np.abs(length - 1) < UNIT_LENGTH)
     if wrong.any():
@@ -63,7 +63,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         odd = np.linalg.eigvalsh(covariance)[:, 0] < -1e-9
         if odd.any():
             what = f"line {lines[odd][0]}: the covariance must have no negative eigenvalue"
-            raise InputError(f"{path}: {what}; write variances, rad² and m², of the carrier's own axes")
+            raise InputError(f"{path}: {what}; write variances about the carrier's axes, rad² and m²")
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
 
@@ -74,11 +74,9 @@ def _check_columns(path: Path, line: int, names: list[str]) -> None:
     odd = next((name[:20] for name in names if name not in known or names.count(name) > 1), None)
     missing = next((name for name in POSE if name not in names), None)
     if odd is not None or missing is not None:
-        what = (
-            f"column {odd!r} is not known, or twice there" if odd is not None else f"column {missing} is missing"
-        )
+        what = f"column {odd!r} is unknown or occurs twice" if odd is not None else f"column {missing} is missing"
         raise InputError(
-            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and of covariances rx_rx ..."
+            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and for covariances rx_rx ..."
         )
     diagonal = [name for name in COVARIANCE if len(set(name.split("_"))) == 1]
     lacks = next((name for name in diagonal if name not in names), None)

@@ -20,7 +20,7 @@ from shapepose_fg.core.storage.schema import Column
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
-ANEW = "begin that run anew with --restart"
+ANEW = "start that run again with --restart"
 """Cure for a damaged set."""
 _SAID = {"about", "arrays", "sha256"}
 """Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all this."""
@@ -167,14 +167,14 @@ class InFolder(KeptArrays):
                 if right and key is not None and self._checked.get((name, key)) != stamp:
                     right = json.loads(said["arrays"])[key] == _digest(key, content.get_tensor(key))
                 if not right:
-                    raise ValueError("it is not as it was written, or of another run")
+                    raise ValueError("its content has changed, or it belongs to another run")
                 self._checked[name, None] = self._checked[name, key] = stamp
                 yield content
         except InputError:
             raise
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
             reason = str(error) or type(error).__name__
-            raise InputError(f"{file}: a part of an unfinished run cannot be read ({reason}); {ANEW}") from None
+            raise InputError(f"{file}: a part of an interrupted run cannot be read ({reason}); {ANEW}") from None
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:

@@ -30,8 +30,8 @@ MODELS: dict[str, tuple[str, Lens]] = {
 }
 """COLMAP's camera models that OpenCV has, and their parameters: distortion coefficients in OpenCV's order."""
 _CURES = {
-    "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
-    " gave it one)",
+    "unit": "pass --unit (a model has no scale until colmap model_aligner or known distances between cameras"
+    " determine one)",
     "up": "pass --up with the axis of the model that points up",
 }
 
@@ -44,10 +44,12 @@ def _read(content: Content) -> WrittenRig | None:
         return None
     for name, binary in zip(FILES, _BINARY, strict=True):
         if not (folder / name).is_file():
-            cure = "copy it there too"
+            cure = "copy it into the same folder"
             if (folder / binary).is_file():
-                cure = f"{binary} is COLMAP's binary: run colmap model_converter --output_type TXT"
-            raise InputError(f"{folder / name}: this half of COLMAP's model is missing; {cure}")
+                cure = (
+                    f"{binary} is COLMAP's binary format: convert it with colmap model_converter --output_type TXT"
+                )
+            raise InputError(f"{folder / name}: this file of COLMAP's model is missing; {cure}")
     return WrittenRig(_images(folder / FILES[1], _lenses(folder / FILES[0])), None, None, _CURES)
 
 
@@ -62,7 +64,7 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
         model = words[1] if len(words) > 1 else ""
         if model not in MODELS:
             known = " ".join(MODELS)
-            raise InputError(f"{place}: camera model {model or 'missing'} is not read; use one of {known}")
+            raise InputError(f"{place}: camera model {model or 'missing'} is not supported; use one of {known}")
         parameters, lens = MODELS[model]
         names = parameters.split()
         width, height, *values = _numbers(words[2:], 2 + len(names), place)
@@ -84,8 +86,10 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
             rows.append((number, line.split(maxsplit=9)))
             points, text = next(lines, (0, ""))
             if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
-                problem = f"line {points}: must hold the points of the image before it, three numbers each"
-                raise InputError(f"{path}: {problem}; leave an empty line there where it has none")
+                problem = (
+                    f"line {points}: must hold the points of the image in the line before, three numbers each"
+                )
+                raise InputError(f"{path}: {problem}; leave an empty line if it has none")
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
     for (number, words), name in zip(rows, names, strict=True):
@@ -108,7 +112,7 @@ def _names(files: Sequence[str]) -> list[str]:
 
 def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(f"{place}: must hold {count} finite numbers, got {len(words)} words; export it again")
+        raise InputError(f"{place}: must hold {count} finite numbers, got {len(words)} values; export it again")
     return [float(word) for word in words]
 
 

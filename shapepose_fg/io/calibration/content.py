@@ -82,7 +82,7 @@ def load(path: Path) -> Content:
 def _named(path: Path, value: Any) -> dict[str, Any]:
     """Every node of a FileStorage by name."""
     if not isinstance(value, dict):
-        raise InputError(f"{path}: OpenCV's FileStorage has named values, here is none; write the file again")
+        raise InputError(f"{path}: this OpenCV FileStorage has no named values; write the file again")
     return {str(key): each for key, each in value.items()}
 
 
@@ -98,13 +98,15 @@ def _parse_yaml(path: Path, text: str) -> Any:
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f"line {mark.line + 1} column {mark.column + 1}" if mark is not None else "the file"
-        raise InputError(f"{path}: {line} is not YAML; correct it there or write the file again") from None
+        raise InputError(f"{path}: {line} is not YAML; correct it or write the file again") from None
     return bounded(documents[0], path) if documents else None
 
 
 def _refuse_long(path: Path, text: str) -> None:
     if len(text) > _MOST_CHARACTERS:
-        raise InputError(f"{path}: {len(text)} characters are too many for cameras; check that this is the file")
+        raise InputError(
+            f"{path}: the file has {len(text)} characters, too many for a calibration; check the path"
+        )
 
 
 def _refuse_hostile(path: Path, text: str) -> None:
@@ -115,7 +117,7 @@ def _refuse_hostile(path: Path, text: str) -> None:
     for event in yaml.parse(text, _Safe):
         line = f"{path}: line {event.start_mark.line + 1}"
         if isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{line} repeats a node by *name; write it out")
+            raise InputError(f"{line} refers to a node by *name; write it out")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MOST_DEPTH:
             raise InputError(f"{line}: nodes are over {MOST_DEPTH} deep; write the file again")
@@ -124,13 +126,13 @@ def _refuse_hostile(path: Path, text: str) -> None:
 def _parse_xml(path: Path, text: str) -> ET.Element:
     """The root of XML without a document type: entities could make it read other files, or grow without end."""
     if _XML_DECLARATION.search(text):
-        raise InputError(f"{path}: XML with a document type or entities is not read; delete the <!DOCTYPE")
+        raise InputError(f"{path}: XML with a document type or entities is not accepted; delete the <!DOCTYPE")
     _refuse_long(path, text)
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
         line, column = error.position
-        cure = "correct it there or write the file again"
+        cure = "correct it or write the file again"
         raise InputError(f"{path}: line {line} column {column + 1} is not XML; {cure}") from None
     except ValueError as error:
         raise InputError(f"{path}: cannot be read as XML ({error}); write the file again") from None

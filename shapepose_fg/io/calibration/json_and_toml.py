@@ -24,13 +24,13 @@ from shapepose_fg.io.validation import describe, validated
 _MATRIX = "write the 3x3 intrinsic matrix row by row, in pixels"
 _CAMERA_FROM_WORLD = "write the 3x4 camera-from-world matrix row by row"
 _ROTATION = "write the 3x3 camera-from-world rotation row by row"
-_EXTRINSICS = "calibrate the extrinsics of this camera too, or delete its table"
+_EXTRINSICS = "calibrate the extrinsics of this camera, too, or delete its table"
 _SIZE = "write width and height in pixels"
 _CURES = {
     **{"K": _MATRIX, "matrix": _MATRIX, "RT": _CAMERA_FROM_WORLD, "cTw": _CAMERA_FROM_WORLD, "R": _ROTATION},
     **{"bTc": "write the 4x4 carrier-from-camera matrix row by row"},
-    **{"wTo": "write the 4x4 matrix, metres, from the trajectory's world to that of the cameras"},
-    **{"drift": "write the part of the way by which an odometry errs, such as 0.01"},
+    **{"wTo": "write the 4x4 matrix from the trajectory's world to the cameras' world, metres"},
+    **{"drift": "write the error of the odometry as a share of the distance travelled, such as 0.01"},
     **{"T": "write the 3 numbers of the translation", "wTc": "write the 4x4 world-from-camera matrix row by row"},
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
@@ -81,18 +81,20 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
         return None
     if content.value["format"] != RIG_FORMAT:
         got = describe(content.value["format"])
-        raise InputError(f'{content.path}: format must be "{RIG_FORMAT}", got {got}; this version reads no other')
+        raise InputError(
+            f'{content.path}: format must be "{RIG_FORMAT}", got {got}; this version cannot read others'
+        )
     rig = validated(_Rig, content.value, content.path, _CURES)
     cures = {
-        "up": 'say which axis points up, "up": "z", or pass --up z',
-        "unit": 'say what lengths are in, "unit": "m", or pass --unit m',
+        "up": 'write the axis that points up, such as "up": "z", or pass --up z',
+        "unit": 'write the unit of lengths, such as "unit": "m", or pass --unit m',
     }
     cameras = []
     for camera in rig.cameras:
         node = Node(vars(camera), f'{content.path}: camera "{camera.name}"', _CURES)
         given = [key for key in ("wTc", "cTw", "trajectory") if getattr(camera, key) is not None]
         if len(given) != 1 or (camera.bTc is not None and camera.trajectory is None):
-            moves = "or trajectory, with bTc, of a camera that moves"
+            moves = "or, of a moving camera, trajectory and bTc"
             raise InputError(f"{node.place}: give exactly one of wTc and cTw, {moves}; {_CURES['wTc']}")
         if camera.trajectory is not None:
             wTc = np.eye(4) if camera.bTc is None else node.pose_of_matrix("bTc")
@@ -108,7 +110,9 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
 def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
     """The trajectory in the file `name` beside the rig file, in the rig's world."""
     if Path(name).is_absolute() or not is_inside(path.parent, name):
-        raise InputError(f"{path}: trajectory {name[:80]} must lie beside the rig file or below; move it there")
+        raise InputError(
+            f"{path}: trajectory {name[:80]} must be in the folder of the rig file or below; move it there"
+        )
     about = _Trajectory() if about is None else about
     found = read_trajectory(path.parent / name, name)
     node = Node({"wTo": about.wTo}, f'{path}: trajectory "{name}"', _CURES)
@@ -146,7 +150,7 @@ def _read_panoptic(content: Content) -> WrittenRig | None:
         cameras.append(node.camera(value["name"], "K", wTc, ["resolution"], "distCoef", most=5))
     if "calibDataSource" in content.value or any({"type", "panel", "node"} & each.keys() for each in listed):
         return WrittenRig(cameras, "cm", "-y")
-    return WrittenRig(cameras, None, None, {"unit": "pass --unit (that of CMU's studio is cm)", "up": _UP})
+    return WrittenRig(cameras, None, None, {"unit": "pass --unit (CMU Panoptic uses cm)", "up": _UP})
 
 
 def _read_voxelpose(content: Content) -> WrittenRig | None:
@@ -162,7 +166,7 @@ def _read_voxelpose(content: Content) -> WrittenRig | None:
         return None
     cameras = []
     for name, camera in value.items():
-        node = Node(camera, f'{content.path}: camera "{name}"', {"": "write it as VoxelPose does"})
+        node = Node(camera, f'{content.path}: camera "{name}"', {"": "write it in VoxelPose's format"})
         fx, fy, cx, cy = (float(node.needed(key, 1)[0]) for key in ("fx", "fy", "cx", "cy"))
         (k1, k2, k3), (p1, p2) = node.needed("k", 3).tolist(), node.needed("p", 2).tolist()
         wTc = node.pose("R", "T", centre=True)
@@ -231,7 +235,7 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
     cameras, notes, wanted = [], list[str](), wanted_tables(content.value)
     for key, table in tables.items():
         if key not in wanted:
-            why = "it is to be ignored" if table.get("ignore") is True else "it has no pose"
+            why = "it is marked as ignored" if table.get("ignore") is True else "it has no pose"
             notes.append(f"camera {table.get('name') or key} is left out: {why}")
             continue
         node = Node(table, f'{content.path}: camera "{key}"', _CURES)
@@ -250,17 +254,17 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
 
 
 _POSE = {"rotation", "translation"}
-_UP = "pass the axis of the world that points up with --up; it is often -y of a first camera that stood level"
+_UP = "pass the world axis that points up with --up; it is often -y if the first camera was level"
 _DIALECTS: dict[str, tuple[Unit | None, Axis | None, dict[str, str]]] = {
     "Caliscope": ("m", None, {"up": _UP}),
     "FreeMoCap": (None, None, {"unit": "pass --unit (FreeMoCap works in mm)", "up": _UP}),
     "Pose2Sim": ("m", "z", {}),
-    "AniPose": (None, None, {"unit": "pass --unit, that of the board's squares", "up": _UP}),
+    "AniPose": (None, None, {"unit": "pass --unit, the unit of the board's squares", "up": _UP}),
 }
 """Unit, up axis and cures per program. AniPose's world is not levelled and has the unit of the board;
 FreeMoCap's is the first camera."""
 JSON_AND_TOML = (
-    Format("our own rig file", _read_rig_file),
+    Format("rig file", _read_rig_file),
     Format("CMU Panoptic's JSON", _read_panoptic),
     Format("VoxelPose's JSON", _read_voxelpose),
     Format("4D Association's calibration.json", _read_association),

@@ -18,17 +18,17 @@ _FISHEYE = 1
 _MOST = 2**20
 """Maximum number of numbers of all cameras together."""
 _ASK = {
-    "unit": "pass --unit, that of the board's squares",
-    "up": "pass --up (a board's z points up or down where it lay; -y of a level first camera)",
+    "unit": "pass --unit, the unit of the board's squares",
+    "up": "pass --up (z or -z if the board lay on the floor; -y if the first camera was level)",
 }
 _ONE_CAMERA = "give the calibration of the whole rig, intrinsics and poses"
-_AGAIN = {"": "save it with OpenCV's calibration again"}
+_AGAIN = {"": "save it with OpenCV's calibration tool again"}
 _STORAGE = {"": "write it with OpenCV's FileStorage"}
 _EASYMOCAP = {"": "write it with EasyMocap again"}
 
 _STEREO = {"": "save it as OpenCV's stereo_calib sample does"}
-_HALF = "this is half of OpenCV's stereo calibration"
-_STEREO_UP = "pass the axis of the first camera that points up with --up; it is -y where that stood level"
+_HALF = "this is only one file of OpenCV's stereo calibration"
+_STEREO_UP = "pass the axis of the first camera that points up with --up; it is -y if that camera was level"
 _SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
 _MATRICES = ("m", "k", "cameramatrix", "camera_matrix", "mtx", "intrinsic", "intrinsic_matrix")
 _BENDS = ("d", "distcoeffs", "dist_coeffs", "distortion_coefficients", "distortion", "dist", "distcoeff")
@@ -62,7 +62,7 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     flat = nodes.needed("Ks", most=_MOST)
     count = len(flat) // 9
     if count == 0 or len(flat) != 9 * count:
-        raise nodes.refuse("Ks", "must hold 9 numbers for each camera")
+        raise nodes.refuse("Ks", "must hold 9 numbers per camera")
     Ks = flat.reshape(count, 3, 3)
     Rs, Ts = nodes.needed("Rs", 9 * count, 3 * count).reshape(count, -1), nodes.needed("Ts", 3 * count)
     sizes = nodes.needed("image_sizes", 2 * count).reshape(count, 2)
@@ -72,7 +72,9 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     # The coefficients stand one after the other: four of a fisheye, equally many of every other camera.
     plain = (len(numbers) - 4 * fisheye.sum()) / max(1, (~fisheye).sum())
     if plain != int(plain) or plain < 0:
-        raise nodes.refuse("distortions", f"must hold equally many numbers for every camera, got {len(numbers)}")
+        raise nodes.refuse(
+            "distortions", f"must hold the same number of values for every camera, got {len(numbers)}"
+        )
     ends = np.cumsum(np.where(fisheye, 4, int(plain)))
     names = ids.split(",") if isinstance(ids, str) else []
     names = names if len(names) == count else [str(index) for index in range(count)]
@@ -117,7 +119,7 @@ def _read_stereo(content: Content) -> WrittenRig | None:
     for side, wTc in zip(sides, (np.eye(4), node.pose("r", "t")), strict=True):
         K, bend = (_of_side(values, names, side) or names[0] + side for names in (_MATRICES, _BENDS))
         cameras.append(node.camera(side, [K], wTc, size, [bend]))
-    note = f"OpenCV's stereo calibration: cameras are called {sides[0]} and {sides[1]}"
+    note = f"OpenCV's stereo calibration: the cameras are named {sides[0]} and {sides[1]}"
     return WrittenRig(cameras, None, None, _ASK | {"up": _STEREO_UP}, notes=[note])
 
 
@@ -144,7 +146,7 @@ def _read_nodes(content: Content) -> WrittenRig | None:
         if node.named(POSE) is not None:
             wTc = node.pose_of_matrix(POSE)
         elif node.named(TURN) is None or node.named(SHIFT) is None:
-            raise InputError(f"{node.place}: R and T are missing, the camera's pose; {_ONE_CAMERA}")
+            raise InputError(f"{node.place}: R and T, the camera's pose, are missing; {_ONE_CAMERA}")
         else:
             wTc = node.pose(TURN, SHIFT)
         fisheye = values.get("distortion_type") == 1 or values.get("fisheye") in (1, "true")
@@ -153,9 +155,9 @@ def _read_nodes(content: Content) -> WrittenRig | None:
     if len(cameras) == 0:
         named = " ".join(list(content.value)[:5]) or "nothing"
         if Node(content.value, "").named(INTRINSIC) is not None:
-            what = "these are the intrinsics of one camera, as OpenCV's calibration saves them"
-            raise InputError(f"{content.path}: {what}; {_ONE_CAMERA}, such as a file per camera with R and T, too")
-        raise InputError(f"{content.path}: no camera with a pose here, only {named}; {_ONE_CAMERA}")
+            what = "this file has the intrinsics of one camera only"
+            raise InputError(f"{content.path}: {what}; {_ONE_CAMERA}, for example a file per camera with R and T")
+        raise InputError(f"{content.path}: there is no camera with a pose, only {named}; {_ONE_CAMERA}")
     return WrittenRig(cameras, None, None, _ASK)
 
 
@@ -180,7 +182,7 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
         one.with_name(one.name.replace("intri", "extri")),
     ):
         if not path.is_file():
-            raise InputError(f"{path}: this half of EasyMocap's calibration is missing; put both into one folder")
+            raise InputError(f"{path}: this file of EasyMocap's calibration is missing; put both into one folder")
         value = load(path).value
         halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
     inner, outer = halves
@@ -227,7 +229,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
     if content.syntax == "YAML" and (is_info(content.value) or message_of(content.value) is not None):
         what = "the intrinsics" if is_info(content.value) else "the pose"
         cure = "give the folder with <camera>.yaml and <camera>_pose.yaml of every camera"
-        raise InputError(f"{content.path}: this is {what} of one camera of ROS; {cure}")
+        raise InputError(f"{content.path}: this file has {what} of one camera of ROS only; {cure}")
     files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
     values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
     if not any(map(is_info, values.values())):
@@ -245,7 +247,8 @@ def _read_ros(content: Content) -> WrittenRig | None:
         model = str(value.get("distortion_model", ""))
         if model not in _LENSES:
             raise InputError(
-                f"{path}: distortion_model {model} is not read; use plumb_bob, rational_polynomial or equidistant"
+                f"{path}: distortion_model {model} is not supported; use plumb_bob, rational_polynomial or"
+                " equidistant"
             )
         # A matrix is a list of numbers, or has one under `data`.
         plain = {key: each.get("data") if isinstance(each, dict) else each for key, each in value.items()}
@@ -260,12 +263,12 @@ def _ros_pose(path: Path, value: Any) -> Array:
     """World from camera, of a message with translation and rotation."""
     message = message_of(value)
     if message is None:
-        raise InputError(f"{path}: neither a camera_info nor a pose of ROS; {_POSE_CURE}")
+        raise InputError(f"{path}: this is neither a camera_info nor a pose of ROS; {_POSE_CURE}")
     child = str(value.get("child_frame_id", ""))
     if child and "optical" not in child:
         raise InputError(
-            f"{path}: child_frame_id {child} is no optical frame (z forward, x right, y down); give the pose of"
-            f" {child}_optical_frame, or whatever the camera's optical frame is called"
+            f"{path}: child_frame_id {child} is not an optical frame (x right, y down, z forward); give the"
+            f" pose of the optical frame, such as {child}_optical_frame"
         )
 
     def of(part: Any, word: str, axes: str) -> list[float]:

@@ -25,7 +25,7 @@ FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP,
 _MISSING = {
     "unit": "pass --unit m, cm or mm",
     "up": "pass --up with the axis that points up (x -x y -y z -z)",
-    "image_size": "pass --image-size WIDTHxHEIGHT, the pictures that were calibrated, in pixels",
+    "image_size": "pass --image-size WIDTHxHEIGHT, the size of the calibrated pictures in pixels",
 }
 """Information that the user can give, and how, in the order of the sentence."""
 
@@ -55,8 +55,8 @@ def read_rig(
     content = load(path)
     if content.syntax == "pickle":
         raise InputError(
-            f"{path}: this is a Python pickle, as OpenCap writes it, and could run any program when it is opened;"
-            " write it as a rig file where you trust it, as docs/conventions.md shows"
+            f"{path}: this is a Python pickle (as OpenCap writes), which could run any program when opened; if"
+            " you trust it, convert it to a rig file as in docs/conventions.md"
         )
     if (known := recognised(content)) is None:
         raise InputError(_unknown(content))
@@ -64,13 +64,13 @@ def read_rig(
     with naming(path):
         wanted = choose([camera.name for camera in written.cameras], cameras, without)
     unwanted = [camera.name for camera in written.cameras if camera.name not in wanted]
-    asked = [f"camera {listing(unwanted)} is left out, as asked"] if unwanted else []
+    asked = [f"camera {listing(unwanted)} is left out as requested"] if unwanted else []
     kept = [camera for camera in written.cameras if camera.name in wanted]
     written = replace(written, cameras=kept, notes=[*written.notes, *asked])
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:
-        raise InputError(f"{path}: {form.name} says itself how large the pictures are; leave --image-size out")
+        raise InputError(f"{path}: this format ({form.name}) contains the picture sizes; leave out --image-size")
     given = {"unit": unit, "up": up, "image_size": image_size if sizes_missing else True}
     missing = [name for name, value in given.items() if value is None]
     if up is None or unit is None or missing:
@@ -112,8 +112,11 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
             cure = f"write CAMERA=FILE with one of {listing(list(rig.names))}"
             raise InputError(f"--trajectory {each[:80]}: must name a camera and a file; {cure}")
         if cameras[name].carrier or any(file == other.partition("=")[2] for other in given if other is not each):
-            cure = 'say in a rig file with "trajectory" and "bTc" how each camera stands on its carrier'
-            raise InputError(f"--trajectory {each[:80]}: a camera has one trajectory of its own; {cure}")
+            cure = 'give the pose of each camera on its carrier in a rig file, with "trajectory" and "bTc"'
+            raise InputError(
+                f"--trajectory {each[:80]}: a camera can have one trajectory, and it belongs to"
+                f" this camera only; {cure}"
+            )
         trajectories.append(read_trajectory(file, name))
         cameras[name] = replace(cameras[name], carrier=name, bTc=np.eye(4))
     with naming("--trajectory"):
@@ -139,7 +142,7 @@ def _unknown(content: Content) -> str:
     if content.syntax == "folder":
         return (
             f"{content.path}: this is a folder; give the file inside it, or the folder with the files of"
-            f" EasyMocap, COLMAP or ROS; here is {listing([path.name for path in value])}"
+            f" EasyMocap, COLMAP or ROS; it contains {listing([path.name for path in value])}"
         )
     about = f"<{value.tag}>" if hasattr(value, "tag") else describe(value)
     if isinstance(value, dict):
@@ -147,6 +150,6 @@ def _unknown(content: Content) -> str:
     found = content.syntax if content.syntax == "text" else f"{content.syntax} ({about})"
     known = ", ".join(form.name for form in FORMATS)
     return (
-        f"{content.path}: recognised as {found}, but this is not a calibration that is known here; give one of"
+        f"{content.path}: recognised as {found}, but this is not a known calibration format; give one of"
         f" {known} (docs/conventions.md)"
     )

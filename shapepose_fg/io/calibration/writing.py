@@ -77,10 +77,10 @@ def check_target(source: Path, target: Path) -> None:
     ending, own = target.suffix.lower(), source.suffix.lower()
     same = ending == own or (ending in _YAML and own in _YAML)
     if ending not in ("", ".json") and (several or not same):
-        name = "a folder, without ending," if several else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
+        name = "a folder (without a suffix)" if several else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
         raise InputError(
-            f"{target}: cameras that came as {form.name} are written so, or as our own rig file; call it {name} or"
-            " FILE.json"
+            f"{target}: cameras read as {form.name} can be written as that, or as a rig file; name the output"
+            f" {name} or FILE.json"
         )
 
 
@@ -88,7 +88,7 @@ def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
     """The content of `source`, its format, and its cameras."""
     content = load(source)
     if (found := recognised(content)) is None:
-        raise InputError(f"{source}: no calibration is here any more; read it again")
+        raise InputError(f"{source}: the calibration is not there any more; read it again")
     return content, *found
 
 

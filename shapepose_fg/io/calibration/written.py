@@ -128,7 +128,7 @@ class Node:
         try:
             np.array(value, dtype=np.float64)
         except ValueError:
-            raise self.refuse(name, "must have rows of one length") from None
+            raise self.refuse(name, "must have rows of equal length") from None
         return found
 
     def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array:
@@ -203,7 +203,7 @@ def pose(
         raise InputError(f"{place}: {problem}; give a pure rotation without scale, row by row")
     if np.linalg.det(R) < 0:
         cure = "use a right-handed world and OpenCV's camera axes: x right, y down, z forward"
-        raise InputError(f"{place}: the rotation of {key} mirrors (determinant -1); {cure}")
+        raise InputError(f"{place}: the rotation of {key} is a reflection (determinant -1); {cure}")
     if off >= _EXACT:
         R = nearest_rotation(R)
     if world_from_camera:

@@ -56,11 +56,11 @@ def _cameras(
         if (said := camera.get(_RESOLUTION, "")) and _LINES.fullmatch(said) is None:
             unnamed.setdefault(said[:20], []).append(camera.attrib[name])
     for said, names in unnamed.items():
-        size = "pictures are taken to be as large as fov_video says"
+        size = "the size of the pictures is assumed to be that of fov_video"
         notes.append(f"{_RESOLUTION} is {said!r} of camera {listing(names)}; {size}")
     for camera in content.value.findall(path):
         if camera not in used:
-            why = "it is not calibrated" if _takes_video(camera, model) else "it takes no videos"
+            why = "it is not calibrated" if _takes_video(camera, model) else "it does not record video"
             kind = f" ({camera.get(model, '')[:40]})" if camera.get(model) else ""
             notes.append(f"camera {camera.get(name, '?')[:40]}{kind} is left out: {why}")
     return WrittenRig(cameras, "mm", "z", notes=notes)
@@ -141,7 +141,7 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     """By the first key frame: ORIENTATION turns the world's axes into the camera's, POSITION is the centre."""
     key_frame = camera.find("KeyFrames/KeyFrame")
     if key_frame is None:
-        raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate it, or delete it")
+        raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate or delete it")
     whole, frame = _node(camera, place, _NEXUS), _node(key_frame, place, _NEXUS)
     width, height = whole.needed("SENSOR_SIZE", 2)
     ratio = whole.numbers("PIXEL_ASPECT_RATIO", 1)
@@ -161,7 +161,7 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
         distortion = [*numbers[2:4], 0.0, 0.0, numbers[4]]
     elif not all(is_number(word) and float(word) == 0 for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
         cure = "calibrate with Nexus 2 or newer, or undistort the pictures and write 0 0"
-        raise InputError(f"{place}: VICON_RADIAL without VICON_RADIAL2 is not read; {cure}")
+        raise InputError(f"{place}: VICON_RADIAL without VICON_RADIAL2 is not supported; {cure}")
     return WrittenCamera(camera.attrib["DEVICEID"], K, wTc, (round(width), round(height)), distortion)
 
 

@@ -28,25 +28,25 @@ _TABLE = "df_with_missing/table"
 """Path of the table of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
 """HDF5's reference to a text of variable length: its length, and its place."""
-_HDF5 = "an HDF5 file, and only SLEAP's analysis files and DeepLabCut's tables are known here; give the CSV"
+_HDF5 = "an HDF5 file, of which only SLEAP's analysis files and DeepLabCut's tables are supported; give the CSV"
 _FREEMOCAP_3D = (
-    "FreeMoCap's table of points in 3D, and its 2D points are needed; give the recording's folder, or"
+    "FreeMoCap's table of 3D points, but its 2D points are needed; give the recording's folder, or"
     " output_data/raw_data/..._pixelXY.npy in it"
 )
 _OTHERS = {
-    ".npy": "a NumPy array, and only FreeMoCap's of (cameras, frames, points, 2 or 3) pixels is known here",
-    ".npz": "a NumPy archive, which has no layout of its own",
-    ".mat": "a MATLAB file, which has no layout of its own",
+    ".npy": "a NumPy array, of which only FreeMoCap's (cameras, frames, points, 2 or 3) in pixels is supported",
+    ".npz": "a NumPy archive, which has no standard layout",
+    ".mat": "a MATLAB file, which has no standard layout",
     ".pkl": "a Python pickle, which could run code and is not opened",
     ".pickle": "a Python pickle, which could run code and is not opened",
     ".slp": "a SLEAP project; export the analysis HDF5: sio export FILE.slp -o FILE.h5",
     ".h5": f"{_HDF5} (deeplabcut.analyze_videos_converth5_to_csv)",
     ".hdf5": _HDF5,
-    ".parquet": "a Parquet table, which has no layout of its own",
-    ".c3d": "a C3D file of points in 3D, and 2D detections are needed",
+    ".parquet": "a Parquet table, which has no standard layout",
+    ".c3d": "a C3D file of 3D points, but 2D detections are needed",
     "_3d_xyz.csv": _FREEMOCAP_3D,
     "freemocap_data_by_frame.csv": _FREEMOCAP_3D,
-    ".trc": "a TRC file of points in 3D, and 2D detections are needed",
+    ".trc": "a TRC file of 3D points, but 2D detections are needed",
 }
 
 
@@ -55,7 +55,7 @@ def what_it_is(path: Path) -> str | None:
     known = next((what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None)
     if known is None:
         return None
-    cure = "" if ";" in known else "; write what it holds as <camera>.json, COCO's keypoint results"
+    cure = "" if ";" in known else "; convert it to <camera>.json, COCO's keypoint results"
     return f"{known}{cure}"
 
 
@@ -69,11 +69,11 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
         shape, dtype, fortran, offset = _header(path, stream)
         if shape[0] != cameras:
             raise InputError(
-                f"{path}: has {shape[0]} cameras, and {cameras} are wanted; give the calibration of the same"
-                " recording, with all of its cameras in their order"
+                f"{path}: has {shape[0]} cameras, but {cameras} are expected; give the calibration of the same"
+                " recording, with all cameras in the same order"
             )
         if np.prod(shape, dtype=float) > _MOST_VALUES:
-            raise InputError(f"{path}: {shape} are too many numbers; cut the recording into parts")
+            raise InputError(f"{path}: its arrays {shape} are too large; split the recording")
         size = path.stat().st_size - offset
         if size < int(np.prod(shape)) * dtype.itemsize:
             raise InputError(f"{path}: the file ends too early; copy it again")
@@ -106,7 +106,7 @@ def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bo
     try:
         shape, fortran, dtype = read_npy_header(stream)
     except Exception:  # NumPy parses the header as Python's own text, with all errors of that
-        raise InputError(f"{path}: this is no NumPy array; {what_it_is(path)}") from None
+        raise InputError(f"{path}: this is not a NumPy array, but {what_it_is(path)}") from None
     if dtype.hasobject:
         raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
     if len(shape) != 4 or shape[3] not in (2, 3) or dtype.kind != "f":
@@ -122,7 +122,7 @@ def read_hdf5(path: Path) -> CameraPeople:
     h5py = optional("h5py", "hdf5")
     with open_regular(path) as stream:
         if stream.read(8) != b"\x89HDF\r\n\x1a\n":
-            raise InputError(f"{path}: this is no HDF5 file; {what_it_is(path)}")
+            raise InputError(f"{path}: this is not an HDF5 file, but {what_it_is(path)}")
     try:
         with h5py.File(path, "r") as file:
             table = _dataset(h5py, file, _TABLE)
@@ -150,10 +150,10 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
         or (np.diff(frame, prepend=-1) <= 0).any()
         or frame.max(initial=0) >= MOST_FRAME
     ):
-        raise InputError(f"{path}: frames must be whole numbers that rise; {_RERUN}")
+        raise InputError(f"{path}: frame numbers must be increasing whole numbers; {_RERUN}")
     if len(rows) == 0 or values.shape[1] != 1 + len(columns):
         raise InputError(
-            f"{path}: has {len(rows)} frames, and its columns are not those it names; export it again"
+            f"{path}: has {len(rows)} frames, and its columns do not match their names; export it again"
         )
     block = PeopleBlock.dense(frame.astype(np.intp), taken(values.astype(np.float64), picked))
     return CameraPeople(
@@ -169,7 +169,7 @@ def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
     """
     kind = attributes.get_id(name)
     if kind.dtype.kind != "S" or kind.shape != () or kind.dtype.itemsize > SMALL:
-        raise ValueError(f"{name} is no plain text")
+        raise ValueError(f"{name} is not text")
     known, rows, row, last = dict[Any, str](), list[list[str]](), list[str](), ""
     for operation, value, _ in pickletools.genops(bytes(attributes[name])):
         match operation.name:
@@ -185,7 +185,7 @@ def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
             case "LIST" | "APPEND" | "STOP":
                 pass
             case other:
-                raise ValueError(f"{name} is no list of names: {other}")
+                raise ValueError(f"{name} is not a list of names: {other}")
     return rows
 
 
@@ -205,7 +205,7 @@ def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
     score = np.ones(xy.shape[:3]) if score is None else score
     if xy.shape[3] != 2 or xy.shape[2] != len(joints) or score.shape != xy.shape[:3]:
         raise InputError(
-            f"{path}: tracks are {xy.shape}, and there are {len(joints)} node_names; export it again with SLEAP"
+            f"{path}: tracks are {xy.shape}, but there are {len(joints)} node_names; export it again with SLEAP"
         )
     points = np.concatenate([xy, np.where(np.isfinite(score), score, 1.0)[..., None]], axis=3)
     parts = (slice(start, start + BLOCK_FRAMES) for start in range(0, len(points), BLOCK_FRAMES))
@@ -231,7 +231,7 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
         return tuple(each.decode("utf-8") for each in names[:])
     begin = names.id.get_offset() if names.dtype.kind == "O" and names.chunks is None else None
     if begin is None:
-        raise InputError(f"{path}: node_names are no plain texts; export it again with SLEAP")
+        raise InputError(f"{path}: node_names are not text; export it again with SLEAP")
     with open_regular(path) as stream:
         stream.seek(begin)
         records = np.frombuffer(stream.read(len(names) * _RECORD.itemsize), dtype=_RECORD)
@@ -244,14 +244,14 @@ def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes
     head = stream.read(16)
     size = int.from_bytes(head[8:], "little")
     if head[:4] != b"GCOL" or not 16 <= size <= _LARGEST_HEAP or length > _LONGEST_NAME:
-        raise ValueError("a text is not where it should be")
+        raise ValueError("the position of a text is invalid")
     heap, at = stream.read(size - 16), 0
     while at + 16 <= len(heap):
         number, begin = int.from_bytes(heap[at : at + 2], "little"), at + 16
         if number == index:
             return heap[begin : begin + length]
         at = begin + -(-int.from_bytes(heap[at + 8 : begin], "little") // 8) * 8
-    raise ValueError("a text is not in its heap")
+    raise ValueError("a text is outside its heap")
 
 
 def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...] | None) -> bool:
@@ -273,4 +273,4 @@ def _numbers(path: Path, dataset: Any) -> Array:
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
     """InputError where so many numbers are more than the file can hold."""
     if 8 * count > max(_SMALL_BYTES, MOST_PACKED * path.stat().st_size):
-        raise InputError(f"{path}: {shape} are too many numbers; export a part of the recording")
+        raise InputError(f"{path}: its arrays {shape} are too large; export a part of the recording")

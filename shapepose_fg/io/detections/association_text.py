@@ -169,7 +169,7 @@ def _blocks(
         view = _candidates(numbers, kind, counts, starts - numbers.first, start, camera)
         yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
     if numbers.reaches(position + 1):
-        what = f"more numbers follow the last of the {frame_count} frames"
+        what = f"there are more numbers after the last of the {frame_count} frames"
         raise numbers.refuse(position, what, "correct the number of frames in line 1, or write it again")
 
 
@@ -188,14 +188,14 @@ def _candidates(
         raise numbers.refuse(
             numbers.first + int(rows[index] + 2 * n[index]),
             f"a candidate's score must lie between 0 and 1, got {scores[index]:g}",
-            "write the detections again: scores are the third row of each joint",
+            "write the detections again; scores are the third row of each joint",
         )
     bad = np.any(np.abs(fractions) > 2, axis=1)
     if bad.any():
         index = int(np.argmax(bad))
         raise numbers.refuse(
             numbers.first + int(rows[index]),
-            f"a candidate lies at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the picture's size",
+            f"a candidate is at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the picture's size",
             "divide x by width - 1 and y by height - 1",
         )
     xy = fractions * (np.array(camera.image_size) - 1.0)
@@ -213,7 +213,7 @@ def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
         known = f" ({SKELETON_TYPES[int(number)]})" if number in range(len(SKELETON_TYPES)) else ""
         raise numbers.refuse(
             0,
-            f"skeleton type {number:g}{known} is not read here, only 4 (BODY_25) and 3 (COCO_18)",
+            f"skeleton type {number:g}{known} is not supported, only 4 (BODY_25) and 3 (COCO_18)",
             "run the detector with its BODY_25 model",
         )
     if frame_count < 1 or frame_count != int(frame_count):
@@ -235,7 +235,7 @@ def _layout(
     def reach(count: int, what: str) -> None:
         if not numbers.reaches(count):
             problem = f"the file ends in frame {frame} of {frame_count}, where {what} should be"
-            raise numbers.refuse(None, problem, "copy or write it again whole")
+            raise numbers.refuse(None, problem, "copy or write the whole file again")
 
     known, counts, starts = numbers.known, [], []
     for frame in frames:
@@ -249,7 +249,7 @@ def _layout(
                 raise numbers.refuse(
                     position,
                     f"frame {frame} must give the number of candidates of {name}, got {n:g}",
-                    "a number is missing or too many before this line: write the detections again",
+                    "there is a number too few or too many before this line; write the detections again",
                 )
             frame_counts.append(int(n))
             frame_starts.append(position + 1)

@@ -53,7 +53,9 @@ def read_deeplabcut(path: Path) -> CameraPeople:
         if row[0].strip() == "coords":
             break
     if "bodyparts" not in heads or "coords" not in heads:
-        raise InputError(f"{path}: no rows bodyparts and coords under scorer, as DeepLabCut writes them; {_RERUN}")
+        raise InputError(
+            f"{path}: there are no rows bodyparts and coords below scorer, as DeepLabCut writes; {_RERUN}"
+        )
     count = min(len(heads["bodyparts"]), len(heads["coords"]))
     whose = heads.get("individuals", [""] * count)
     joints, picked = body_parts(path, zip(whose, heads["bodyparts"], heads["coords"], strict=False))
@@ -64,12 +66,12 @@ def read_deeplabcut(path: Path) -> CameraPeople:
         numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[:, 0]
         if (np.diff(numbers, prepend=last) <= 0).any():
             line = some[int(np.argmax(np.diff(numbers, prepend=last) <= 0))][0]
-            raise InputError(f"{path}: line {line}: frames must rise; {_RERUN}")
+            raise InputError(f"{path}: line {line}: frame numbers must increase; {_RERUN}")
         first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
         values = np.array([_numbers(path, line, row, width) for line, row in some])
         blocks.append(PeopleBlock.dense(numbers, taken(values, picked)))
     if last < 0:
-        raise InputError(f"{path}: no frames under the heads; {_RERUN}")
+        raise InputError(f"{path}: there are no frames below the headings; {_RERUN}")
     return CameraPeople(path, _DEEPLABCUT, iter(blocks), first, last, rerun=_RERUN, joints=joints)
 
 
@@ -129,7 +131,9 @@ def _points(path: Path) -> Array:
     who = next((name for name in ("cam_id", "port") if name in names), None)
     what = next((name for name in ("keypoint_id", "point_id") if name in names), None)
     if who is None or what is None:
-        raise InputError(f"{path}: no columns cam_id and keypoint_id (or port and point_id); export it again")
+        raise InputError(
+            f"{path}: columns cam_id and keypoint_id (or port and point_id) are missing; export it again"
+        )
     columns = [names.index(each) for each in ("sync_index", who, what, "img_loc_x", "img_loc_y")]
     parts = []
     while len(some := list(islice(rows, _LINES))) > 0:
@@ -144,7 +148,9 @@ def _points(path: Path) -> Array:
     if table[:, 2].max(initial=0) > BLAZEPOSE and not (table[:, 2] == 0).any():
         table = table[:0]
     if len(table) == 0:
-        raise InputError(f"{path}: no points of a person's body; track with Caliscope's POSE or HOLISTIC")
+        raise InputError(
+            f"{path}: there are no points of a person's body; track with Caliscope's POSE or HOLISTIC"
+        )
     return table
 
 
@@ -157,7 +163,9 @@ def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> 
     if digits and int(digits) in ports:
         return int(digits)
     numbers = " ".join(map(str, ports))
-    raise InputError(f"{path}: has cameras {numbers}, and none is {cameras[camera]}; give its own calibration")
+    raise InputError(
+        f"{path}: has cameras {numbers}, but not {cameras[camera]}; give the calibration of the same recording"
+    )
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -169,7 +177,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             *whole, rest = (rest + piece).split("\n")
             yield from (f"{line}\n" for line in whole)
             if len(rest) > 2**20:
-                raise InputError(f"{path}: a line has over a million characters; {_RERUN}")
+                raise InputError(f"{path}: a line has more than a million characters; {_RERUN}")
         if rest:
             yield rest
 
@@ -181,14 +189,14 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             if any(row):
                 yield reader.line_num, row
     except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num} is no CSV ({error}); {_RERUN}") from None
+        raise InputError(f"{path}: line {reader.line_num} cannot be read as CSV ({error}); {_RERUN}") from None
 
 
 def _frame(path: Path, line: int, word: str) -> int:
     """The frame's number: the first field, or the last number in a picture's name."""
     number = last_number(word.strip().rsplit(".", 1)[0])
     if number is None or number == MOST_FRAME:
-        raise InputError(f"{path}: line {line} begins with no frame's number, {word[:40]!r}; {_RERUN}")
+        raise InputError(f"{path}: line {line} must begin with a frame number, got {word[:40]!r}; {_RERUN}")
     return number
 
 

@@ -81,7 +81,7 @@ class _Instance(BaseModel, strict=True):
     def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint."""
         if len(self.keypoints) != len(self.keypoint_scores):
-            problem = f"{len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores"
+            problem = f"there are {len(self.keypoints)} keypoints, but {len(self.keypoint_scores)} keypoint_scores"
             raise InputError(f"{place}: {problem}; {_RERUN[program]}")
         pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
         return [number for (x, y), score in pairs for number in (x, y, score)]
@@ -138,7 +138,7 @@ class _Object(BaseModel, strict=True):
             return []
         scores = [1.0] * len(own.x) if own.visible is None else own.visible
         if not len(own.x) == len(own.y) == len(scores):
-            raise InputError(f"{place}.keypoints must have as many x, y and visible; {_RERUN[program]}")
+            raise InputError(f"{place}.keypoints must have the same number of x, y and visible; {_RERUN[program]}")
         rows = zip(own.x, own.y, scores, strict=True)
         return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
 
@@ -232,10 +232,13 @@ def read_frame_files(folder: Path) -> CameraPeople:
     found = numbered(folder, FRAME_FILE)
     if len(found) == 0:
         lists = sorted(each.name for each in _lists(folder))
-        what = "no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run one of them into it"
+        what = (
+            "there is no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; write the"
+            " detections of one of them into it"
+        )
         if len(lists) > 1:
             names = " ".join(lists[:4])
-            what = f"several JSON files without frame numbers ({names}); leave the one to be read"
+            what = f"there are several JSON files without frame numbers ({names}); keep only one"
         raise InputError(f"{folder}: {what}")
     program, joints = _OPENPOSE, None
     if not found[0][1].name.endswith("_keypoints.json"):
@@ -280,7 +283,9 @@ def _people_of_file(file: Path, program: str, joints: str | tuple[str, ...] | No
     content = read_json(file, most=MIDDLE)
     if program == _PICTURES and isinstance(content, dict):
         if _joints_of_meta(content.get("meta_info")) != joints:
-            raise InputError(f"{file}: meta_info names other joints than the first file; give one model's files")
+            raise InputError(
+                f"{file}: its meta_info names other joints than the first file; give the files of one model"
+            )
         content = content.get("instance_info")
     return _people(content, file, program)
 
@@ -312,8 +317,8 @@ def read_one_file(path: Path) -> CameraPeople:
     if not items.found or (items.key is None and first is not None and not _known(first)):
         found = "a list" if items.found else describe(items.value)
         raise InputError(
-            f"{path}: recognised as JSON ({found}), expected a list of people with image_id (COCO,"
-            " AlphaPose) or of frames with instances (MMPose); give one of these"
+            f"{path}: recognised as JSON ({found}), but a list of people with image_id (COCO, AlphaPose) or of"
+            " frames with instances (MMPose) is expected; give one of these"
         )
     again = every if first is None else chain([first], every)
     if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
@@ -378,7 +383,7 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
             continue
         one = validated(_PifPafFrame, parse_json(line, path), path, _RERUN[_PIFPAF])
         if one.frame <= last:
-            raise InputError(f"{path}: line {number}: frames must rise; {_RERUN[_PIFPAF]}")
+            raise InputError(f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}")
         last = one.frame
         place = f"{path}: line {number}"
         people.add([each.flat(place, _PIFPAF) for each in one.predictions])
@@ -422,7 +427,10 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     first: dict[int, int | str] = {}
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
-            problem = f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame}"
+            problem = (
+                f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} have the same frame"
+                f" number {frame}"
+            )
             raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
     listed = (min(first), max(first)) if first else (0, -1)
     joints = _joints_of_categories(others.get("categories"), categories)
@@ -445,7 +453,7 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
     if name is None and isinstance(image, int):
         if 0 <= image < MOST_FRAME:
             return image
-        raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
+        raise InputError(f"{place} '{image}' is not a frame number; {_RERUN[program]}, of numbered pictures")
     name = str(image) if name is None else name
     if (number := last_number(Path(name).stem)) in (None, MOST_FRAME):
         raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")

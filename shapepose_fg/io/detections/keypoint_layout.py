@@ -11,7 +11,7 @@ from shapepose_fg.core.skeleton import BODY_25, SKELETONS, Skeleton
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople
 
-_CURE = "name the detector's own with --skeleton"
+_CURE = "name the detector's layout with --skeleton"
 _MOST_PEOPLE = 200
 """Maximum number of a camera's people that are compared with a body."""
 _SPREAD, _SIGMAS = 0.5, 2.5
@@ -32,18 +32,18 @@ def skeleton_of_people(
     if counted is None:
         return wanted or BODY_25, []
     count, camera = counted
-    place = f"{camera.source}: recognised as {camera.program} with {count} keypoints a person"
+    place = f"{camera.source}: recognised as {camera.program} with {count} keypoints per person"
     named, notes = _named_in_files(people, count)
     if wanted is not None:
         if wanted.keypoint_count != count:
-            raise InputError(f"{place}, but {wanted.name} has {wanted.keypoint_count}; name its own")
+            raise InputError(f"{place}, but {wanted.name} has {wanted.keypoint_count}; name the right layout")
         if named is not None and keypoint_names(named[0]) != keypoint_names(wanted):
-            return wanted, [f"{named[1]}, but they are read as {wanted.name}, as you said"]
+            return wanted, [f"{named[1]}, but they are read as {wanted.name}, as requested"]
         return wanted, []
     if named is not None:
         skeleton, who, passed = named
         over = (
-            [f"joints that the body does not have are passed over: {listing([_shown(each) for each in passed])}"]
+            [f"joints that the body does not have are ignored: {listing([_shown(each) for each in passed])}"]
             if passed
             else []
         )
@@ -56,10 +56,12 @@ def skeleton_of_people(
     alike = [each for each in SKELETONS.values() if each.keypoint_count == count]
     if len(alike) == 0:
         known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
-        problem = "which is not known here"
-        raise InputError(f"{place}, {problem}; describe them in a --skeleton file; known are {known}")
+        problem = "which is not a known layout"
+        raise InputError(
+            f"{place}, {problem}; describe the layout in a --skeleton file; known layouts are {known}"
+        )
     found, why = (alike[0], "") if len(alike) == 1 else _best_fit(people, alike)
-    said = f"{count} keypoints a person and no names of joints: taken as those of {found.name}{why}"
+    said = f"{count} keypoints per person without joint names: read as {found.name}{why}"
     return found, [*notes, said]
 
 
@@ -81,19 +83,19 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
     if len(chosen) > 1:
         (one, first), (other, second) = list(chosen.items())[:2]
         raise InputError(
-            f"{first.source}: joints lie as in {one}, those of {second.source} as in {other}; give the detections"
+            f"{first.source}: people look like {one}, those of {second.source} like {other}; give the detections"
             f" of one model for all cameras, or {_CURE}"
         )
     fits_of_all = np.concatenate(fits, axis=1)
     best = _sure(fits_of_all)
     if best is None:
         if fits_of_all.shape[1] > 0 and fits_of_all.mean(axis=1).max() < LIKE_A_BODY:
-            return usual, ", the most usual; people look like those of no layout"
+            return usual, ", the most common layout, although people look like none of them"
         rivals = [
             each.name for each, fit in zip(layouts, fits_of_all, strict=True) if not _surely(fits_of_all[0] - fit)
         ]
-        return usual, f", the most usual; people do not tell it from {', '.join(rivals[1:])}"
-    return layouts[best], ", as people look" + (f", and not as {usual.name}" if best > 0 else "")
+        return usual, f", the most common layout; people do not distinguish it from {', '.join(rivals[1:])}"
+    return layouts[best], "because people look like it" + (f", not as {usual.name}" if best > 0 else "")
 
 
 def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
@@ -168,7 +170,7 @@ def _declared(declared: DeclaredJoints, count: int) -> tuple[tuple[Skeleton, lis
     joints = declared.joints
     if not isinstance(joints, str):
         if len(joints) > count:
-            return None, f"{declared.source} names keypoint {len(joints) - 1}, and people have {count}"
+            return None, f"{declared.source} names keypoint {len(joints) - 1}, but people have {count} keypoints"
         joints += ("",) * (count - len(joints))
     return _called(joints, count, declared.source)
 
@@ -185,14 +187,18 @@ def _called(
         layouts = layouts_called(joints)
         fit = [each for each in layouts if each.keypoint_count == count]
         if fit:
-            return (fit[0], []), f"{source} says {_shown(joints)}"
-        has = f"have {layouts[0].keypoint_count} keypoints, not {count}" if layouts else "are not known here"
-        return None, f"{source} says {_shown(joints)}, which {has}"
+            return (fit[0], []), f"{source} names {_shown(joints)}"
+        has = (
+            f"have {layouts[0].keypoint_count} keypoints instead of {count}"
+            if layouts
+            else ("are not a known layout")
+        )
+        return None, f"{source} names {_shown(joints)}, which {has}"
     if not any(body_points(joints)):
-        return None, f"{source} names joints that are not known here, such as {_shown(joints[0])}"
+        return None, f"{source} names unknown joints, such as {_shown(joints[0])}"
     if len(joints) != count:
         raise InputError(
-            f"{source} names {len(joints)} joints, and its people have {count} keypoints; correct the names, or"
+            f"{source} names {len(joints)} joints, but its people have {count} keypoints; correct the names, or"
             f" {_CURE}"
         )
     try:

@@ -17,8 +17,8 @@ from shapepose_fg.io.detections.view_streams import undistorted
 from shapepose_fg.io.validation import validated
 
 _CURE = (
-    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and of a'
-    ' camera that moves "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
+    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and for a'
+    ' moving camera "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
 )
 _Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
 _Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
@@ -66,11 +66,11 @@ def view_of(
     if any(len(each) != 3 * K for each in flat):
         wrong = next(len(each) for each in flat if len(each) != 3 * K)
         raise InputError(
-            f"{place}: {3 * K} numbers a person were expected, of {skeleton.name}, got {wrong}; {_CURE}"
+            f"{place}: {3 * K} numbers per person are expected for {skeleton.name}, got {wrong}; {_CURE}"
         )
     keypoints = np.array(flat, dtype=np.float64).reshape(len(flat), K, 3)
     if np.nanmax(keypoints[..., 2], initial=0.0) > OVERSHOOT:
-        raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; divide them")
+        raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; rescale them")
     frame = np.zeros(len(flat), dtype=np.intp)
     view = joints_of_people(frame, keypoints, lambda score: np.minimum(score, 1.0), skeleton)
     seen = undistorted(view, place, rig.cameras[rig.names.index(camera)]).seen

@@ -62,7 +62,7 @@ def check_one_model(known: set[int], people: Sequence[list[float]], source: Path
     known |= {len(person) // 3 for person in people}
     if len(known) > 1:
         counts = " and ".join(map(str, sorted(known)))
-        what = f"recognised as {program}, with people of {counts} keypoints"
+        what = f"recognised as {program}, but people have {counts} keypoints"
         raise InputError(f"{source}: {what}; give the detections of one model")
 
 
@@ -176,15 +176,15 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
     """
     top = max(each.top_score for each in people)
     if top == 2 and all(each.visibilities for each in people):
-        note = "scores are COCO's visibilities: 2 was read as 1, and 1, a hidden joint, as 0.5"
+        note = "scores are COCO visibilities: 2 (visible) is read as 1, and 1 (hidden) as 0.5"
         return lambda score: np.where(score == 1, _OCCLUDED, score / 2), note
     if top <= OVERSHOOT:
         return lambda score: np.minimum(score, 1.0), None
     step = -(-sum(each.score_count for each in people) // _MOST_LOOKED_AT)
     looked_at = np.concatenate([block.scores[::step] for each in people for block in each.blocks()])
     scale = max(1.0, float(np.quantile(looked_at, 1 - _RARE)))
-    divided = f"divided by {scale:.3g}, which 1 in 100 exceeds, and " if scale > 1 else ""
-    note = f"scores reach {top:.3g}, so they are no probabilities: they were {divided}cut at 1"
+    divided = f"divided by {scale:.3g}, their 99 % quantile, and " if scale > 1 else ""
+    note = f"scores reach {top:.3g}, so they are not probabilities: they were {divided}clipped to 1"
     return lambda score: np.minimum(score / scale, 1.0), note
 
 

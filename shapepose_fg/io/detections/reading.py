@@ -99,11 +99,14 @@ def read_detections(
             streams.append(read)
     if len(people) > 0:
         skeleton, told = skeleton_of_people(people, wanted, declared)
-        how = "made as middles, where a person's two ends were seen"
+        how = "they are the midpoints of two joints, if both were detected"
         streams, said, first = _streams_of(people, skeleton)
         notes += [*said, *told]
     else:
-        skeleton, how = _skeleton_of_streams(streams, wanted), "made between the two that one neighbour links"
+        skeleton, how = (
+            _skeleton_of_streams(streams, wanted),
+            ("they are between the two joints that one neighbour connects"),
+        )
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
     notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
     table = assemble(streams, rig, skeleton, kept, own_frames)
@@ -123,7 +126,7 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
         what = "this is a file" if known is None else f"this is {known}"
         raise InputError(f"{path}: {what}; give the folder that holds the detections of all cameras")
     if not path.is_dir():
-        raise InputError(f"{path}: there is no such folder; check the path of the detections")
+        raise InputError(f"{path}: there is no such folder; check the path")
     folder, entries = _entries(path)
     holds = listing([each.name for each in entries])
     for form in FORMATS:
@@ -135,7 +138,7 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
             missing = rig.names[found.index(None)]
             raise InputError(
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}" are missing,'
-                f" {folder} holds {holds}; add them, or choose cameras by --without {missing}"
+                f" {folder} contains {holds}; add them, or leave the camera out with --without {missing}"
             )
     # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
     for form, offered, names in _offered(entries):
@@ -147,12 +150,12 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
         return form, [file] * len(rig), []
     if len(whole) > 1:
         names = " ".join(file.name for _, file in whole)
-        raise InputError(f"{folder}: several files of all cameras ({names[:200]}); give the one to be read")
+        raise InputError(f"{folder}: there are several files of all cameras ({names[:200]}); give one of them")
     for each in entries:
         if each.is_file() and (known := what_it_is(each)) is not None:
             raise InputError(f"{each}: this is {known}")
     raise InputError(
-        f"{folder}: no detections of the cameras {' '.join(rig.names)} here, only {holds}; give the folder"
+        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}, only {holds}; give the folder"
         " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
         " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
     )
@@ -168,7 +171,7 @@ def camera_names(path: Path) -> list[str]:
     elif path.is_dir():
         folder, entries = _entries(path)
     else:
-        raise InputError(f"{path}: there is no such folder; check the path of the detections")
+        raise InputError(f"{path}: there is no such folder; check the path")
     for each in entries:
         if _FREEMOCAP_FILES.search(each.name) is not None:
             return cameras_of_freemocap(each)
@@ -183,7 +186,7 @@ def camera_names(path: Path) -> list[str]:
                 return [name for name, there in zip(names, holds, strict=True) if there]
     holds = listing([each.name for each in entries])
     cure = "give the folder with a file or folder for each camera"
-    raise InputError(f"{folder}: no detections here, only {holds}; {cure}")
+    raise InputError(f"{folder}: there are no detections, only {holds}; {cure}")
 
 
 def _entries(path: Path) -> tuple[Path, list[Path]]:
@@ -250,7 +253,8 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
         other = each.skeleton or skeleton
         if other.name != skeleton.name:
             raise InputError(
-                f"{each.source} has the joints of {other.name}, {first.source} those of {skeleton.name}; give the"
+                f"{each.source} has the joints of {other.name}, but {first.source} those of {skeleton.name};"
+                " give the"
                 " detections of one model for all cameras"
             )
     if wanted is not None and wanted.joints != skeleton.joints:
@@ -271,12 +275,12 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
     for each, camera in zip(people, cameras, strict=True):
         if each.farthest is not None and each.farthest <= 1:
             raise InputError(
-                f"{camera.source}: recognised as {camera.program}, but all keypoints lie between -1"
-                f" and 1, and pixels were expected; {camera.rerun}"
+                f"{camera.source}: recognised as {camera.program}, but all keypoints are between -1 and 1, and"
+                f" pixels are expected; {camera.rerun}"
             )
     notes = [] if note is None else [note]
     if first > 0 and not all(camera.every_frame for camera in cameras):
-        notes.append(f"frame 0 is number {first} of the files")
+        notes.append(f"frame 0 has number {first} in the files")
     streams = []
     for each, camera in zip(people, cameras, strict=True):
         # A camera that lists every one of its frames must list those of the others.
@@ -287,7 +291,7 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
             (since, until), more = camera.gaps[0], ", and others" if len(camera.gaps) > 1 else ""
             where = f"frame {since}" if since == until else f"frames {since} to {until}"
             have = "frames have" if count > 1 else "frame has"
-            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); no people are seen there")
+            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); no people are read there")
     return streams, notes, empty
 
 
@@ -295,10 +299,10 @@ def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
     """Numbers of the first and last frame that any camera lists."""
     listed = [each for each in cameras if each.last >= each.first]
     if len(listed) == 0:
-        problem = f"recognised as {cameras[0].program}, where no camera lists a frame"
+        problem = f"recognised as {cameras[0].program}, but no camera has a frame"
         raise InputError(f"{cameras[0].source}: {problem}; give detections of people")
     first, last = min(each.first for each in listed), max(each.last for each in listed)
     if last - first >= _MOST_FRAMES:
-        problem = f"recognised as {listed[0].program}, whose frames would run from {first} to {last}"
+        problem = f"recognised as {listed[0].program}, but its frames would run from {first} to {last}"
         raise InputError(f"{listed[0].source}: {problem}; number the pictures by their frames")
     return first, last

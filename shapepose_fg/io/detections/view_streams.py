@@ -106,13 +106,13 @@ def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[Vi
         for view in views:  # what is wrong with their files goes first
             for _ in view.blocks:
                 pass
-        cure = "give the same frames of each, numbered alike"
-        raise InputError(f"{folder}: no frame is there of every camera ({spans}); {cure}")
-    note = f"{folder}: frame 0 is number {start} of the files ({spans})"
+        cure = "give the same frames of each camera with the same numbers"
+        raise InputError(f"{folder}: no frame exists for all cameras ({spans}); {cure}")
+    note = f"{folder}: frame 0 has number {start} in the files ({spans})"
     if not own_frames:
         note = (
-            f"{folder}: cameras have different frames ({spans}); the {stop - start} that all have, {start} to"
-            f" {stop - 1}, are used; where cameras were started apart, `shapepose-fg synchronise` finds when"
+            f"{folder}: cameras have different frames ({spans}); the {stop - start} common ones, {start} to"
+            f" {stop - 1}, are used; if the cameras are unsynchronised, run `shapepose-fg synchronise`"
         )
     return [_part(view, start - view.first_number, stop - start) for view in views], stop - start, [note]
 
@@ -216,7 +216,7 @@ class _LeftOut:
         joints = "joint" if self._count == 1 else "joints"
         share = f"{self._count} {joints} of {self._of} ({self._count / max(self._of, 1):.1%})"
         if self._count > self._most * self._of:
-            raise InputError(f"{self._first}; so are {share} of this camera; {self._cure}")
+            raise InputError(f"{self._first}; this holds for {share} of this camera; {self._cure}")
         return [f"{self._first}; {share} left out"] if self._count else []
 
 
@@ -226,7 +226,7 @@ class _Undistorted:
     def __init__(self, source: Path | str, camera: Camera) -> None:
         self.source, self.camera = source, camera
         self.reasons = (
-            _LeftOut("give detections made on pictures of the calibrated size", _STRAY),
+            _LeftOut("give detections from pictures of the calibrated size", _STRAY),
             _LeftOut("check the distortion coefficients in the calibration", _BENT),
         )
 
@@ -240,7 +240,7 @@ class _Undistorted:
         certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
         straight = camera.undistort(certain.seen.xy)
         undone = np.asarray(~np.isfinite(straight).all(axis=1))
-        why = f"where the distortion of camera {camera.name} cannot be undone"
+        why = f"where the distortion of camera {camera.name} cannot be inverted"
         self.reasons[1].add(undone, partial(self._words, certain, why))
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
 

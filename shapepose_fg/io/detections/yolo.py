@@ -43,14 +43,15 @@ def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]
     numbers = np.array(words[_BOX:], dtype=np.float64)
     count = len(numbers) // 3
     if count < 4:
-        raise InputError(f"{file}: line {line} has a box and no keypoints; run a pose model: yolo pose predict")
+        raise InputError(f"{file}: line {line} has a box but no keypoints; run a pose model: yolo pose predict")
     points = numbers[: 3 * count].reshape(count, 3)
     if (
         not ((points[:, :2] > -1) & (points[:, :2] < 2)).all()
         or not ((points[:, 2] >= 0) & (points[:, 2] <= 2)).all()
     ):
         raise InputError(
-            f"{file}: line {line} must hold x and y as parts of the picture, and scores, of keypoints; {_RERUN}"
+            f"{file}: line {line} must hold x and y of keypoints as fractions of the picture size, and scores;"
+            f" {_RERUN}"
         )
     points[(points[:, :2] == 0).all(axis=1), 2] = 0  # points that are hardly seen are in the corner 0 0
     points[:, :2] *= image_size

@@ -77,11 +77,11 @@ class Take:
         result without identities is a Take too: a person is then a number within the frame.
         """
         if len(people) == 0:
-            raise ValueError("no people were found, so there is nothing to export")
+            raise ValueError("the result has no people, so there is nothing to export")
         if identities and not people.run.get("configuration", {}).get("temporal", True):
             raise ValueError(
-                "this result is frame by frame, so people cannot be followed; reconstruct with --temporal, "
-                "or export csv or rrd"
+                "this result is frame by frame and has no identities; reconstruct with --temporal, or export"
+                " csv or rrd"
             )
         people = _seen(people) if seen_only else people
         # All frames that were reconstructed, those without people too.
@@ -95,8 +95,8 @@ class Take:
         lost = np.flatnonzero(rows[person, place] != np.arange(len(people)))
         if len(lost) > 0:
             raise ValueError(
-                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; "
-                "correct that with `shapepose-fg tracks`"
+                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; correct them"
+                " with `shapepose-fg tracks`"
             )
         times = _times(people, frames, fps)
         steps = np.diff(times) / np.diff(frames)
@@ -138,8 +138,8 @@ class Take:
         step = (self.times_s - self.times_s[0]) * self.fps
         if step[-1] >= _LONGEST:
             raise InputError(
-                f"people.npz: the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames"
-                f" at {self.fps:g} a second; give --fps, or part of it with --frames"
+                f"people.npz: the times cover {self.times_s[-1] - self.times_s[0]:.0f} s, which is"
+                f" {step[-1]:.0f} frames at {self.fps:g} Hz; give --fps, or a part with --frames"
             )
         place = np.rint(step).astype(np.intp)
         nearest = np.lexsort((np.abs(step - place), place))
@@ -174,7 +174,7 @@ def _check_memory(persons: int, frames: int) -> None:
 def _seen(people: Reconstruction) -> Reconstruction:
     """The people without joints that no view saw."""
     if not (people.known != Known.UNKNOWN).any():
-        raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
+        raise ValueError("people.npz does not contain how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
     columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
     for names, kept in ((_OF_JOINTS, seen), (BODY, seen.any(axis=1))):
@@ -192,9 +192,9 @@ def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None)
     times = people.time_s[first]
     known, times = known[np.isfinite(times)], times[np.isfinite(times)]
     if len(known) == 0:
-        raise ValueError("people.npz does not say when its frames were taken; give --fps")
+        raise ValueError("people.npz does not contain the times of its frames; give --fps")
     if (np.diff(times) <= 0).any():
-        raise ValueError("time_s does not rise from frame to frame; give --fps")
+        raise ValueError("time_s does not increase from frame to frame; give --fps")
     rate = (known[-1] - known[0]) / (times[-1] - times[0]) if len(known) > 1 else _fps_of(people)
     between = np.interp(frames, known, times)
     return between + (np.minimum(frames - known[0], 0) + np.maximum(frames - known[-1], 0)) / rate
@@ -204,7 +204,7 @@ def _fps_of(people: Reconstruction) -> float:
     """Frame rate according to run.json, Hz."""
     fps = people.run.get("time", {}).get("fps")
     if fps is None or not fps > 0:
-        raise ValueError("one frame does not say how many there are a second; give --fps")
+        raise ValueError("one frame does not determine the frame rate; give --fps")
     return float(fps)
 
 

@@ -37,7 +37,7 @@ _LENSES = {4: "equidistant", 5: "plumb_bob"}
 def nanoseconds(time_s: float) -> int:
     """A time in nanoseconds for the log of an MCAP file; InputError before 1970 and after 2038."""
     if not 0 <= time_s < _LAST_S:
-        raise InputError(f"time {time_s:g} s: ROS's clocks run from 0 to 2^31 s; give times from 0 on")
+        raise InputError(f"time {time_s:g} s: ROS times must be 0 to 2^31 s; give times from 0 on")
     return round(time_s * NS)
 
 

@@ -96,7 +96,7 @@ class Frames:
         time_s = np.array(sorted(self._told[most])) / NS
         poses, surely, there = self.at(frame, time_s)
         if there.sum() < 2:
-            raise ValueError(f"2 poses are needed, known along {' in '.join(self.chain(frame))} at the same time")
+            raise ValueError(f"2 poses are needed, with {' in '.join(self.chain(frame))} known at the same time")
         says = surely[there].any()
         return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
 
@@ -148,9 +148,9 @@ def _matrix(pose: Array, place: str) -> Array:
     from scipy.spatial.transform import Rotation
 
     if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > UNIT_LENGTH:
-        raise InputError(f"{place}: a pose must be finite, its quaternion of length 1; leave it out")
+        raise InputError(f"{place}: a pose must be finite, with a quaternion of length 1; leave it out")
     if np.abs(pose[:3]).max() > MOST_METRES:
-        raise InputError(f"{place}: a pose is over {MOST_METRES:g} m away; write metres")
+        raise InputError(f"{place}: a pose is more than {MOST_METRES:g} m away; write metres")
     return rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
 
 
