@@ -94,7 +94,7 @@ def module_folder(module: str) -> Path | None:
         else:
             fresh.mkdir()
             (fresh / source.name).write_bytes(source.read_bytes())
-            os.utime(fresh / source.name, (0, 0))  # older versions of Numba look at the time, not at the content
+            os.utime(fresh / source.name, (0, 0))  # older versions of Numba check the time, not the content
         if not folder.exists():
             fresh.rename(folder)
         _remove_old(place, module)
