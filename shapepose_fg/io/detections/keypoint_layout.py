@@ -95,7 +95,7 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
             each.name for each, fit in zip(layouts, fits_of_all, strict=True) if not _surely(fits_of_all[0] - fit)
         ]
         return usual, f", the most common layout; people do not distinguish it from {', '.join(rivals[1:])}"
-    return layouts[best], "because people look like it" + (f", not as {usual.name}" if best > 0 else "")
+    return layouts[best], ", because people look like it" + (f", not as {usual.name}" if best > 0 else "")
 
 
 def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
