@@ -23,6 +23,7 @@ from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
+    information_by_view,
     inverses,
     linearise,
     mean_confidence,
@@ -30,6 +31,7 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.noise_law import core_sigma_m, variance_ratio
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import State
@@ -147,15 +149,18 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
     exchange = exchange_spread(state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints))
-    alone = np.ones(len(X), dtype=bool)
+    alone, ways = np.ones(len(X), dtype=bool), state.config.observations
     for person in state.people:
         mine, times_s = person.rows, person.times_s
         alone[mine] = not person.temporal
         association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
             clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
+    sigma_m = core_sigma_m(rows.confidence, ways) * ways.scatter(joints)[:, None]
+    by_view = information_by_view(final, state.sigmas, state.views, ways)
+    ratio = variance_ratio(state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information)
     clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
-    return np.where(
+    return ratio[..., None, None] * np.where(
         alone[:, None, None, None],
         covariance + calibration.association * association,
         calibration.covariance(clues),
