@@ -186,7 +186,7 @@ class Residuals:
         of_others = np.digitize(self.of_others, EDGES)
 
         def total(values: Array) -> Array:
-            return np.bincount(score, values, len(EDGES) + 1)
+            return np.bincount(score, values, len(EDGES) + 1).astype(np.float64)
 
         count, expected = total(np.ones(len(score))), np.square(prior.times)
         squared_times, gross = expected, np.array(prior.gross)
