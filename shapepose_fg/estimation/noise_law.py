@@ -129,9 +129,9 @@ class Residuals:
     scatter: Array
     """(R,) standard deviation in Eq. 1's weights, as a length at the joint's depth, m."""
     squared: Array
-    """(R, 2) squared distance along the two axes of the others' covariance, m²."""
+    """(R,) squared distance, mean of both axes of the picture, m²."""
     others: Array
-    """(R, 2) variance of the place along these axes by Eq. 1's weights, m²."""
+    """(R,) variance of the place by Eq. 1's weights, mean of both axes, m²."""
     of_others: Array
     """(R, V) scores of the other views' detections; 0 for none."""
 
@@ -165,10 +165,10 @@ class Residuals:
             length = depth[:, 0, view] / focal
             off_m = length[:, None] * (xy[:, 0, view] - every.xy[there][:, view])
             slope = length[:, None, None] * slope[:, 0, view]
-            variance, axes = np.linalg.eigh(slope @ inverses(evidence.information[there]) @ slope.mT)
-            squared = np.square(np.einsum("nij,ni->nj", axes, off_m))
+            covariance = slope @ inverses(evidence.information[there]) @ slope.mT
+            squared, variance = np.square(off_m).mean(axis=1), np.trace(covariance, axis1=1, axis2=2) / 2
             score = every.confidence[there][:, view]
-            known = np.isfinite(squared + variance).all(axis=1)
+            known = np.isfinite(squared + variance)
             columns = (
                 score,
                 core_sigma_m(score, config) * scatter[joint],
@@ -192,16 +192,16 @@ class Residuals:
         squared_times, gross = expected, np.array(prior.gross)
         for _ in range(_ROUNDS):
             theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-            others, own = self.others * theirs[:, None], (squared_times[score] * self.scatter**2)[:, None]
+            others, own = self.others * theirs, squared_times[score] * self.scatter**2
             likely = [
-                -0.5 * (self.squared / variance + np.log(variance)).sum(axis=1)
+                -self.squared / variance - np.log(variance)  # of both axes
                 for variance in (others + own, others + own + GROSS_M**2)
             ]
             odds = gross[score] / np.maximum(1 - gross[score], 1e-9)
             core = 1 / (1 + odds * np.exp(np.clip(likely[1] - likely[0], -50.0, 50.0)))
             # Expected square of the detection's own error, which is a part of the residual.
             share = own / (others + own)
-            error = (share**2 * self.squared + share * others).mean(axis=1) / self.scatter**2
+            error = (share**2 * self.squared + share * others) / self.scatter**2
             squared_times = (_PRIOR_COUNT * expected + total(core * error)) / (_PRIOR_COUNT + total(core))
             gross = (_PRIOR_COUNT * np.array(prior.gross) + total(1 - core)) / (_PRIOR_COUNT + count)
         # As in run.json, from which it is read again.
