@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -143,10 +144,16 @@ def of_few_frames(monkeypatch):
     monkeypatch.setattr(offsets, "NOISE_FRAMES", 20)
 
 
+def set_up(scene, recording) -> tuple[Setup, ThinnedFrames]:
+    """What a run has when it begins."""
+    config = PipelineConfig()
+    setup = Setup(scene.rig, BODY_25, config, make_fitter(config.body))
+    return setup, ThinnedFrames(recording, scene.rig, config.candidates)
+
+
 def test_a_run_learns_it_once_and_keeps_it(noisy, of_few_frames, monkeypatch):
     scene, recording, times = noisy
-    config = PipelineConfig()
-    setup, frames = Setup(scene.rig, BODY_25, config, None), ThinnedFrames(recording, scene.rig, config.candidates)
+    setup, frames = set_up(scene, recording)
     kept = InMemory()
     law = offsets.kept_noise(kept, setup, frames, times, Notebook())
     found, usual = np.array([law.times, NoiseLaw.shipped().times])[:, 3:6]
@@ -158,8 +165,7 @@ def test_a_run_learns_it_once_and_keeps_it(noisy, of_few_frames, monkeypatch):
 def test_a_short_recording_keeps_what_ships(noisy, monkeypatch):
     scene, recording, times = noisy
     monkeypatch.setattr(offsets, "NOISE_FRAMES", 21)
-    config = PipelineConfig()
-    setup, frames = Setup(scene.rig, BODY_25, config, None), ThinnedFrames(recording, scene.rig, config.candidates)
+    setup, frames = set_up(scene, recording)
     assert offsets.noise_of(setup, frames, times, Notebook()) == NoiseLaw.shipped()
 
 
