@@ -129,9 +129,9 @@ class Residuals:
     scatter: Array
     """(R,) standard deviation in Eq. 1's weights, as a length at the joint's depth, m."""
     squared: Array
-    """(R,) squared distance, mean of both axes of the picture, m²."""
+    """(R, 2) squared distances along the axes of the place's covariance, m²."""
     others: Array
-    """(R,) variance of the place by Eq. 1's weights, mean of both axes, m²."""
+    """(R, 2) variances of the place along these axes by Eq. 1's weights, rising, m²."""
     of_others: Array
     """(R, V) scores of the other views' detections; 0 for none."""
 
@@ -166,9 +166,12 @@ class Residuals:
             off_m = length[:, None] * (xy[:, 0, view] - every.xy[there][:, view])
             slope = length[:, None, None] * slope[:, 0, view]
             covariance = slope @ inverses(evidence.information[there]) @ slope.mT
-            squared, variance = np.square(off_m).mean(axis=1), np.trace(covariance, axis1=1, axis2=2) / 2
+            variance, whole = np.linalg.eigvalsh(covariance), np.square(off_m).sum(axis=1)
+            along = np.einsum("ni,nij,nj->n", off_m, covariance, off_m) - variance[:, 0] * whole
+            second = np.clip(along / np.maximum(np.ptp(variance, axis=1), 1e-12), 0.0, whole)
+            squared = np.column_stack([whole - second, second])
             score = every.confidence[there][:, view]
-            known = np.isfinite(squared + variance)
+            known = np.isfinite(squared + variance).all(axis=1)
             columns = (
                 score,
                 core_sigma_m(score, config) * scatter[joint],
@@ -192,16 +195,16 @@ class Residuals:
         squared_times, gross = expected, np.array(prior.gross)
         for _ in range(_ROUNDS):
             theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-            others, own = self.others * theirs, squared_times[score] * self.scatter**2
+            others, own = self.others * theirs[:, None], (squared_times[score] * self.scatter**2)[:, None]
             likely = [
-                -self.squared / variance - np.log(variance)  # of both axes
+                -0.5 * (self.squared / variance + np.log(variance)).sum(axis=1)
                 for variance in (others + own, others + own + GROSS_M**2)
             ]
             odds = gross[score] / np.maximum(1 - gross[score], 1e-9)
             core = 1 / (1 + odds * np.exp(np.clip(likely[1] - likely[0], -50.0, 50.0)))
             # Expected square of the detection's own error, which is a part of the residual.
             share = own / (others + own)
-            error = (share**2 * self.squared + share * others) / self.scatter**2
+            error = (share**2 * self.squared + share * others).mean(axis=1) / self.scatter**2
             squared_times = (_PRIOR_COUNT * expected + total(core * error)) / (_PRIOR_COUNT + total(core))
             gross = (_PRIOR_COUNT * np.array(prior.gross) + total(1 - core)) / (_PRIOR_COUNT + count)
         # As in run.json, from which it is read again.
