@@ -73,12 +73,13 @@ def kept_offsets(
 def kept_noise(
     kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> NoiseLaw:
-    """The noise law that a run stored when it began; `noise_of` where it has none yet."""
+    """The noise law that a run stored when it began; `noise_of` where it has none."""
     if len(kept.names(_NOISE)) > 0:
         with naming(kept.place(_NOISE), ANEW):
             return NoiseLaw.from_dict({name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS})
     noise = noise_of(setup, frames, times, book)
-    kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
+    if noise != NoiseLaw.shipped():
+        kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
     return noise
 
 
