@@ -28,7 +28,10 @@ from shapepose_fg.proposal.thinning import ThinnedFrames
 _OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
 """The names under which a run stores them."""
 NOISE_FRAMES = 60
-"""Number of frames from which the noise law is learnt; shorter recordings keep what ships."""
+"""Maximum number of frames from which the noise law is learnt; shorter recordings keep what ships."""
+_ENOUGH = 10_000
+"""Number of detections of 2D people that are enough for it: crowds have them in a dozen frames."""
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 def estimate_offsets(
@@ -97,12 +100,18 @@ def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: N
             StageOne(setup.skeleton, setup.config.candidates, setup.config.proposals, Notebook()),
             times.of_views(len(setup.rig)),
         )
-        for frame in (detections.first + t for t in spread_frames(count, NOISE_FRAMES)):
+        frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
+        # Wherever this ends, its frames are spread over the whole recording.
+        for frame in frames[np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")].tolist():
             found = detections[frame]
             people = stage(found, setup.rig.at(time_s[frame]))
             people = replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))
+            whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
             chosen.append(people)
-            every.append(Observations.of(whole_people(people.candidate, found), found, people.initial))
+            every.append(whole)
+            learnt += int(whole.seen.sum())
+            if learnt >= _ENOUGH:
+                break
         rows, whole = Observations.concatenate(chosen), Observations.concatenate(every)
         views, config = Views.of(setup.rig, rows.time_s), setup.config.observations
         return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
