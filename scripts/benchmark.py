@@ -28,6 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.compiling import cores
 from shapepose_fg.core.detections import DetectionSequence, Recording
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.io.calibration import read_rig
@@ -187,14 +188,13 @@ def _crowd(data: Path) -> tuple[DetectionSequence, Rig, float]:
 
 def _machine() -> str:
     """Processor, cores, how busy it was, versions."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = f", load {os.getloadavg()[0]:.1f} before the start" if hasattr(os, "getloadavg") else ""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     numbers = versions()
     packages = ", ".join(f"{name} {numbers[name]}" for name in ("python", "numpy", "gtsam"))
-    return f"{[*named, platform.processor() or platform.machine()][0]}, {cores} cores{load}\n{packages}"
+    return f"{[*named, platform.processor() or platform.machine()][0]}, {cores()} cores{load}\n{packages}"
 
 
 def _table(title: str, spent: dict[str, list[Spent]]) -> Table:

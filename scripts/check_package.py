@@ -2,13 +2,19 @@
 
 The wheel is built from the sdist, so that what the sdist lacks is noticed. The environment takes the dependencies
 from the one that runs this (torch is a large download), but nothing of this folder.
+
+With --versions oldest newest, one environment is made with the oldest versions that pyproject.toml allows (as far
+as wheels for the interpreter exist), and one with the newest, without constraints.txt. In each the demo runs, then
+the fast tests. --python python3.11 python3.13 tries other interpreters. Exit code 1 where something fails.
 """
 
+import argparse
 import os
 import subprocess
 import sys
 import sysconfig
 import tempfile
+import time
 import venv
 from pathlib import Path
 
@@ -30,32 +36,82 @@ run("simulate demo --people 1 --cameras 3 --frames :6 --output in")
 run("reconstruct --calibration in/calibration.json --detections in --fps 25 --output results")
 assert len(shapepose_fg.Reconstruction.load("results")) == 6 and Path("results/report.html").is_file()
 """
+VERSIONS = """
+import platform
+from importlib.metadata import version
+names = "numpy scipy numba gtsam opencv-python-headless pydantic typer rich".split()
+print(f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in names), sep=", ")
+"""
 
 
 def main() -> None:
-    """Build, install, use; an error ends with exit code 1 and what the failing step said."""
+    """Make the environments one after the other, and use them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--versions", nargs="+", choices=("oldest", "newest"), help="versions of dependencies")
+    parser.add_argument("--python", nargs="*", default=[sys.executable], help="interpreters; by default this one")
+    parser.add_argument("--tests", nargs="*", default=["tests"], help="files of tests; none: only the demo")
+    parser.add_argument("--folder", type=Path, help="folder in which environments stay, for the next time")
+    arguments = parser.parse_args()
+    failed = False
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (arguments.folder or Path(temporary)).absolute()
+        tries = [(python, which) for python in arguments.python for which in arguments.versions or ()]
+        for python, which in tries or [(sys.executable, "built")]:
+            begin, place = time.monotonic(), folder / f"{Path(python).name}-{which}"
+            place.mkdir(parents=True, exist_ok=True)
+            try:
+                said = tried(python, which, place, arguments.tests) if tries else built(place)
+            except RuntimeError as error:
+                failed, said = True, f"failed: {error}"
+            print(f"{python}, {which}: {said} ({(time.monotonic() - begin) / 60:.0f} min)", flush=True)
+    sys.exit(failed)
+
+
+def run(place: Path, *command: object) -> str:
+    """Run a command in a folder, without this folder's packages; returns the last line that it printed."""
+    words = [str(each) for each in command]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
+    environment |= {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(words, cwd=place, env=environment, capture_output=True, text=True, check=False)
+    lines = (done.stdout + done.stderr).strip().splitlines()
+    last = [each for each in lines if not each.startswith("WARNING")][-25:]
+    if done.returncode != 0:
+        raise RuntimeError("\n".join([" ".join(words[:8]), *last]))
+    return last[-1] if last else ""
 
-        def run(*command: object) -> None:
-            words = [str(each) for each in command]
-            done = subprocess.run(words, cwd=place, env=environment, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                sys.exit(f"{' '.join(words[:6])} failed:\n{done.stdout[-3000:]}{done.stderr[-3000:]}")
 
-        run(sys.executable, "-m", "build", "--outdir", place / "dist", ROOT)
-        wheel = next((place / "dist").glob("*.whl"))
-        venv.create(place / "empty", with_pip=False)
-        python = place / "empty" / "bin" / "python"
-        run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel)
-        # After the environment's own packages, and without what `pip install -e` left there.
-        site = Path(sysconfig.get_path("purelib", vars={"base": str(place / "empty")}))
-        paths = [each for each in sys.path if each.endswith("site-packages")]
-        (site / "dependencies.pth").write_text("\n".join(paths) + "\n", encoding="utf-8")
-        run(python, "-I", "-c", USE)
-        run(place / "empty" / "bin" / "shapepose-fg", "--help")
-        print(f"{wheel.name} ({wheel.stat().st_size / 1e6:.1f} MB) and its sdist install and run")
+def built(place: Path) -> str:
+    """Build at `place`, install into an empty environment, and use it."""
+    run(place, sys.executable, "-m", "build", "--outdir", place / "dist", ROOT)
+    wheel = next((place / "dist").glob("*.whl"))
+    venv.create(place / "empty", with_pip=False)
+    python = place / "empty" / "bin" / "python"
+    run(place, sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel)
+    # After the environment's own packages, and without what `pip install -e` left there.
+    site = Path(sysconfig.get_path("purelib", vars={"base": str(place / "empty")}))
+    paths = [each for each in sys.path if each.endswith("site-packages")]
+    (site / "dependencies.pth").write_text("\n".join(paths) + "\n", encoding="utf-8")
+    run(place, python, "-I", "-c", USE)
+    run(place, place / "empty" / "bin" / "shapepose-fg", "--help")
+    return f"{wheel.name} ({wheel.stat().st_size / 1e6:.1f} MB) and its sdist install and run"
+
+
+def tried(python: str, which: str, place: Path, tests: list[str]) -> str:
+    """Install the package with some versions of its dependencies at `place`, run the demo and the tests."""
+    own = place / "bin" / "python"
+    if not own.exists():
+        run(place, python, "-m", "venv", place)
+    run(place, own, "-m", "pip", "install", "--quiet", "uv")
+    resolution = ("--resolution", "lowest-direct" if which == "oldest" else "highest")
+    wheels = ("--only-binary", ":all:", "--no-binary", "shapepose-fg")
+    install = (place / "bin" / "uv", "pip", "install", "--quiet", "--python", own)
+    run(place, *install, *resolution, *wheels, f"{ROOT}[dev]")
+    run(place, place / "bin" / "shapepose-fg", "demo", "--output", place / "demo")
+    summary, versions = "demo only", run(place, own, "-c", VERSIONS)
+    if tests:
+        run(place, *install, "--no-deps", "-e", ROOT)
+        summary = run(ROOT, own, "-m", "pytest", "-m", "not slow", "-n", "2", "--dist", "loadfile", *tests)
+    return f"passed: {versions}: {summary}"
 
 
 if __name__ == "__main__":

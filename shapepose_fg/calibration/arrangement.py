@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from factors.noise import gaussian, robust_kernel
 from shapepose_fg.calibration.relative import Relative
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.setup_check.fit import difference
 
 _TREES = 100
@@ -38,8 +39,7 @@ class Edge:
     @classmethod
     def of(cls, pair: Relative, metres: float) -> "Edge":
         """Edge of a pair whose cameras are `metres` apart."""
-        bTa = np.eye(4)
-        bTa[:3, :3], bTa[:3, 3] = pair.R, metres * pair.t
+        bTa = rigid(pair.R, metres * pair.t)
         way = pair.t / np.linalg.norm(pair.t)
         covariance = pair.covariance + _LEAST**2 * np.diag(np.r_[1.0, 1, 1, 0, 0, 0])
         covariance[3:, 3:] += _LEAST**2 * (np.eye(3) - np.outer(way, way)) + _LENGTH**2 * np.outer(way, way)

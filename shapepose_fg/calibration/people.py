@@ -9,6 +9,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.setup_check.evidence import observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
@@ -26,7 +27,7 @@ _NOISE = ObservationConfig()
 
 
 @dataclass(frozen=True)
-class People:
+class People(Rows):
     """P people of single frames, J joints, V cameras."""
 
     frame: Index
@@ -39,17 +40,10 @@ class People:
     points: Array
     """(P, J, 3) where the cameras put the joints, metres; NaN where fewer than two saw them."""
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
     @property
     def seen(self) -> Mask:
         """(P, J, V) which detections place a joint."""
         return np.asarray(np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1]))
-
-    def only(self, keep: Mask) -> "People":
-        """The people of a mask `keep` (P,)."""
-        return People(self.frame[keep], self.xy[keep], self.sigma_px[keep], self.points[keep])
 
 
 @dataclass(frozen=True)

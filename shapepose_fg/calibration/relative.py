@@ -11,7 +11,7 @@ from itertools import product
 import cv2
 import numpy as np
 
-from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.body.model.rotation import exp_so3, hat
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
@@ -160,7 +160,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
         a, b, size = seen.joints(kept)
         pose = _in_front(E, a, b) if best is None else (best.R, best.t)
         R, t, covariance = refined_pose(*pose, a, b, size)
-        E = cross(t) @ R
+        E = hat(t) @ R
         new, score = seen.chosen(seen.misses(E[None])[0])
         if best is not None and score <= best.score:
             return best
@@ -198,13 +198,13 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
     size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
     to, H, usual = np.zeros((5, 6)), np.eye(5), 1.0
     for _ in range(_STEPS):
-        E, turned = cross(t) @ R, a @ R.T
+        E, turned = hat(t) @ R, a @ R.T
         Ea, Eb = a @ E.T, b @ E
         # Sampson's distance, of an angle on both sides, as a part of people's size.
         scale = size * np.sqrt((Ea**2).sum(axis=1) + (Eb**2).sum(axis=1))
         r = (b * Ea).sum(axis=1) / scale
         # b . [t] (w x R a) = (b x t) . (w x R a) = w . (R a x (b x t)); b . (dt x R a) = dt . (R a x b)
-        J = np.concatenate([_crossed(turned, b @ cross(t)), _crossed(turned, b)], axis=1) / scale[:, None]
+        J = np.concatenate([_crossed(turned, b @ hat(t)), _crossed(turned, b)], axis=1) / scale[:, None]
         to = np.zeros((5, 6))
         to[:3, :3], to[3:, 3:] = np.eye(3), basis_across(t)
         J, usual = J @ to.T, max(_RANSAC / 2, float(np.median(np.abs(r))))
@@ -218,11 +218,6 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         if np.linalg.norm(step) < 1e-6:
             break
     return R, t, to.T @ np.linalg.inv(H) @ to * _DILUTION * usual**2
-
-
-def cross(t: Array) -> Array:
-    """(3, 3) matrix of the cross product with `t`."""
-    return np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
 
 
 def _crossed(a: Array, b: Array) -> Array:

@@ -37,31 +37,34 @@ class Demo:
         median_mm = float(np.nanmedian(distance_mm)) if distance_mm.size else float("nan")
         accuracy = {
             "people found": (f"{metrics.people_found} of {metrics.people_true}", "in all frames together"),
-            "found twice": (str(metrics.people_duplicated), ""),
-            "invented": (str(metrics.people_invented), ""),
-            "precision": (_percent(metrics.precision), f"joints within {CORRECT_M} m, of those placed"),
-            "recall": (_percent(metrics.recall), f"joints within {CORRECT_M} m, of all true ones"),
+            "duplicates": (str(metrics.people_duplicated), ""),
+            "false positives": (str(metrics.people_invented), ""),
+            "precision": (_percent(metrics.precision), f"estimated joints within {CORRECT_M} m of the truth"),
+            "recall": (_percent(metrics.recall), f"true joints with an estimate within {CORRECT_M} m"),
             "F1": (_percent(metrics.f1), ""),
-            "MPJPE": (f"{metrics.mpjpe_mm:.1f} mm", "mean distance of a joint to the true one"),
-            "median": (f"{median_mm:.1f} mm", "half of the joints are nearer than this"),
+            "MPJPE": (f"{metrics.mpjpe_mm:.1f} mm", "mean distance between estimated and true joints"),
+            "median": (f"{median_mm:.1f} mm", "median of the same distance"),
         }
         calibration = covariance_calibration(error_m, people.covariance[matches.row])
         covariances = {
             f"inside the {100 * level:.0f} % ellipsoid": (
                 _percent(share),
-                f"should be {100 * level:.0f} %; more is cautious",
+                f"nominal: {100 * level:.0f} %; higher: underconfident",
             )
             for level, share in calibration.coverage.items()
         }
-        covariances["mean NEES"] = (f"{calibration.mean_nees:.2f}", "should be 3; more is too sure")
+        covariances["mean NEES"] = (
+            f"{calibration.mean_nees:.2f}",
+            "nominal: 3; higher: overconfident",
+        )
         frames = max(len(self.scene), 1)
         spent = {stage: s for stage, s in people.run["seconds"].items() if stage != "load"}
         time = {stage: (f"{1e3 * each / frames:.1f}", "") for stage, each in spent.items()}
         time["all"] = (f"{1e3 * sum(spent.values()) / frames:.1f}", "bodies are cheaper in longer recordings")
         tables = {
-            "Against the truth": accuracy,
-            "Is the truth where the covariances say?": covariances,
-            "Time, milliseconds a frame": time,
+            "Comparison with the truth": accuracy,
+            "Calibration of the covariances": covariances,
+            "Time per frame, ms": time,
         }
         return Group(*(Padding(_table(title, rows), (1, 0, 0, 2)) for title, rows in tables.items()))
 
@@ -70,12 +73,12 @@ class Demo:
         self.people.save(folder)
         told = [
             f"{folder / 'people.npz'}  joints, covariances and bodies",
-            f"{folder / 'run.json'}  settings, times",
-            f"{folder / 'observations.npz'}  which detections the joints are made of",
+            f"{folder / 'run.json'}  settings and times",
+            f"{folder / 'observations.npz'}  detections assigned to each joint",
             f"{folder / CAMERAS}  the cameras",
         ]
         if report:
-            told.append(f"{write_report(folder, self.people, self.scene.rig)}  to look at, in a browser")
+            told.append(f"{write_report(folder, self.people, self.scene.rig)}  open it in a browser")
         else:
             (folder / REPORT).unlink(missing_ok=True)
         return told

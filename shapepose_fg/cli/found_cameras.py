@@ -21,7 +21,7 @@ MOST_S = 60.0
 
 def report_option() -> Any:
     """The option for a page with pictures."""
-    return option(RESULT, "Page with the cameras in 3D and people over them, for the browser: FILE.html.")
+    return option(RESULT, "Page for the browser with cameras and people in 3D: FILE.html.")
 
 
 def found_clocks(
@@ -45,7 +45,7 @@ def found_clocks(
         recording, times = read_recording(detections, rig, skeleton, Path(folder), fps, own_frames=True)
         note(*recording.notes)
         if times is None or len(times) < 2:
-            raise InputError("--fps: missing; say how many frames a second the cameras took")
+            raise InputError("--fps: missing; give the frame rate of the cameras")
         span = frame_range(frames, len(recording), recording.first)
         with progress("comparing", "pairs") as done:
             found = synchronise(recording, rig, fps or rate_of(times.frame_s), span, most, progress=done)
@@ -64,5 +64,6 @@ def show_clocks(found: "Synchronised", rig: "Rig") -> None:
     for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
         known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"
         rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
-    caption = "began: its frame 0, on the first camera's clock; stands out: the offset of all others"
-    show(table(("camera", "began, s", "± ms", "stands out"), rows, caption=caption))
+    caption = "start: time of the camera's frame 0 on the first camera's clock; distinct: how clearly the best"
+    " offset differs from all others"
+    show(table(("camera", "start, s", "± ms", "distinct"), rows, caption=caption))

@@ -14,20 +14,24 @@ if TYPE_CHECKING:
 @grouped
 def live(
     cameras: CameraOptions,
-    detections: str | None = option(INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; standard input."),
+    detections: str | None = option(
+        INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; by default standard input."
+    ),
     skeleton: str | None = option(
-        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
     ),
-    lag: float = option(TIME, "How much later refined people follow, seconds.", 0.3),
+    lag: float = option(TIME, "Delay of the refined people, seconds.", 0.3),
     output: list[str] | None = option(
-        RESULT, "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun to look; standard output; may be repeated."
+        RESULT,
+        "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun for the viewer; by default standard"
+        " output; may be repeated.",
     ),
-    workers: int = option(RUN, "Processes that refine; 1: none but this one.", 2),
+    workers: int = option(RUN, "Number of processes, with this one.", 2),
 ) -> None:
-    """Follow people while a detector runs: a line per camera and picture in, lines of people out.
+    """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines of people.
 
     In: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people". Out: "now" after each
-    frame, "settled" when its people are refined. Ends with the input; a line that cannot be used is left out with
+    frame, "settled" when its people are refined. Ends with the input; an invalid line is left out with
     a note. A socket listens on this machine only, unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2
     messages. `rerun` starts that viewer, rerun+http://HOST:9876/proxy is one that runs.
     """
@@ -60,7 +64,7 @@ def live(
                 publish("settled", people.settled())
             if report.jumps > jumps:
                 jumps = report.jumps
-                of_cameras(f"all cameras jumped to {view[2]:.2f} s")
+                of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
             said = _say(people, said, of_cameras)
 
         try:
@@ -70,7 +74,7 @@ def live(
             raise
         publish("settled", people.finish())
         report = people.report()
-    out = f"{report.dropped} came too late, twice or at another time"
+    out = f"{report.dropped} measurements were dropped (late, repeated, or at the wrong time)"
     note(f"{report.frames} frames, {report.late} of them late; {out}")
 
 

@@ -47,12 +47,12 @@ from shapepose_fg.core.storage.output_folder import prepare_output
 
 app = typer.Typer(
     name="shapepose-fg",
-    help="Every person in the room in 3D, with a body, from several calibrated cameras.",
+    help="Reconstruct several people in 3D, with bodies, from several calibrated cameras.",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
-_RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
+_RECORDING, _RESULT, _TRY = "Reconstruct a recording", "Use a result", "Try and evaluate"
 for _panel, _commands in {
     _RECORDING: (detect, calibrate, check_calibration, refine_calibration, synchronise, reconstruct, live, batch),
     _RESULT: (report, overlay, view, explain, export),
@@ -92,9 +92,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if (what := failure(error)) is None:
             raise
         is_file = isinstance(error, OSError)
-        code = _fail(f"{what}; {'check path, permissions and space left' if is_file else 'start it again'}")
+        code = _fail(
+            f"{what}; {'check the path, permissions and free disk space' if is_file else 'start it again'}"
+        )
     except Stopped as stop:
-        say("stopped", stop.message or "nothing is left half written", "bold yellow")
+        say("stopped", stop.message or "no incomplete files are left", "bold yellow")
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
@@ -105,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 @grouped
 def evaluate_shelf_command(
     results: Path = argument("RESULTS", "Folder of a reconstruction."),
-    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
+    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, a text file.", REQUIRED),
     as_json: bool = json_option(),
 ) -> None:
     """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
@@ -130,7 +132,7 @@ it saw the people are reconstructed, over time."""
 @grouped
 def demo(
     output: Path = option(RESULT, "Folder for the result.", Path("demo")),
-    report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report"),
+    report: bool = option(RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"),
 ) -> None:
     """Reconstruct a built-in scene of four people and compare it with the truth."""
     prepare_output(output)

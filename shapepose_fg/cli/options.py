@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
-INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
+INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "Drawing"
 """Headings under which `--help` lists options."""
 REQUIRED: Any = MISSING
 """Placeholder for the default of a required option."""
@@ -65,7 +65,7 @@ def preset_option(default: Preset | None) -> Any:
     """The option for a preset."""
     return option(
         RESULT,
-        "accurate (default); fast: in every third frame or so, and motion between; paper: as the paper has it.",
+        "Settings: accurate (default); fast (solves about every third frame); paper (the method as published).",
         default,
     )
 
@@ -104,12 +104,12 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def frames_option() -> Any:
     """The option for frames of a recording, or of a result."""
-    return option(TIME, "Frames A to B-1; either may be left out.", metavar="A:B")
+    return option(TIME, "Range of frames, A to B-1; either may be left out.", metavar="A:B")
 
 
 def workers_option() -> Any:
     """The option for the number of processes."""
-    return option(RUN, "Processes of this machine; by default as many as pay. They change no byte.")
+    return option(RUN, "Number of processes; by default as many as are useful. Results do not depend on it.")
 
 
 def json_option() -> Any:
@@ -122,39 +122,45 @@ class RunOptions:
     """Options of execution, and of interrupted runs."""
 
     workers: int | None = workers_option()
-    cluster: str | None = option(RUN, "Dask scheduler (tcp://host:8786) to solve, or `local`.", metavar="ADDRESS")
-    resume: bool = option(RUN, "Go on with what was stopped in --output.", False, "--resume")
-    restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")
+    cluster: str | None = option(
+        RUN, "Dask scheduler for the solving (tcp://host:8786), or `local`.", metavar="ADDRESS"
+    )
+    resume: bool = option(RUN, "Continue the interrupted run in --output.", False, "--resume")
+    restart: bool = option(RUN, "Start again, and delete the interrupted run in --output.", False, "--restart")
 
     def check(self) -> None:
         """Refuse options that contradict each other."""
         check_workers(self.workers)
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
-                f"--workers and --cluster {self.cluster}: these are processes of this machine, or of the cluster;"
-                " give one"
+                f"--workers and --cluster {self.cluster}: processes are either of this machine or of the"
+                " cluster; give one of them"
             )
         if self.resume and self.restart:
-            raise InputError("--resume and --restart: this goes on or begins anew; give one of them")
+            raise InputError(
+                "--resume and --restart: a run is either continued or started again; give one of them"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
     """The cameras of a recording."""
 
-    calibration: Path | None = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
-    up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
+    calibration: Path | None = option(INPUT, "Calibration of the cameras: a file or folder in a known format.")
+    up: str | None = option(INPUT, "World axis that points up: x, -x, y, -y, z or -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
-    image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
-    cameras: str | None = option(INPUT, "Only these of the calibration's cameras.", metavar="A,B")
-    without: str | None = option(INPUT, "All of its cameras but these.", metavar="A,B")
+    image_size: str | None = option(
+        INPUT, "Size of the calibrated pictures, if the file does not contain it.", metavar="WxH"
+    )
+    cameras: str | None = option(INPUT, "Use only these cameras.", metavar="A,B")
+    without: str | None = option(INPUT, "Leave out these cameras.", metavar="A,B")
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used."""
         from shapepose_fg.io.calibration import read_rig
 
         if self.calibration is None:
-            raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
+            raise InputError("--calibration: missing; give the calibration file or folder")
         size = picture_size(self.image_size)
         up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
         chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
@@ -179,16 +185,16 @@ class CameraOptions:
 class DetectionOptions(CameraOptions):
     """Cameras, and their 2D detections."""
 
-    detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
+    detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
-        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
     )
 
     def rig(self) -> "Rig":
         """The cameras; InputError where they cannot be used, or are fewer than two."""
         found = super().rig()
         if len(found) < 2:
-            raise InputError(f"{self.calibration}: at least 2 cameras are needed to see depth, got {len(found)}")
+            raise InputError(f"{self.calibration}: at least 2 cameras are needed, got {len(found)}")
         return found
 
     def still_rig(self, what: str) -> "Rig":
@@ -196,8 +202,8 @@ class DetectionOptions(CameraOptions):
         found = self.rig()
         moving = next((camera.name for camera in found.cameras if camera.carrier), None)
         if moving is not None:
-            cure = "leave it out of the calibration; reconstruct refines trajectories by itself"
-            raise InputError(f"{self.calibration}: camera {moving} moves, and {what} is for fixed cameras; {cure}")
+            cure = "leave it out with --without; reconstruct refines trajectories itself"
+            raise InputError(f"{self.calibration}: camera {moving} moves, and {what} needs fixed cameras; {cure}")
         return found
 
 
@@ -230,8 +236,8 @@ class Located(DetectionOptions):
 class ProjectOptions(DetectionOptions):
     """Cameras and their 2D detections, each given or from a Pose2Sim project."""
 
-    detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
-    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
+    detections: Path | None = option(INPUT, "Folder with the 2D detections of all cameras.")
+    project: Path | None = option(INPUT, "Pose2Sim project: use its cameras, detections and frame rate.")
 
     def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
         """The options with the paths of a project, and the project; `tell` receives its notes."""
@@ -256,8 +262,10 @@ class ProjectOptions(DetectionOptions):
 class TimeOptions:
     """Options about the times of frames."""
 
-    fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
-    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
+    fps: float | None = option(TIME, "Frame rate, Hz; by default that of times.csv, else 30.")
+    timestamps: Path | None = option(
+        TIME, "File with the time of every frame, seconds; by default times.csv beside the detections."
+    )
 
     def read(
         self,
@@ -312,9 +320,9 @@ class ResultOptions:
     """A saved result, and how it is read."""
 
     results: Path = argument("RESULTS", "Folder of a reconstruction.")
-    fps: float | None = option(TIME, "Frames a second, in place of the result's own times.")
-    up: str | None = option(INPUT, "Axis that points up, where cameras.json is not there.", metavar="AXIS")
-    body: Path | None = option(INPUT, "The body model of the result, where its file has moved.")
+    fps: float | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
+    up: str | None = option(INPUT, "World axis that points up, if cameras.json is missing.", metavar="AXIS")
+    body: Path | None = option(INPUT, "Body model of the result, if its file has moved.")
 
     def how(self) -> dict[str, Any]:
         """Arguments of the functions that read it."""
@@ -327,8 +335,8 @@ class TakeOptions(ResultOptions):
     """A part of a saved result."""
 
     frames: str | None = frames_option()
-    person: list[int] | None = option(RESULT, "Only this person; may be given several times.")
-    seen_only: bool = option(RESULT, "Leave out joints that no view saw in that frame.", False, "--seen-only")
+    person: list[int] | None = option(RESULT, "Use only this person; may be repeated.")
+    seen_only: bool = option(RESULT, "Leave out joints without a detection in that frame.", False, "--seen-only")
 
     def how(self) -> dict[str, Any]:
         """Arguments of the functions that read it."""
@@ -368,13 +376,13 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 def check_fps(fps: float | None) -> None:
     """Refuse an invalid frame rate."""
     if fps is not None and not 0.01 <= fps <= 1e5:
-        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
+        raise InputError(f"--fps {fps:g}: must be 0.01 to 100000 Hz, such as 25")
 
 
 def check_workers(workers: int | None) -> None:
     """Refuse an invalid number of processes."""
     if workers is not None and not 1 <= workers <= 64:
-        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")
+        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out to use as many as are useful")
 
 
 def result_frames(text: str | None) -> range | None:
@@ -405,5 +413,5 @@ def ends(text: str) -> tuple[int, int | None]:
     """Both ends of `A:B`; the second is None where it is left out."""
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
     if match is None:
-        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
+        raise InputError(f"--frames {text}: must be A:B with two frame numbers, such as 0:100")
     return int(match[1] or 0), int(match[2]) if match[2] else None

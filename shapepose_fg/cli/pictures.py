@@ -21,14 +21,16 @@ class PictureOptions:
 
     videos: list[str] | None = option(
         INPUT,
-        "Folder with a video, picture, or folder of pictures named after each camera; or each one's own.",
+        "Folder with a video, picture or folder of pictures named after each camera; or the path of one camera.",
         None,
         "--videos",
         "--images",
         metavar="FOLDER|CAMERA=PATH",
     )
     image_placement: list[str] | None = option(
-        INPUT, "Pictures of another size: scale, letterbox, crop, crop-centre.", metavar="KIND|CAMERA=KIND"
+        INPUT,
+        "How pictures of another size were made: scale, letterbox, crop, crop-centre.",
+        metavar="KIND|CAMERA=KIND",
     )
 
     def named(self, rig: "Rig") -> list[str]:
@@ -79,7 +81,7 @@ def opened(name: str, path: Path) -> "Footage":
     """A camera's video or pictures, decoded once with a progress bar; notes are printed."""
     from shapepose_fg.io.footage.footage import open_footage
 
-    with progress(f"looking through {name}") as done:
+    with progress(f"reading {name}") as done:
         footage = open_footage(path, done)
     note(*footage.notes)
     return footage

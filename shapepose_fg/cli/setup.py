@@ -30,10 +30,10 @@ def check_calibration(
 
     Exit code 1 where something looks wrong, 0 where nothing does. Of pictures the sizes are compared.
     """
+    from shapepose_fg.cli.setup_table import setup_report
     from shapepose_fg.io.footage.placement import FOOTAGE
     from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
     from shapepose_fg.setup_check.report import check_setup
-    from shapepose_fg.setup_check.table import setup_report
 
     seen = given.located()
     rig = seen.still_rig("check-calibration")

@@ -94,7 +94,7 @@ def table(
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
     for n, head in enumerate(heads):
         made.add_column(head, justify="left" if n < left else "right", overflow="fold")
     for row in rows:

@@ -33,9 +33,9 @@ def people_over_time(
     context: typer.Context,
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
 ) -> None:
-    """List the people of a result over time, or correct who is who: shapepose-fg tracks RESULTS merge 3 9.
+    """List the people of a result over time, or correct identities: shapepose-fg tracks RESULTS merge 3 9.
 
-    Without a command everybody is listed. The result as it was before the first correction stays in
+    Without a command all people are listed. The result as it was before the first correction stays in
     RESULTS/uncorrected, and `undo` takes corrections back one by one.
     """
     context.obj = results
@@ -45,9 +45,10 @@ def people_over_time(
 
 @tracks.command("list")
 def list_people(
-    context: typer.Context, as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
-    """Everybody: frames, gaps, stature, how often seen, how far they walked."""
+    """List all people: frames, gaps, stature, share of frames seen, distance walked."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.tracking.listing import list_saved_tracks
 
@@ -62,45 +63,45 @@ def list_people(
 
 @tracks.command("merge")
 def merge_people(context: typer.Context, person: Person, other: Other) -> None:
-    """B is A: B's rows become A's."""
+    """Merge B into A: B's rows become A's."""
     _correct(context, "merge", person, other=other)
 
 
-New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free one.")]
+New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free number.")]
 
 
 @tracks.command("split")
 def split_person(context: typer.Context, person: Person, frame: From, new: New = None) -> None:
-    """From FRAME on A is somebody else: a new person."""
+    """Split A at FRAME: from there on it is a new person."""
     _correct(context, "split", person, other=new, frame=frame)
 
 
 @tracks.command("rename")
 def rename_person(context: typer.Context, person: Person, other: Other) -> None:
-    """A gets the number B, which must be free."""
+    """Rename A to B, which must be a free number."""
     _correct(context, "rename", person, other=other)
 
 
 @tracks.command("drop")
 def drop_person(context: typer.Context, person: Person) -> None:
-    """A is a false positive: A's rows are taken out."""
+    """Drop A, a false positive: its rows are removed."""
     _correct(context, "drop", person)
 
 
 @tracks.command("swap")
 def swap_people(context: typer.Context, person: Person, other: Other, frame: From) -> None:
-    """From FRAME on A is B and B is A."""
+    """Swap A and B from FRAME on."""
     _correct(context, "swap", person, other=other, frame=frame)
 
 
 @tracks.command("undo")
 def undo_correction(context: typer.Context) -> None:
-    """Take the last correction back."""
+    """Undo the last correction."""
     from shapepose_fg.io.corrections import take_back
 
     folder = results_folder(context.obj)
     edit, _ = take_back(folder, _solver(folder))
-    print(f"taken back: {edit}")
+    print(f"undone: {edit}")
     show(_tracks_table(context.obj))
     _renew_report(folder)
 
@@ -141,7 +142,7 @@ def _tracks_table(results: Path) -> "RenderableType":
     )
     lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
     if not run.get("configuration", {}).get("temporal", True):
-        lines.append("every frame was solved by itself: a number is no identity")
+        lines.append("every frame was solved separately: numbers are not identities")
     edits = read_corrections(results_folder(results))
     if len(edits) > 0:
         lines.append(f"corrected: {'; '.join(map(str, edits))}")
@@ -171,12 +172,12 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     edit = Edit(Action(action), person, **more)
     solve = _solver(folder)
     edited = correct(folder, edit, solve)
-    words = "; joints and bodies stay as they were solved"
+    words = "; joints and bodies were not solved again"
     if solve is not None:
-        words = f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"
+        words = f"; solved again: {' '.join(map(str, sorted(edited.changed)))}"
     print(f"done: {edit}{words if len(edited.changed) > 0 else ''}")
     show(_tracks_table(context.obj))
-    print(f"take it back: shapepose-fg tracks {context.obj} undo")
+    print(f"to undo it: shapepose-fg tracks {context.obj} undo")
     _renew_report(folder)
 
 
@@ -212,7 +213,9 @@ def _solver(folder: Path) -> "Solve | None":
             return None
         if functions := opened.run.get("extra_factors"):
             names = ", ".join(map(str, functions))
-            note(f"who is solved anew is so without the factors of {names}, which only Python has")
+            note(
+                f"corrected people are solved again without the factors of {names}, which are known in Python only"
+            )
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
         from shapepose_fg.pipeline.solving import Solver, solve_rows

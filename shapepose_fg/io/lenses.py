@@ -8,7 +8,7 @@ import numpy as np
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError, naming, optional
-from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.files import BIG, open_regular
 from shapepose_fg.io.detections.reading import camera_names
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import per_camera
@@ -18,7 +18,6 @@ _NARROWEST, _WIDEST = 5.0, 150.0
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF")
 """Pillow's names of the supported formats: its other readers, of which some start programs, are disabled."""
-_MOST_BYTES = 2**28
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """The tags of EXIF's own directory in a photo, and of FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
@@ -45,11 +44,9 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     for name, field in given.items():
         picture = size or sizes.get(name)
         if field is None:
-            raise InputError(f"--field-of-view: camera {name} has none; give {name}=DEGREES")
+            raise InputError(f"--field-of-view: missing for camera {name}; give {name}=DEGREES")
         if picture is None:
-            raise InputError(
-                f"camera {name}: nothing says how large its pictures are; pass --image-size WIDTHxHEIGHT"
-            )
+            raise InputError(f"camera {name}: the size of its pictures is unknown; pass --image-size WIDTHxHEIGHT")
         with naming(detections):
             cameras.append(_camera(name, picture, _degrees(field, picture)))
     with naming(detections):
@@ -90,8 +87,8 @@ def _focal_of_photo(file: Path) -> float:
     picture with the same diagonal (EXIF 2.3, 4.6.5).
     """
     image = optional("PIL.Image", "photos")
-    cure = "give a photo as the camera wrote it, or degrees"
-    with open_regular(file, cure, _MOST_BYTES) as stream, warnings.catch_warnings():
+    cure = "give an unedited photo of the camera, or degrees"
+    with open_regular(file, cure, BIG) as stream, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's on large pictures: none is unpacked here
         try:
             with image.open(stream, formats=_FORMATS) as photo:
@@ -101,5 +98,5 @@ def _focal_of_photo(file: Path) -> float:
         except Exception as error:  # of damaged files the library raises anything: SyntaxError, struct.error
             raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
     if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
-        raise InputError(f"{file}: its EXIF does not say FocalLengthIn35mmFilm; {cure}")
+        raise InputError(f"{file}: its EXIF data have no FocalLengthIn35mmFilm; {cure}")
     return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))

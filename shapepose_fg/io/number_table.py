@@ -8,11 +8,9 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import read_text
+from shapepose_fg.core.storage.files import BIG, read_text
 from shapepose_fg.io.validation import is_number
 
-_MOST_BYTES = 2**28
-"""Largest file, bytes: a line per frame, a day of 30 cameras."""
 MISSING = "-"
 """Placeholder of a missing number, in the columns that may lack some."""
 
@@ -30,7 +28,7 @@ def read_number_table(
     columns may have `MISSING`. InputError that names file and line; `units` is the cure for what is no number.
     """
     names, rows, lines = list[str](), list[list[float]](), list[int]()
-    for line, text in enumerate(read_text(path, most=_MOST_BYTES).splitlines(), start=1):
+    for line, text in enumerate(read_text(path, most=BIG).splitlines(), start=1):
         words = [word for word in re.split(r"[,\s]+", text.split("#")[0].strip()) if word]
         if len(words) == 0:
             continue

@@ -9,8 +9,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.calibration.reading import is_calibration
-from shapepose_fg.io.camera_names import listing
-from shapepose_fg.io.detections.json_people import frame_files, frame_number
+from shapepose_fg.io.camera_names import listing, numbered
+from shapepose_fg.io.detections.json_people import FRAME_FILE
 from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.footage.footage import glance
 from shapepose_fg.io.footage.places import VIDEOS
@@ -76,7 +76,7 @@ class Pose2SimProject:
         if start >= stop:
             last = self.first_number + count
             raise InputError(
-                f"{self.folder / CONFIG}: project.frame_range is {list(self.frames)}, and the detections have"
+                f"{self.folder / CONFIG}: project.frame_range is {list(self.frames)}, but the detections have"
                 f" frames {self.first_number} to {last - 1}; correct it, or write 'all'"
             )
         return range(start, stop)
@@ -97,14 +97,14 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
     if rate == "auto" and times.is_file():
         fps, said = None, f"times from {times}"
     else:
-        told = ((glance(video)[1], f", as {video.name} says") for video in videos)
-        assumed = _RATE, " are assumed: project.frame_rate is 'auto', and there is no video"
+        told = ((glance(video)[1], f" (from {video.name})") for video in videos)
+        assumed = _RATE, " are assumed, because project.frame_rate is 'auto' and there is no video"
         given = rate != "auto"
-        fps, origin = (rate, f", as {CONFIG} says") if given else next((e for e in told if e[0] > 0), assumed)
-        said = f"{fps:g} frames a second{origin}"
+        fps, origin = (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
+        said = f"{fps:g} Hz{origin}"
     # Results have the numbers of the files' names, 0 where they have none, from the first that all have.
-    folders = [frame_files(each) for each in detections.iterdir() if each.is_dir()]
-    numbers = (min(map(frame_number, files)) for files in folders if len(files) > 0)
+    folders = [numbered(each, FRAME_FILE) for each in detections.iterdir() if each.is_dir()]
+    numbers = (files[0][0] for files in folders if len(files) > 0)
     return Pose2SimProject(
         folder,
         calibration,
@@ -127,7 +127,7 @@ def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
     rate, span = project.get("frame_rate", "auto"), project.get("frame_range", "auto")
     number = isinstance(rate, int | float) and not isinstance(rate, bool)
     if rate != "auto" and not (number and 0.01 <= rate <= 1e5):
-        raise wrong("frame_rate", "frames a second or 'auto'")
+        raise wrong("frame_rate", "a frame rate in Hz or 'auto'")
     pair = isinstance(span, list) and [type(number) for number in span] == [int, int]
     if span not in ("auto", "all", []) and not (pair and 0 <= span[0] < span[1]):
         raise wrong("frame_range", "'auto', 'all', or two frame numbers such as [10, 300]")
@@ -170,13 +170,13 @@ def _joints_of_tree(tree: Any) -> dict[int, str]:
 def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
     """Config.toml of a trial over that of the session above it, and the session's folder."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; give that of a Pose2Sim project")
+        raise InputError(f"{folder}: there is no such folder; give the folder of a Pose2Sim project")
     own, above = folder / CONFIG, folder.resolve().parent / CONFIG
     if not own.is_file():
-        raise InputError(f"{own}: there is no such file; give the folder of a Pose2Sim project, which has one")
+        raise InputError(f"{own}: there is no such file; give the folder of a Pose2Sim project, which contains it")
     trials = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
     if len(trials) > 0 and not any((folder / name).is_dir() for name in (*_POSES, "videos")):
-        raise InputError(f"{folder}: a session of several trials; give one of them: {listing(trials)}")
+        raise InputError(f"{folder}: this is a session of several trials; give one of them: {listing(trials)}")
     config = read_toml(own, may_be_empty=True)
     if not above.is_file():
         return config, folder
@@ -198,7 +198,9 @@ def _calibration(session: Path, folder: Path) -> Path:
     inside = [each for place in places for each in sorted(place.iterdir()) if each.is_dir()]
     rooms = [each for each in inside if "calib" in each.name.lower()]
     if len(rooms) == 0:
-        raise InputError(f"{session}: no folder of the calibration here; put cameras into {session}/calibration")
+        raise InputError(
+            f"{session}: there is no calibration folder; put the calibration into {session}/calibration"
+        )
     files = [each for room in rooms for each in room.iterdir() if each.is_file()]
     files.sort(key=lambda file: (file.stat().st_mtime, file.name), reverse=True)
     files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first among its kind
@@ -206,7 +208,7 @@ def _calibration(session: Path, folder: Path) -> Path:
     if found is None:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
         cure = "run Pose2Sim's calibration, or put one of the formats of docs/conventions.md there"
-        raise InputError(f"{rooms[0]}: no calibration that is known here, only {there}; {cure}")
+        raise InputError(f"{rooms[0]}: there is no calibration in a known format, only {there}; {cure}")
     return found
 
 
@@ -214,7 +216,7 @@ def _detections(folder: Path, has_videos: bool) -> Path:
     """The folder of 2D detections; InputError with the command that makes them where there are videos only."""
 
     def is_pose(path: Path) -> bool:
-        there = len(frame_files(path)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
+        there = len(numbered(path, FRAME_FILE)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
         return there and not path.name.startswith(".")
 
     for place in (folder / name for name in _POSES):
@@ -222,10 +224,10 @@ def _detections(folder: Path, has_videos: bool) -> Path:
             return place
     pose, videos = folder / "pose", folder / "videos"
     if not has_videos:
-        problem = f"neither 2D detections ({' '.join(_POSES)}) nor videos here"
+        problem = f"there are neither 2D detections ({' '.join(_POSES)}) nor videos"
         raise InputError(f"{folder}: {problem}; put the videos into {videos} and detect people in them")
     command = shlex.join(["shapepose-fg", "detect", "--project", str(folder.resolve()), "--network", "NETWORK"])
-    raise InputError(f"{pose}: no 2D detections yet; run Pose2Sim's poseEstimation, or {command}")
+    raise InputError(f"{pose}: there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}")
 
 
 def footage_of(folder: Path) -> tuple[Path, Path, Path]:

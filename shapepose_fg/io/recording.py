@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.core.storage.files import read_text, write_content
+from shapepose_fg.core.storage.files import BIG, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
@@ -19,7 +19,6 @@ from shapepose_fg.io.detections.people import DeclaredJoints
 from shapepose_fg.io.detections.view_streams import in_moments
 from shapepose_fg.io.timestamps import read_own_times, read_timestamps
 
-_MOST_BYTES = 2**28
 TIMES = "times.csv"
 """Name of the file with the times of detections, beside them."""
 
@@ -27,7 +26,7 @@ TIMES = "times.csv"
 def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -> Path | None:
     """The file with the times of the frames: the given one, or without a rate the one beside; or none."""
     if fps is not None and timestamps is not None:
-        raise InputError("--fps and --timestamps: both say when frames were taken; give one of them")
+        raise InputError("--fps and --timestamps: both determine the times of frames; give one of them")
     beside = detections / TIMES
     return timestamps or (beside if fps is None and beside.is_file() else None)
 
@@ -63,7 +62,7 @@ def read_recording(
     if moments is None:
         return recording, times
     together = in_moments(recording, moments.picture, InFolder(kept / "moments"))
-    what = f"{file}: pictures of the same times are put together: {len(moments)} frames"
+    what = f"{file}: pictures of equal times are combined into {len(moments)} frames"
     return replace(together, notes=(*recording.notes, what, *moments.notes)), times
 
 
@@ -87,12 +86,12 @@ def write_moments(file: Path, rig: Rig, picture: Index) -> None:
 
 def read_moments(file: Path) -> dict[str, Index]:
     """Read a file of `write_moments`: (T,) pictures by the camera's name; InputError on anything else."""
-    lines = [re.split(r",\s*", line) for line in read_text(file, most=_MOST_BYTES).splitlines()]
+    lines = [re.split(r",\s*", line) for line in read_text(file, most=BIG).splitlines()]
     names, *rows = lines if len(lines) > 0 else [[""]]
     try:
         numbers = np.array(rows, dtype=np.intp).reshape(len(rows), len(names))
     except ValueError:
-        raise InputError(f"{file}: not whole numbers, as many in each line; reconstruct again") from None
+        raise InputError(f"{file}: lines must have the same number of whole numbers; reconstruct again") from None
     if names[0] != "frame" or (numbers[:, 0] != np.arange(len(rows))).any() or (numbers[:, 1:] < -1).any():
-        raise InputError(f"{file}: not a line for each frame from 0 on; reconstruct again")
+        raise InputError(f"{file}: there must be a line for each frame from 0 on; reconstruct again")
     return dict(zip(names[1:], numbers.T[1:], strict=True))

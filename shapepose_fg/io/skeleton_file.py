@@ -46,7 +46,11 @@ def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
         if len(called) == 1:
             return called[0]
         names = " ".join(each.name for each in called) or " ".join(SKELETONS)
-        what = "several skeletons are called so; give" if called else "neither a file nor a known skeleton; give"
+        what = (
+            "several skeletons have this name; give"
+            if called
+            else ("this is neither a file nor a known skeleton; give")
+        )
         raise InputError(f"{name}: {what} {'one of' if called else 'a TOML file, or one of'} {names}")
     return read_skeleton(name)
 
@@ -62,12 +66,12 @@ def read_skeleton(path: str | Path) -> Skeleton:
     points = {joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint}
     unknown = [name for name in file.body if name not in points]
     if unknown:
-        raise InputError(f"{path}: body.{unknown[0]} is no keypoint of {file.name}; it has {' '.join(points)}")
+        raise InputError(f"{path}: body.{unknown[0]} is not a keypoint of {file.name}; it has {' '.join(points)}")
     for joint, point in points.items():
         if point not in BODY_POINTS:
             raise InputError(
-                f"{path}: the body has no point {point!r}; say under [body] which of its points {joint} is"
-                f' ({" ".join(BODY_POINTS)}), or write "" for keypoints to be passed over'
+                f"{path}: the body has no point {point!r}; write under [body] which of its points {joint} is"
+                f' ({" ".join(BODY_POINTS)}), or "" to ignore the keypoint'
             )
 
     def pair(names: list[str]) -> tuple[str, str]:
@@ -75,7 +79,7 @@ def read_skeleton(path: str | Path) -> Skeleton:
 
     anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
     if not isinstance(anchor, str) and set(anchor) not in _HIPS:
-        raise InputError(f"{path}: an anchor of two is the middle of the hips; name others under [middles]")
+        raise InputError(f"{path}: an anchor of two joints must be the hips; name other midpoints under [middles]")
     core = [points.get(joint, joint) for joint in file.core or ()]
     if file.core is None:
         core = [point for point in points.values() if point not in _FACE_AND_TOES]

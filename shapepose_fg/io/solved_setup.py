@@ -17,8 +17,8 @@ def cameras_of(folder: Path) -> Rig:
     file = folder / CAMERAS
     if not file.exists():
         raise InputError(
-            f"{file}: there is none, and this needs the cameras of the result: write them with"
-            " `people.save(folder, rig)` or `write_rig(rig, file)`, or copy the calibration there under this name"
+            f"{file}: this file with the cameras of the result is missing; write it with `people.save(folder,"
+            " rig)` or `write_rig(rig, file)`, or copy the calibration to this path"
         )
     return read_rig(file)
 
@@ -31,5 +31,5 @@ def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
         return BodyModel.default().arrays
     if file.exists():
         return read_smpl_file(file)
-    problem = "the body model of this result is not there any more"
-    raise InputError(f"{file}: {problem}; put it back, or say with --body where it is")
+    problem = "the body model of this result is missing"
+    raise InputError(f"{file}: {problem}; restore it, or give its path with --body")

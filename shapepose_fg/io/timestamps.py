@@ -10,7 +10,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.frame_times import MOST_FPS, FrameTimes
 from shapepose_fg.core.moments import CameraClock, Moments, align
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.number_table import MISSING, read_number_table
@@ -18,8 +18,8 @@ from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a meaning of their own; every other column is a camera's."""
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 1e-6, 10.0
-"""Shortest and longest time between frames, s: outside of these the file has another unit."""
+_LONGEST_STEP_S = 10.0
+"""Longest time between frames, s: beyond it the file has another unit."""
 
 
 def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
@@ -59,7 +59,7 @@ def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]
     if max(periods) > 1.01 * min(periods):
         slow, fast = (clocks[periods.index(end(periods))].name for end in (max, min))
         what = f"cameras {slow} and {fast} took {1 / max(periods):.3g} and {1 / min(periods):.3g} frames a second"
-        raise InputError(f"{path}: {what}, and one rate is needed to find when they began; give detections of one")
+        raise InputError(f"{path}: {what}, but synchronisation needs a common rate; give detections of one rate")
     there = np.isfinite(time_s)
     filled = time_s.copy()
     for own, has, clock in zip(filled.T, there.T, clocks, strict=True):
@@ -88,14 +88,14 @@ def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]
     wanted = [_TIME] if _TIME in names else rig.names
     missing = [name for name in wanted if name not in names]
     if len(missing) > 0:
-        problem = f"no times of camera {missing[0]}, the columns are {' '.join(names)[:80]}"
+        problem = f"times of camera {missing[0]} are missing; the columns are {' '.join(names)[:80]}"
         raise InputError(f"{path}: {problem}; name a column {_TIME}, or one for each camera of the calibration")
     picked = np.arange(frames)
     if _FRAME in names:
         picked = _lines_of_frames(path, numbers[:, names.index(_FRAME)], lines, frames)
     elif len(numbers) != frames:
         problem = f"must hold a time for each of the {frames} frames, got {len(numbers)}"
-        raise InputError(f"{path}: {problem}; add a column frame where it is of more frames than the recording")
+        raise InputError(f"{path}: {problem}; add a column frame if the file has more frames than the recording")
     time_s = numbers[picked][:, [names.index(name) for name in wanted]]
     clocks = [_clock(path, name, each, lines[picked]) for name, each in zip(wanted, time_s.T, strict=True)]
     return time_s, clocks
@@ -126,12 +126,12 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
     steps = np.diff(time_s)
     if (steps <= 0).any():
         what = f"line {lines[int(np.argmax(steps <= 0)) + 1]} must be later than the frame before"
-        raise InputError(f"{path}: {what}; put frames in order of their times")
+        raise InputError(f"{path}: {what}; sort frames by time")
     step = float(np.median(steps)) if len(steps) > 0 else np.inf
-    if len(steps) > 0 and not _SHORTEST_STEP_S <= step <= _LONGEST_STEP_S:
-        raise InputError(f"{path}: frames would be {step:.3g} s apart; write seconds")
+    if len(steps) > 0 and not 1 / MOST_FPS <= step <= _LONGEST_STEP_S:
+        raise InputError(f"{path}: frames are {step:.3g} s apart; write seconds")
     if len(there) > 0 and len(time_s) == 0:
-        raise InputError(f"{path}: camera {name} has no times; take it out of the calibration")
+        raise InputError(f"{path}: camera {name} has no times; leave it out with --without")
     return CameraClock(name, time_s, step)
 
 
@@ -143,9 +143,9 @@ def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> I
         raise InputError(f"{path}: line {line} must name a frame, 0 or more, got {number:g}; correct it")
     found, first, count = np.unique(numbers, return_index=True, return_counts=True)
     if (count > 1).any():
-        raise InputError(f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line of it")
+        raise InputError(f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line")
     missing = np.setdiff1d(np.arange(frames), found)
     if len(missing) > 0:
         has = f"the recording has frames 0 to {frames - 1}"
-        raise InputError(f"{path}: no time of frame {missing[0]}, {has}; add its line")
+        raise InputError(f"{path}: the time of frame {missing[0]} is missing; {has}; add its line")
     return first[np.searchsorted(found, np.arange(frames))]

@@ -4,16 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.frame_times import MOST_FPS
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
-from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
 from shapepose_fg.io.number_table import read_number_table
 from shapepose_fg.io.validation import is_number
-
-_MOST_METRES = 1e6
-_UNIT = 0.01
-"""Largest deviation of a quaternion's length from 1."""
-_SHORTEST_S = 1e-6
 
 
 def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
@@ -44,19 +41,18 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         raise InputError(f"{path}: a trajectory needs 2 poses or more, got {len(numbers)}; write a line for each")
     columns = {each: numbers[:, place] for place, each in enumerate(names)}
     pose = np.column_stack([columns[each] for each in POSE])
-    far = np.abs(pose[:, 1:4]).max(axis=1) > _MOST_METRES
+    far = np.abs(pose[:, 1:4]).max(axis=1) > MOST_METRES
     if far.any():
-        raise InputError(f"{path}: line {lines[far][0]} is over {_MOST_METRES:g} m away; write metres")
+        raise InputError(f"{path}: line {lines[far][0]} is more than {MOST_METRES:g} m away; write metres")
     length = np.linalg.norm(pose[:, 4:], axis=1)
-    wrong = ~(np.abs(length - 1) < _UNIT)
+    wrong = ~(np.abs(length - 1) < UNIT_LENGTH)
     if wrong.any():
         got = f"line {lines[wrong][0]}: the quaternion qx qy qz qw must have length 1, got {length[wrong][0]:.4g}"
         raise InputError(f"{path}: {got}; write time x y z qx qy qz qw, qw last")
-    late = np.flatnonzero(np.diff(pose[:, 0]) < _SHORTEST_S)
+    late = np.flatnonzero(np.diff(pose[:, 0]) < 1 / MOST_FPS)
     if len(late) > 0:
         raise InputError(f"{path}: line {lines[late[0] + 1]} must be later than the pose before; sort by time")
-    wTb = np.tile(np.eye(4), (len(pose), 1, 1))
-    wTb[:, :3, :3], wTb[:, :3, 3] = Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4]
+    wTb = rigid(Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4])
     covariance = None
     if any(each in columns for each in COVARIANCE):
         zero = np.zeros(len(pose))
@@ -67,7 +63,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         odd = np.linalg.eigvalsh(covariance)[:, 0] < -1e-9
         if odd.any():
             what = f"line {lines[odd][0]}: the covariance must have no negative eigenvalue"
-            raise InputError(f"{path}: {what}; write variances, rad² and m², of the carrier's own axes")
+            raise InputError(f"{path}: {what}; write variances about the carrier's axes, rad² and m²")
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
 
@@ -78,11 +74,9 @@ def _check_columns(path: Path, line: int, names: list[str]) -> None:
     odd = next((name[:20] for name in names if name not in known or names.count(name) > 1), None)
     missing = next((name for name in POSE if name not in names), None)
     if odd is not None or missing is not None:
-        what = (
-            f"column {odd!r} is not known, or twice there" if odd is not None else f"column {missing} is missing"
-        )
+        what = f"column {odd!r} is unknown or occurs twice" if odd is not None else f"column {missing} is missing"
         raise InputError(
-            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and of covariances rx_rx ..."
+            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and for covariances rx_rx ..."
         )
     diagonal = [name for name in COVARIANCE if len(set(name.split("_"))) == 1]
     lacks = next((name for name in diagonal if name not in names), None)

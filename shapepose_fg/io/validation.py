@@ -50,7 +50,7 @@ def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
     """
     problem: Any = error.errors(include_url=False)[0]
     kind, got, context = problem["type"], describe(problem["input"]), problem.get("ctx", {})
-    what = f"is refused: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"
+    what = f"is not valid: {problem['msg'][:1].lower()}{problem['msg'][1:]}, got {got}"
     if kind in _SAYINGS:
         what = _SAYINGS[kind]
     elif kind in ("too_short", "too_long"):
@@ -63,7 +63,7 @@ def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
     elif kind in _WANTED:
         what = f"must be {_WANTED[kind]}, got {got}"
     elif kind in ("value_error", "assertion_error"):
-        what = f"is refused: {context.get('error', problem['msg'])}"
+        what = f"is not valid: {context.get('error', problem['msg'])}"
     return problem["loc"], what
 
 

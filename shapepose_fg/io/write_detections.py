@@ -36,9 +36,11 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
     _check(recording)
     for camera in rig.cameras:
         if camera.lens != "perspective" or camera.distortion[5:].any():
-            raise ValueError(f"the format has five coefficients of distortion, camera {camera.name} another lens")
+            raise ValueError(
+                f"the format has five distortion coefficients, but camera {camera.name} has another lens model"
+            )
     if rig.up != "z":
-        raise ValueError(f"the format has z up, this rig {rig.up}: turn the world and the truth first")
+        raise ValueError(f"the format has z up, but this rig {rig.up}; rotate the world and the truth first")
     folder, calibration = Path(folder), dict[str, Any]()
     for camera in rig.cameras:
         entry = {
@@ -88,7 +90,7 @@ def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
     for camera in rig.cameras:
         place = Path(folder) / camera.name
         if next(place.glob("*_keypoints.json"), None) is not None:
-            raise InputError(f"{place}: there are frames already, which would mix with the new; delete it first")
+            raise InputError(f"{place}: there are frames of another recording already; delete them first")
 
 
 def _check(recording: DetectionSequence) -> None:
@@ -96,7 +98,7 @@ def _check(recording: DetectionSequence) -> None:
     if recording.skeleton.joints != BODY_25.joints:
         raise ValueError(f"only BODY_25 can be written, not {recording.skeleton.name}")
     if len(recording) == 0:
-        raise ValueError("there is no frame to write: these formats have at least one")
+        raise ValueError("there is no frame to write; these formats need at least one")
 
 
 def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, camera: Camera) -> None:

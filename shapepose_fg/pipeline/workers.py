@@ -21,6 +21,7 @@ from typing import Any, Generic, TypeVar
 import cloudpickle
 from loky import ProcessPoolExecutor
 
+from shapepose_fg.core.compiling import cores
 from shapepose_fg.core.errors import WorkLost
 
 Shared = TypeVar("Shared")
@@ -141,11 +142,6 @@ def suitable_workers(items: int, worth: int) -> int:
     items.
     """
     return max(1, min(cores(), items // worth))
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

@@ -6,14 +6,13 @@ leaves the later ones as they are. Affinities are high inside a person, and wher
 """
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import symmetric_root
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics
 
@@ -52,21 +51,7 @@ class NoiseProcess:
 
 
 @dataclass(frozen=True)
-class Table:
-    """Columns of one length."""
-
-    def take(self, index: NDArray) -> Self:
-        """The rows at `index`, or where it holds."""
-        return type(self)(**{name: value[index] for name, value in vars(self).items()})
-
-    def join(self, other: Self) -> Self:
-        """The rows of both."""
-        both = {name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()}
-        return type(self)(**both)
-
-
-@dataclass(frozen=True)
-class FalseCandidates(Table):
+class FalseCandidates(Rows):
     """The false candidates of the present frame: F of them."""
 
     view: Index
@@ -107,8 +92,9 @@ class FalseCandidateProcess:
         if self._present_now is None:
             self._present_now = self._born(rng, self._present)
         else:
-            staying = self._present_now.take(rng.random(len(self._present_now.view)) < self._present_now.stays)
-            self._present_now = staying.join(self._born(rng, self._present * (1.0 - self._stays)[:, None]))
+            staying = self._present_now.rows(rng.random(len(self._present_now)) < self._present_now.stays)
+            born = self._born(rng, self._present * (1.0 - self._stays)[:, None])
+            self._present_now = FalseCandidates.concatenate([staying, born])
         return self._present_now
 
     def _born(self, rng: np.random.Generator, rate: Array) -> FalseCandidates:
@@ -144,7 +130,7 @@ _LEAST_LENGTH_PX = 8.0
 
 
 @dataclass(frozen=True)
-class Candidates(Table):
+class Candidates(Rows):
     """D candidates while they are generated."""
 
     view: Index

@@ -174,8 +174,8 @@ class Detector:
         found, reported = self._reported(joints, true_xy, px_a_metre, visibility, noise, rng)
         metres_a_px = depth / self._rig.focal_px[:, None, None]
         captors = self._captors(reported, true_xy, metres_a_px, visibility, noise)
-        found = _merge(found.join(self._invented(false, true_xy, depth)))
-        found = found.take(rng.permutation(len(found.view)))
+        found = _merge(Candidates.concatenate([found, self._invented(false, true_xy, depth)]))
+        found = found.rows(rng.permutation(len(found.view)))
         pairs, affinity = affinities(
             found, true_xy, captors, self._table, doubt=config.doubt, wrong=config.wrong_affinities, rng=rng
         )
@@ -224,9 +224,9 @@ class Detector:
             reach_px=self._reach_px(ndtr(noise[NoiseProcess.SCALE, reported]), sizes[view, 1]),
         )
         in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of duplicates was measured
-        found = found.join(self._duplicates(found, in_sight, px_a_metre, rng))
+        found = Candidates.concatenate([found, self._duplicates(found, in_sight, px_a_metre, rng)])
         inside = np.all((found.xy >= 0) & (found.xy <= sizes[found.view] - 1), axis=1)
-        return found.take(inside), reported
+        return found.rows(inside), reported
 
     def _duplicates(
         self, found: Candidates, swap_rank: Array, px_a_metre: Array, rng: np.random.Generator
@@ -235,7 +235,7 @@ class Detector:
         table, swaps = self._table, self._config.swaps
         low, high = swaps * table.swap, swaps * (table.swap + table.double)
         those = (swap_rank >= low) & (swap_rank < high)
-        first = found.take(those)
+        first = found.rows(those)
         rank = (swap_rank[those] - low) / max(high - low, 1e-9)
         shift_px = rng.normal(0.0, table.double_m, first.xy.shape) * px_a_metre[those, None]
         return Candidates(
@@ -315,7 +315,7 @@ class Detector:
             owner=np.zeros((len(xy), true_xy.shape[1]), dtype=bool),
             reach_px=self._reach_px(false.rank, size[:, 1]),
         )
-        return found.take(there)
+        return found.rows(there)
 
     def _reach_px(self, probability: Array, height_px: Array) -> Array:
         """Distance (D,) to a better candidate of the joint within which one is lost: logistic, relative to the
@@ -332,7 +332,7 @@ def _merge(found: Candidates) -> Candidates:
         return found
     label = found.view * len(BODY_25) + found.joint
     order = np.lexsort((-found.confidence, label))
-    found, label = found.take(order), label[order]
+    found, label = found.rows(order), label[order]
     winner = np.full(len(label), -1)
     # Candidates of one label stand together, the best first: compare each with those one place before, two, ...
     for step in range(1, int(np.bincount(label).max())):
@@ -344,7 +344,7 @@ def _merge(found: Candidates) -> Candidates:
     owner = found.owner.copy()
     for index in np.flatnonzero(lost)[::-1]:  # few; the worst first, so that theirs is handed up
         owner[winner[index]] |= owner[index]
-    return replace(found, owner=owner).take(~lost)
+    return replace(found, owner=owner).rows(~lost)
 
 
 def _between(hidden: Array, visible: Array, seen: Array) -> Array:

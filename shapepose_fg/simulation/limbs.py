@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
 
 PELVIS, SPINE, NECK, HEAD = 0, (3, 6, 9), 12, 15
@@ -16,7 +17,6 @@ LEGS = ((1, 4, 7), (2, 5, 8))
 """Hip, knee, ankle: left, right."""
 ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
 """Collar, shoulder, elbow, wrist: left, right."""
-_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 _KNEE_HINGE = np.array([1.0, 0.0, 0.0])
 _ELBOW_HINGE = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
 _REACH = 0.995
@@ -60,11 +60,11 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
     turned[:, PELVIS] = _facing(puppet.heading)
     position = np.zeros((count, 24, 3))
     position[:, PELVIS] = puppet.pelvis
-    bones = rest - rest[np.maximum(_PARENTS, 0)]
+    bones = rest - rest[np.maximum(SMPL_PARENTS, 0)]
 
     def grow(joint: int, local: Array | None = None) -> None:
         """Place a joint after its parent; without `local` it keeps the parent's rotation."""
-        parent = _PARENTS[joint]
+        parent = SMPL_PARENTS[joint]
         position[:, joint] = position[:, parent] + turned[:, parent] @ bones[joint]
         turned[:, joint] = turned[:, parent] if local is None else turned[:, parent] @ local
 
@@ -95,7 +95,7 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         chain = (shoulder, elbow, wrist)
         _two_bones(turned, position, bones, chain, target, pole, _ELBOW_HINGE[side])
         turned[:, wrist] = turned[:, wrist + 2] = turned[:, elbow]
-    local = np.swapaxes(turned[:, _PARENTS[1:]], -1, -2) @ turned[:, 1:]
+    local = np.swapaxes(turned[:, SMPL_PARENTS[1:]], -1, -2) @ turned[:, 1:]
     axis_angle = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(count, 23, 3)
     orient = Rotation.from_matrix(turned[:, PELVIS]).as_rotvec()
     return orient, axis_angle, puppet.pelvis - rest[PELVIS]

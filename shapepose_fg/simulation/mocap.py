@@ -18,6 +18,7 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.npz import read_npz
+from shapepose_fg.simulation.limbs import ARMS
 
 _OF_CLIP = "seq_start seq_len fps names subject action tier wrist_valid toe_valid leg_m floor_y".split()
 _ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
@@ -25,7 +26,7 @@ _ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
 _GLITCH_RAD_S = np.radians(900.0)
 """Angular speed above which a marker has jumped, rad/s: no joint of a walker or dancer turns faster."""
 
-COLLARS, SHOULDERS = (13, 14), (16, 17)
+COLLARS, SHOULDERS, *_ = zip(*ARMS, strict=True)
 """Left and right in SMPL's order."""
 _SETTING = np.radians(30.0)
 """Elevation of the arm up to which only the glenohumeral joint turns (Inman, Saunders and Abbott 1944)."""

@@ -6,10 +6,12 @@ to SMPL's parameters. World z up, floor at z = 0, metres, radians.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
 
 COUPLE, LOOP, WAVER = np.array([[-0.15, 0.0], [1.05, 0.0], [0.92, -0.1]])
@@ -26,41 +28,23 @@ Path = Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
-class Motion:
-    """P people's bodies in T frames, in SMPL's parameters."""
+class Motion(Table):
+    """P people's bodies in N frames, in SMPL's parameters."""
 
-    betas: Array
+    betas: Annotated[Array, Column("P 10")]
     """(P, 10) shapes, in standard deviations."""
-    global_orient: Array
-    """(T, P, 3) axis-angle."""
-    body_pose: Array
-    """(T, P, 23, 3) axis-angle."""
-    transl: Array
-    """(T, P, 3) metres."""
+    global_orient: Annotated[Array, Column("N P 3")]
+    """(N, P, 3) axis-angle."""
+    body_pose: Annotated[Array, Column("N P 23 3")]
+    """(N, P, 23, 3) axis-angle."""
+    transl: Annotated[Array, Column("N P 3")]
+    """(N, P, 3) metres."""
 
     @classmethod
     def still(cls, betas: Array, frames: int = 1) -> "Motion":
         """People of shapes `betas` (P, 10) in the T-pose, not shifted."""
         people = len(betas)
         return cls(betas, *(np.zeros((frames, people, *shape)) for shape in ((3,), (23, 3), (3,))))
-
-    @classmethod
-    def joined(cls, parts: "list[Motion]") -> "Motion":
-        """Motions of the same people, one after the other."""
-        names = ("global_orient", "body_pose", "transl")
-        return cls(parts[0].betas, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-    def __getitem__(self, frames: slice) -> "Motion":
-        """The motion in some consecutive frames."""
-        return Motion(self.betas, self.global_orient[frames], self.body_pose[frames], self.transl[frames])
-
-    def __post_init__(self) -> None:
-        frames, people = self.transl.shape[:2]
-        shapes = {"betas": (people, 10), "global_orient": (frames, people, 3)}
-        shapes |= {"body_pose": (frames, people, 23, 3), "transl": (frames, people, 3)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
 
 
 class Build:

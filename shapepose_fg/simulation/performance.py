@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.body_model import BodyModel, accumulate
+from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, shoulder_rhythm
@@ -62,8 +63,6 @@ class Figure:
         shaped = arrays.template + arrays.shapes @ betas
         self.rest: Array = arrays.joint_regressor @ shaped
         """(24, 3) joints in the T-pose, y up."""
-        self.parents = body.parents
-        """(24,) parent of each joint."""
         self.leg_m = float(np.linalg.norm(np.diff(self.rest[[1, 4, 7]], axis=0), axis=1).sum())
         """Length of thigh and shank together."""
         feet = [np.flatnonzero(arrays.weights[:, list(_FEET[side::2])].sum(axis=1) > 0.9) for side in (0, 1)]
@@ -74,11 +73,9 @@ class Figure:
 
     def joints(self, rotations: Array, pelvis: Array) -> tuple[Array, Array]:
         """Joints (T, 24, 3) and their world rotations (T, 24, 3, 3) with the pelvis joint at `pelvis` (T, 3)."""
-        world, places = rotations.copy(), np.empty((len(pelvis), 24, 3))
+        world, places = accumulate(rotations), np.empty((len(pelvis), 24, 3))
         places[:, 0] = pelvis
-        for joint in range(1, 24):
-            parent = self.parents[joint]
-            world[:, joint] = world[:, parent] @ rotations[:, joint]
+        for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
             places[:, joint] = places[:, parent] + world[:, parent] @ (self.rest[joint] - self.rest[parent])
         return places, world
 

@@ -62,7 +62,7 @@ class Scene:
         segments = zip((0, *self.cuts), (*self.cuts, len(self)), self.clips, strict=False)
         clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
         cuts = tuple(first - span.start for first in self.cuts if span.start < first < span.stop)
-        return replace(self, motion=self.motion[span.start : span.stop], cuts=cuts, clips=clips)
+        return replace(self, motion=self.motion.rows(slice(span.start, span.stop)), cuts=cuts, clips=clips)
 
     def truth_at(self, frame: int) -> Array:
         """(P, 25, 3) true BODY_25 keypoints of one frame."""
@@ -70,7 +70,7 @@ class Scene:
 
     def vertices_at(self, frame: int, only: Index | None = None) -> NDArray[np.float32]:
         """(P, Nv, 3) the true surfaces of one frame; or (P, M, 3), the vertices `only` (M,) of them."""
-        parameters = parameters_of(self.motion[frame : frame + 1])
+        parameters = parameters_of(self.motion.rows(slice(frame, frame + 1)))
         return self.body.vertices(parameters, only).astype(np.float32)
 
 

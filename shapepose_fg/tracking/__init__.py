@@ -1,1 +1,3 @@
-"""Who is who over time: people are followed from frame to frame by their joints in 3D and their 2D detections."""
+"""Identities over time: people are tracked from frame to frame by their 3D joints and 2D
+detections.
+"""

@@ -1,7 +1,8 @@
-"""Corrections of identities by hand: who is whom is changed row by row, and what has to be solved anew is named.
+"""Manual corrections of identities, and which identities must be solved again after each of them.
 
-Every correction is a function of a result to a result; nothing is read or written here. A person's body has one
-shape over all frames, so a person whose rows changed is solved anew as a whole, and nobody else.
+Every correction is a function from a result to a result; nothing is read or written here. A body
+has one shape in all frames, so every identity with changed rows is solved again as a whole; the
+others are not.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,22 +15,23 @@ from shapepose_fg.core.arrays import Mask, Whole
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 
 Solve = Callable[[Reconstruction], Reconstruction]
-"""Rows of some people with their `observations` to rows of the same people, solved anew; other frames may join."""
+"""Solves rows of some people again from their `observations`; the same people, maybe in other
+frames."""
 
 
 class Action(StrEnum):
-    """What is done to identities."""
+    """Kinds of correction."""
 
     MERGE = "merge"
-    """The rows of `other` become `person`'s."""
+    """All rows of `other` get the identity `person`."""
     SPLIT = "split"
-    """The rows of `person` from `frame` on become `other`'s, who is new."""
+    """The rows of `person` from `frame` on get the new identity `other`."""
     RENAME = "rename"
-    """`person` gets the number `other`, which is free."""
+    """`person` gets the unused number `other`."""
     DROP = "drop"
-    """The rows of `person` are taken out."""
+    """All rows of `person` are removed."""
     SWAP = "swap"
-    """From `frame` on `person` and `other` change places."""
+    """`person` and `other` exchange their identities from `frame` on."""
 
 
 _OTHER = frozenset({Action.MERGE, Action.SPLIT, Action.RENAME, Action.SWAP})
@@ -38,16 +40,16 @@ _FRAME = frozenset({Action.SPLIT, Action.SWAP})
 
 @dataclass(frozen=True)
 class Edit:
-    """One correction."""
+    """One correction of identities."""
 
     action: Action
-    """What is done."""
+    """Kind of correction."""
     person: int
-    """The identity that it is done to."""
+    """The identity to correct."""
     other: int | None = None
-    """The second identity, where there is one."""
+    """The second identity, for all actions but `drop`."""
     frame: int | None = None
-    """First frame that is changed, where not all are."""
+    """First frame of the correction, for `split` and `swap`."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "action", Action(self.action))
@@ -56,7 +58,7 @@ class Edit:
                 raise ValueError(f"{self.action} needs {'a' if self.action in actions else 'no'} {what}")
 
     def __str__(self) -> str:
-        """The correction as it is typed."""
+        """The correction as typed on the command line."""
         if self.action == Action.SPLIT:
             return f"{self.action} {self.person} {self.frame} --new {self.other}"
         parts = self.action, self.person, self.other, self.frame
@@ -65,21 +67,21 @@ class Edit:
 
 @dataclass(frozen=True)
 class Edited:
-    """A result with other identities."""
+    """A result after corrections."""
 
     people: Reconstruction
-    """The rows with their new identities, joints and bodies as they were."""
+    """The rows with their new identities; joints and bodies are unchanged."""
     changed: frozenset[int] = frozenset()
-    """Identities whose rows are not what they were solved from: these are to be solved anew."""
+    """Identities with rows from other solves; they must be solved again."""
 
 
 def free_number(person: Whole) -> int:
-    """The number that a new identity gets, where these are the rows' (N,)."""
+    """The next unused identity, given the identities (N,) of all rows."""
     return int(person.max(initial=-1)) + 1
 
 
 def apply(people: Reconstruction, edit: Edit) -> Edited:
-    """`people` after one correction; ValueError, with the cure, where it cannot be made."""
+    """Apply one correction; raises ValueError, with the cure, if it is impossible."""
     rows = _rows_of(people, edit.person)
     if edit.action == Action.DROP:
         return Edited(people.rows(~rows))
@@ -95,11 +97,11 @@ def apply(people: Reconstruction, edit: Edit) -> Edited:
 
 
 def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
-    """`people` after several corrections, one after the other; what is to be solved anew after all of them."""
+    """Apply corrections in order; `changed` lists what must be solved again after all of them."""
     edited = Edited(people)
     for edit in edits:
         earlier, edited = edited.changed, apply(edited.people, edit)
-        if edit.action in (Action.RENAME, Action.SWAP) and not edited.changed:  # people only change names
+        if edit.action in (Action.RENAME, Action.SWAP) and not edited.changed:  # renames only
             names = {edit.person: _other(edit), _other(edit): edit.person}
             earlier = frozenset(names.get(each, each) for each in earlier)
         left = frozenset(edited.people.person.tolist())
@@ -108,9 +110,11 @@ def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
 
 
 def undo(original: Reconstruction, current: Reconstruction, edits: Sequence[Edit]) -> Edited:
-    """`original` after all of `edits` but the last, where `current` is what they all led to.
+    """Undo the last of `edits`: `original` after all others, where `current` is the result of all
+    of them.
 
-    What the last one did not touch has been solved since, and is taken from `current`.
+    Identities that the last correction did not touch keep the rows of `current`, which may be
+    solved already.
     """
     before, last = replay(original, edits[:-1]), edits[-1]
     touched = {last.person, last.other} - {None}
@@ -123,9 +127,10 @@ def undo(original: Reconstruction, current: Reconstruction, edits: Sequence[Edit
 
 
 def solve_anew(edited: Edited, solve: Solve) -> Reconstruction:
-    """The result with the identities that changed solved anew by `solve`, and nobody else.
+    """Solve the changed identities again by `solve`; all other rows stay as they are.
 
-    ValueError where the result does not say what its rows were solved from, or `solve` returns other people.
+    Raises ValueError if the result has no observations, or if `solve` returns other people or no
+    observations.
     """
     people, changed = edited.people, np.array(sorted(edited.changed), dtype=np.int64)
     if len(changed) == 0:
@@ -175,12 +180,14 @@ def _swap(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edite
             f"neither {edit.person} nor {edit.other} is there from frame {edit.frame} on; give one up to {last}"
         )
     names = {edit.person: _other(edit), _other(edit): edit.person}
-    only_names = later.sum() == (rows | others).sum()  # from before both began
+    only_names = later.sum() == (rows | others).sum()  # both begin at or after `frame`
     return _relabelled(people, names, later, changed=set() if only_names else set(names))
 
 
 def _relabelled(people: Reconstruction, names: dict[int, int], rows: Mask, changed: set[int]) -> Edited:
-    """`people` with other identities in `rows` (N,); identities that lost all their rows are not to be solved."""
+    """Rename identities in `rows` (N,) of `people`; identities without any row left
+    need no solve.
+    """
     person = people.person.copy()
     for old, new in names.items():
         person[rows & (people.person == old)] = new
@@ -188,7 +195,7 @@ def _relabelled(people: Reconstruction, names: dict[int, int], rows: Mask, chang
 
 
 def _rows_of(people: Reconstruction, person: int) -> Mask:
-    """(N,) the rows of one identity; ValueError where there is nobody of that number."""
+    """(N,) mask of the rows of one identity; raises ValueError if there is none."""
     rows = people.person == person
     if not rows.any():
         known = np.unique(people.person).tolist()
@@ -198,7 +205,7 @@ def _rows_of(people: Reconstruction, person: int) -> Mask:
 
 
 def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
-    """ValueError where the number that is to be given belongs to somebody, or cannot be one."""
+    """Raise ValueError if the new number is in use or out of range."""
     if not 0 <= _other(edit) <= MOST_NUMBER:
         raise ValueError(f"{edit.other} cannot be a person's number; give one from 0 to {MOST_NUMBER}")
     if (people.person == edit.other).any():
@@ -209,6 +216,6 @@ def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
 
 
 def _other(edit: Edit) -> int:
-    """The second identity of a correction that has one."""
+    """The second identity of a correction, which must have one."""
     assert edit.other is not None
     return edit.other

@@ -1,5 +1,5 @@
-"""From frames to rows: who is there, from when to when; block by block, with a short look ahead, in bounded
-memory.
+"""Rows of tracked people from frames: which people are present, and when. Frames are processed in
+blocks with a short look-ahead, in bounded memory.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,33 +19,35 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks, mean_distance
 from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
 
 BLOCK_S = 3.0
-"""People are decided for so long at a time: in some of its frames everybody is seen well."""
+"""Length of a block, s; long enough that each person is well visible in some of its frames."""
 MOST_FRAMES = 256
-"""Frames that a block has at the most, whatever the rate: memory."""
+"""Maximum number of frames in a block at any frame rate; bounds memory."""
 _SAME_M = 0.35
-"""Mean distance of core joints up to which somebody is whom another explanation has in the same frame."""
+"""Mean distance of core joints, m, below which two hypotheses in a frame are the same person."""
 _WALK_MPS = 1.5
-"""How much farther off somebody may be for each second out of sight."""
+"""Growth of the re-identification distance while a person is out of sight, m/s."""
 
 _ROUNDS = 3
-"""How often people are sought in a frame that stands alone, as long as sides are exchanged."""
+"""Maximum number of searches for people in an isolated frame, repeated while sides are
+exchanged."""
 _PACE_S = 0.2
-"""How fast somebody went is taken of so many seconds before they vanished."""
+"""Duration over which the speed before a disappearance is measured, s."""
 _COASTS_S = 0.5
-"""For so long somebody out of sight is thought to go on like that: as long as tracks are followed unseen."""
+"""Longest extrapolation of a person out of sight, s; as long as a track is followed without
+evidence."""
 
 
 @dataclass(frozen=True)
 class FollowingConfig(Settings):
-    """What becomes of tracks."""
+    """Settings of track births and deaths."""
 
     look_ahead_s: Seconds = 1.0
-    """A frame is decided when this much more has been seen: whether a person out of sight comes back, and since
-    when a new person had been there."""
+    """A frame is decided after this much look-ahead, s; until then a lost person may return, and a
+    new person may turn out to have been present earlier."""
 
 
 _UNLIKELY = "too little that nobody else explains, or there too briefly"
-"""Why people are not kept over time."""
+"""Reason for dropping a person over time."""
 
 Decided = tuple[Input, Observations]
 """A frame and the rows of its people."""
@@ -53,20 +55,24 @@ Decided = tuple[Input, Observations]
 
 @dataclass(frozen=True)
 class FollowState:
-    """What is carried from frame to frame: who was there last, and the frames that are not decided yet."""
+    """State carried from frame to frame: people of the last decided frame, and the undecided
+    frames.
+    """
 
     people: Tracks
-    """The people of the last frame that is decided; their numbers are identities."""
+    """People of the last decided frame; their numbers are identities."""
     next_id: int = 0
     """The identity of the next new person."""
     pending: tuple[Input, ...] = field(default=())
-    """Frames that wait for what comes after them, oldest first."""
+    """Undecided frames, oldest first."""
 
 
 def follow(
     tracker: Tracker, state: FollowState, new: Input, config: FollowingConfig
 ) -> tuple[FollowState, list[Decided]]:
-    """Take in the next frame; returns the rows of the frames that are decided by it, oldest first."""
+    """Add the next frame; returns the frames that are now decided, with their rows,
+    oldest first.
+    """
     pending = (*state.pending, new)
     keys = [frame for frame in pending if frame.key]
     if not new.key or len(keys) < 2:
@@ -81,13 +87,17 @@ def follow(
 
 
 def finish(tracker: Tracker, state: FollowState) -> tuple[FollowState, list[Decided]]:
-    """The rows of all frames that are still open: the recording ends here, or is cut."""
+    """Decide all pending frames, at the end or a cut of the recording; returns them with their
+    rows.
+    """
     keys = sum(frame.key for frame in state.pending)
     return _decide(tracker, state, keys) if keys > 0 else (state, [])
 
 
 def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState, list[Decided]]:
-    """Rows of the first `own` keyframes that are pending; and none, for now, of the frames between."""
+    """Decide the first `own` pending keyframes; the frames between keyframes get no
+    rows for now.
+    """
     keys = [n for n, frame in enumerate(state.pending) if frame.key]
     frames, until = [state.pending[n] for n in keys], [*keys, len(state.pending)][own]
     frames = hold(tracker, frames, state.people)
@@ -108,14 +118,15 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
 
 
 def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
-    """The people `ids` (A,) of a frame that is decided, and where their joints are."""
+    """Tracks of the people `ids` (A,) of a decided frame, with the states of their joints."""
     time_s, zero = float(frame.time_s.mean()), np.zeros(len(ids), dtype=np.intp)
     return Tracks(time_s, ids, zero, joints, np.full(len(ids), time_s))
 
 
 def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bool) -> Chosen:
-    """Shorten people to begin with their first detection, where nobody was there before the `first` frame, and up
-    to their last one, where nothing follows the `last`: to be there unseen costs less at the ends than to appear.
+    """Trim people to their first detection, if nobody precedes the `first` frame, and to their last
+    detection, if nothing follows the `last` frame: at these ends, unseen frames would cost less
+    than a birth or death.
     """
     frame = np.arange(found.there.shape[1])
     seen = (found.candidate[chosen.hypothesis] >= 0).any(axis=(2, 3))
@@ -126,7 +137,7 @@ def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bo
 
 
 def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
-    """A frame that has nothing to do with others, and whom stage I finds in it, numbered from `next_id` on."""
+    """Process an isolated frame: people found by stage I, numbered from `next_id` on."""
     nobody, none = tracker.nobody(), np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
     for _ in range(_ROUNDS):
         places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
@@ -139,7 +150,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
 
 
 def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Index) -> Observations:
-    """The people of a frame as observations, each identity once; what is not known well is left open."""
+    """The people of a frame as observations, each identity once; uncertain joints are NaN."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
     _, first = np.unique(identity[here], return_index=True)
     here = here[np.sort(first)]
@@ -152,7 +163,9 @@ def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Ind
 def observed(
     given: Input, candidate: Index, places: Array, track: Index, evidence: Array | None = None
 ) -> Observations:
-    """People at `places` (P, J, 3), metres, with their detections (P, J, V) as rows of a frame; -1 for none."""
+    """Observations of people at `places` (P, J, 3), m, in a frame, with detections (P, J, V), -1
+    for none.
+    """
     frame, time_s = np.full(len(track), given.frame), np.repeat(given.time_s[None], len(track), axis=0)
     told = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
     return Observations.of(candidate, given.detections, places, **told)
@@ -161,10 +174,12 @@ def observed(
 def _identities(
     found: Hypotheses, chosen: Chosen, state: FollowState, times: Array, own: int, skeleton: Skeleton
 ) -> tuple[Index, int]:
-    """(K,) the identity of everybody who was chosen, -1 for whom only later frames have; and the next new one.
+    """(K,) identity of each chosen person, -1 if present only in later frames; and the next unused
+    identity.
 
-    Whoever is there from the first frame on is one of those carried on, where there is one in the same place; who
-    appears later is somebody who vanished before nearby.
+    People present in the first frame take the identity of the carried person at the same place.
+    People who appear later take the identity of a person who disappeared nearby, if there is one;
+    else a new one.
     """
     identity = np.full(len(chosen), -1, dtype=np.intp)
     needed = chosen.start < own
@@ -185,7 +200,9 @@ def _identities(
 
 
 def _returned(found: Hypotheses, chosen: Chosen, k: int, identity: Index, times: Array, skeleton: Skeleton) -> int:
-    """The identity of the nearest person who vanished before the `k`-th chosen appears; -1 where nobody fits."""
+    """Identity of the nearest person who disappeared before the `k`-th chosen appears;
+    -1 for none.
+    """
     start, best, nearest_m = int(chosen.start[k]), -1, np.inf
     here = found.places[chosen.hypothesis[[k]], start]
     for j in np.flatnonzero((identity >= 0) & (chosen.stop <= start)).tolist():
@@ -201,9 +218,10 @@ def _returned(found: Hypotheses, chosen: Chosen, k: int, identity: Index, times:
 
 
 def _left_at(places: Array, times: Array, later_s: float) -> Array:
-    """(1, J, 3) where a person who was at `places` (T, J, 3) at `times` (T,), or more, is `later_s` after.
+    """(1, J, 3) extrapolated joints, m, `later_s` after the last of `places` (T, J, 3) at `times`
+    (T,).
 
-    Joints go on as the body went in the last `_PACE_S` that it was placed, for `_COASTS_S` at the most.
+    All joints move at the median velocity over the last `_PACE_S`, for at most `_COASTS_S`.
     """
     last = len(places) - 1
     first = int(np.searchsorted(times[:last], times[last] - _PACE_S))
@@ -216,6 +234,6 @@ def _left_at(places: Array, times: Array, later_s: float) -> Array:
 
 
 def core_distance(places: Array, others: Array, skeleton: Skeleton) -> Array:
-    """(P, Q) `mean_distance` of core joints alone."""
+    """(P, Q) `mean_distance` over core joints only, m."""
     core = list(skeleton.core)
     return mean_distance(places[:, core], others[:, core])

@@ -1,4 +1,4 @@
-"""Who is in a result: each identity's frames, gaps, stature, and how far it walked."""
+"""Summary of the identities of a result: frames, gaps, stature and walked distance."""
 
 from dataclasses import dataclass
 
@@ -11,41 +11,42 @@ from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction
 
 _STEP_S = 0.5
-"""Walked distance is measured between mean places of this long: a joint's noise, summed up, is no walk."""
+"""Walked distance is measured between mean positions over this time, s; this averages out joint
+noise."""
 _STILL_M = 0.05
-"""Between two such places, less than this is no walk either."""
+"""Steps between mean positions shorter than this, m, are noise and are ignored."""
 
 
 @dataclass(frozen=True)
 class TrackSummary:
-    """One identity of a result."""
+    """Summary of one identity."""
 
     person: int
-    """Its number."""
+    """Identity."""
     first: int
     """First frame."""
     last: int
     """Last frame."""
     rows: int
-    """Frames in which it is there."""
+    """Number of frames with this identity."""
     gaps: int
-    """Stretches between first and last in which it is not."""
+    """Number of gaps between the first and the last frame."""
     stature_m: float
-    """Height of its mean body in T-pose, metres; NaN where it has no body."""
+    """Height of its mean body in T-pose, m; NaN without a body."""
     confidence: float
     """Mean confidence of its joints, 0 to 1."""
     seen: float
-    """Share of its placed joints that a view saw; NaN where the result does not say."""
+    """Share of its estimated joints that a view saw; NaN if the result does not record it."""
     walked_m: float
-    """How far it walked, metres: from half second to half second, steps under 5 cm left out."""
+    """Walked distance, m, summed over half seconds; steps under 5 cm are ignored."""
 
 
 _TOGETHER = 40_000
-"""Rows of a saved result that are in memory together, but for those of one person."""
+"""Maximum number of rows of a saved result in memory at once, plus those of one person."""
 
 
 def list_saved_tracks(opened: OpenedReconstruction, body: SmplArrays | None = None) -> list[TrackSummary]:
-    """`list_tracks` of a saved result, some people at a time."""
+    """`list_tracks` of a saved result, loading a few people at a time."""
     numbers, counts = np.unique(opened.person, return_counts=True)
     group = (np.cumsum(counts) - counts) // _TOGETHER
     return [
@@ -56,9 +57,10 @@ def list_saved_tracks(opened: OpenedReconstruction, body: SmplArrays | None = No
 
 
 def list_tracks(people: Reconstruction, body: SmplArrays | None = None, every: int = 1) -> list[TrackSummary]:
-    """The identities of `people`, by number; statures on the model `body`, and NaN without one.
+    """Summaries of the identities of `people`, by number; statures need the model `body` and are
+    NaN without it.
 
-    `people` are those of every frame, or of `every` so many.
+    `people` has rows for each frame, or for every `every`-th frame.
     """
     order = np.lexsort((people.frame, people.person))
     persons, first = np.unique(people.person[order], return_index=True)
@@ -74,13 +76,13 @@ def list_tracks(people: Reconstruction, body: SmplArrays | None = None, every: i
 
 
 def _mean_betas(betas: Array) -> Array:
-    """(10,) the mean shape of one person's rows (N, 10); NaN where none has a body."""
+    """(10,) mean shape of one person's rows (N, 10); NaN if no row has a body."""
     fitted = np.isfinite(betas).all(axis=1)
     return betas[fitted].mean(axis=0) if fitted.any() else np.full(betas.shape[1], np.nan)
 
 
 def _summary(people: Reconstruction, person: int, rows: Index, stature_m: float, every: int) -> TrackSummary:
-    """The summary of the identity in `rows`, which are sorted by frame."""
+    """Summary of the identity in `rows`, sorted by frame."""
     frame, known = people.frame[rows], people.known[rows]
     placed = np.isfinite(people.joints[rows]).all(axis=-1)
     told = placed & (known != Known.UNKNOWN)
@@ -98,7 +100,7 @@ def _summary(people: Reconstruction, person: int, rows: Index, stature_m: float,
 
 
 def _walked_m(people: Reconstruction, rows: Index) -> float:
-    """How far the middle of a person's placed joints went: hips alone may be hidden."""
+    """Walked distance of the mean of the known joints, m; the hips may be hidden."""
     count = np.isfinite(people.joints[rows].sum(axis=-1)).sum(axis=1)
     rows, count = rows[count > 0], count[count > 0]
     if len(rows) == 0:

@@ -1,4 +1,6 @@
-"""Joints of people after a frame, by the detections that are theirs: Kalman's update, linearised anew in turn."""
+"""Kalman update of people's joints by their assigned detections in a frame, with iterated
+linearisation.
+"""
 
 from typing import NamedTuple
 
@@ -16,30 +18,31 @@ from shapepose_fg.tracking.plausibility import tear
 from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
 _ITERATIONS = 3
-"""How often gates and linearisation are made anew in one frame."""
+"""Number of linearisations (and gatings) per frame."""
 MIN_SEEN_TWICE = 4
 """Core joints that two views must see for a frame to count as evidence of the person."""
 MIN_IN_A_VIEW = 9
-"""Core joints of which one view sees enough for the same: more than half of a body is no chance."""
+"""Core joints that a single view must see for the same purpose: over half a body is no
+coincidence."""
 
 
 class Trust(NamedTuple):
-    """How far detections are trusted, as kernels take it (`ObservationConfig`)."""
+    """Noise of detections in the form that kernels take (from `ObservationConfig`)."""
 
     kinds = "f1 f0 f0 f0 f0 i0 f0"
     scatter: Array
-    """(J,) what sigma is multiplied with for each joint."""
+    """(J,) factor of the standard deviation for each joint."""
     sigma_m: float
     floor_rad: float
     rho_2d_m: float
     fixed_depth_m: float
     robust: int
     width: float
-    """The robust kernel and its width, standard deviations."""
+    """Robust kernel and its width, in standard deviations."""
 
     @classmethod
     def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "Trust":
-        """The settings, for `joints` of these names."""
+        """Build it from the settings, for the named `joints`."""
         return cls(
             scatter=config.scatter(joints),
             sigma_m=float(config.sigma_m),
@@ -54,13 +57,13 @@ class Trust(NamedTuple):
 def measured(
     joints: JointStates, lost: Mask, candidate: Index, weight: Array, sight: Sight, trust: Trust, bones: Bones
 ) -> tuple[JointStates, Index, Mask]:
-    """A people's joints after a frame in which they have the detections `candidate` (A, J, V), -1 for none; those
-    of them that are within the gate, and of joints that can be the person's own; and for whom they are evidence
-    (A,): enough core joints are seen by two views, or by one.
+    """Update people's joints with the detections `candidate` (A, J, V) of a frame, -1 for none.
 
-    It is what `observation_sigmas` and `linearise` say at the joints, as the measurement of a Kalman filter;
-    `weight` (D,) is that of each detection, 0 for none. Joints that are `lost` (A, J) begin where the views put
-    them, if two or more do.
+    Returns the updated joints; the detections (A, J, V) that passed the gate and a check of bone
+    lengths; and whether the frame is evidence of each person (A,): two views, or one, see enough
+    core joints. It is a Kalman update with the noise of `observation_sigmas` and the Jacobians of
+    `linearise`; `weight` (D,) weights each detection, 0 to ignore it. Joints that are `lost` (A, J)
+    start at the triangulated position, if two or more views see them.
     """
     mean, covariance, kept = joints.mean.copy(), joints.covariance.copy(), candidate.copy()
     evident = np.empty(len(mean), dtype=bool)
@@ -70,8 +73,8 @@ def measured(
 
 @kernel("f3 f4 b2 i3 f1", Sight, Trust, Bones, "b1")
 def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, evident):
-    """Update `mean` (A, J, S) and `covariance` (A, J, S, S), take out of `candidate` what does not fit, fill in
-    `evident` (A,).
+    """Update `mean` (A, J, S) and `covariance` (A, J, S, S) in place, set rejected detections in
+    `candidate` to -1, and fill in `evident` (A,).
     """
     people, joints, views = candidate.shape
     sigma_px, depths, sure, room = np.empty(views), np.empty(views), np.empty(views), np.empty(views)
@@ -135,14 +138,14 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
 
 @part
 def _apart_m(place, camera, focal, xy):
-    """Distance of a detection from a projected place, metres at its depth."""
+    """Reprojection distance of a detection from a 3D position, as a length at its depth, m."""
     x, y, depth = project(camera, place)
     return np.sqrt((x - xy[0]) ** 2 + (y - xy[1]) ** 2) * depth / focal
 
 
 @part
 def _mean_depth(mean, camera):
-    """Mean depth of a person's joints in front of a view, metres."""
+    """Mean depth of the joints in front of the camera, m."""
     total, count = 0.0, 0
     for j in range(len(mean)):
         depth = project(camera, mean[j])[2]
@@ -154,7 +157,9 @@ def _mean_depth(mean, camera):
 
 @part
 def _linearise(place, candidate, sigma_px, cameras, focal, xy, numbers, L, g, inlier):
-    """Sum up what views say of a joint at `place`: information L (3, 3) and gradient g (3,)."""
+    """Accumulate the detections of a joint, linearised at `place`: information L (3, 3), gradient g
+    (3,).
+    """
     rho_m, fixed_m, robust, width = numbers[2], numbers[3], numbers[4], numbers[5]
     for i in range(3):
         g[i] = L[i, 0] = L[i, 1] = L[i, 2] = 0.0
@@ -167,9 +172,10 @@ def _linearise(place, candidate, sigma_px, cameras, focal, xy, numbers, L, g, in
 
 @part
 def _move(mean, P, place, L, g, M, gain):
-    """Put `place` where a joint is after the measurement, by the gain P (1 + L P)^-1.
+    """Set `place` to the joint's updated position, with gain P (1 + L P)^-1.
 
-    It needs no inverse of L, which is singular where one view sees the joint. What pulls is left in `M[0]`.
+    This needs no inverse of L, which is singular if a single view sees the joint. The innovation
+    remains in `M[0]`.
     """
     for i in range(3):
         for k in range(3):
@@ -187,7 +193,7 @@ def _move(mean, P, place, L, g, M, gain):
 
 @part
 def _update(mean, P, L, M, gain):
-    """A joint's state after `_move`: P less (gain L) P, symmetric."""
+    """Update a joint's mean and covariance after `_move`: P - (gain L) P, kept symmetric."""
     for i in range(len(mean)):
         mean[i] += gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
         for k in range(3):
@@ -204,7 +210,7 @@ def _update(mean, P, L, M, gain):
 
 @part
 def _invert(M):
-    """The inverse of a matrix (3, 3), in its place."""
+    """Invert a matrix (3, 3) in place."""
     a, b, c, d, e, f, g, h, i = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2], M[2, 0], M[2, 1], M[2, 2]
     first, second, third = e * i - f * h, f * g - d * i, d * h - e * g
     over = 1.0 / (a * first + b * second + c * third)

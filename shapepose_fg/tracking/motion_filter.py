@@ -1,4 +1,4 @@
-"""Where joints are, how fast they move and how surely: a Kalman filter, batched over people and joints."""
+"""Kalman filter of joint positions and velocities, batched over people and joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 
 LOST_M = 0.2
-"""A joint whose predicted place has a larger sigma is lost: it is sought around its parent on the skeleton. A
-joint that one view sees is not, however far along the ray it may be."""
+"""Predicted standard deviation, m, above which a joint is lost, and searched for around its parent.
+A joint seen by one view is not lost, however uncertain its depth."""
 TRUSTED_M = 0.1
-"""A joint with a smaller sigma is judged by the length of its bones, and is not lost in the next frame, however
-long that is in coming: at 10 frames a second the velocity of a new person's joints alone makes it uncertain by 20
-cm."""
+"""Standard deviation, m, below which a joint's bone lengths are checked, and below which it is not
+lost in the next frame however long the interval: at 10 frames per second the unknown velocity of a
+new person's joints alone adds 20 cm."""
 _FOLLOW_S = 0.25
-"""Time constant with which the velocity of an unseen joint becomes that of the person."""
+"""Time constant with which the velocity of an unseen joint approaches that of the person, s."""
 _FOLLOW_SIGMA_M = 0.05
-"""Sigma from which on a joint counts as unseen in this sense."""
+"""Standard deviation, m, above which a joint counts as unseen here."""
 
 
 @dataclass(frozen=True)
 class JointStates(Rows):
-    """States of A people's J joints, a Gaussian each: position and n - 1 derivatives (`factors.Motion`)."""
+    """Gaussian states of A people's J joints: position and n - 1 derivatives (`factors.Motion`)."""
 
     mean: Array
     """(A, J, 3 n) position, metres in the world, velocity, metres per second, and so on."""
@@ -37,12 +37,12 @@ class JointStates(Rows):
 
     @property
     def position(self) -> Array:
-        """(A, J, 3) metres."""
+        """(A, J, 3) positions, metres."""
         return self.mean[..., :3]
 
     @property
     def velocity(self) -> Array:
-        """(A, J, 3) metres per second."""
+        """(A, J, 3) velocities, metres per second."""
         return self.mean[..., 3:6]
 
     @property
@@ -52,30 +52,32 @@ class JointStates(Rows):
 
     @classmethod
     def at(cls, position: Array, sigma_m: Array, start: Sequence[float]) -> "JointStates":
-        """People at `position` (A, J, 3), known to `sigma_m` (A, J), whose derivatives are 0, known to `start`."""
+        """States at `position` (A, J, 3), sigma `sigma_m` (A, J); derivatives are 0 with the sigmas
+        `start`.
+        """
         mean = np.concatenate([position, *[np.zeros_like(position)] * len(start)], axis=-1)
         sigma = np.stack([sigma_m, *(np.full_like(sigma_m, each) for each in start)], axis=-1)
         return cls(mean, np.repeat(sigma**2, 3, axis=-1)[..., None] * np.eye(mean.shape[-1]))
 
 
 class Bones(NamedTuple):
-    """A skeleton of J joints, and how people are made, as kernels take them."""
+    """Skeleton of J joints with its bone limits, in the form that kernels take."""
 
     kinds = "b1 i1 i1 i1 f1"
     core: Mask
-    """(J,) the core joints."""
+    """(J,) mask of the core joints."""
     order: Index
     """(J,) all joints, parents first."""
     parents: Index
-    """(J,) -1 for the root."""
+    """(J,) parent of each joint, -1 for the root."""
     hips: Index
-    """(2,) right and left."""
+    """(2,) right and left hip."""
     longest_m: Array
-    """(J,) the longest distance of a joint to its parent, metres; the root's counts nothing."""
+    """(J,) maximum distance of each joint from its parent, metres; unused for the root."""
 
     @classmethod
     def of(cls, skeleton: Skeleton, longest_m: Array) -> "Bones":
-        """A detector's."""
+        """Build it from a detector's skeleton."""
         core, order = np.zeros(len(skeleton), dtype=bool), np.concatenate(skeleton.tree_levels).astype(np.intp)
         core[list(skeleton.core)] = True
         return cls(
@@ -86,10 +88,12 @@ class Bones(NamedTuple):
 def predicted(
     joints: JointStates, step_s: float, motion: Motion, density: Array, bones: Bones
 ) -> tuple[JointStates, Mask]:
-    """Joints `step_s` later, by a model of motion with noise of this `density` (J,); and which (A, J) are lost.
+    """Predict joints `step_s` later by a motion model with noise density `density` (J,); also which
+    (A, J) are lost.
 
-    A negative step predicts into the past. An unseen joint comes to move as the person does, straight on. Lost
-    joints are put where their parents are, known to a bone's length; a lost root between its hips.
+    A negative step predicts backwards. The velocity of an unseen joint decays to the person's
+    velocity. Lost joints are placed at their parents, with a sigma from the bone's length; a lost
+    root between the hips.
     """
     mean, covariance = np.empty_like(joints.mean), np.empty_like(joints.covariance)
     lost, room = np.empty(mean.shape[:2], dtype=bool), np.empty((2, mean.shape[2]))
@@ -106,14 +110,15 @@ def _step(motion: Motion, step_s: float) -> tuple[Array, Array]:
 
 @part
 def sigma(P):
-    """`JointStates.sigma_m` of one joint's covariance."""
+    """`JointStates.sigma_m` for the covariance of one joint."""
     return np.sqrt((P[0, 0] + P[1, 1] + P[2, 2]) / 3)
 
 
 @part
 def _across(P):
-    """Standard deviation of the position across the ray of a joint that one view sees, metres: an axis that is
-    known much worse than the others drops out, and where all are alike it is `sigma`.
+    """Standard deviation of the position across the viewing ray of a joint that one view sees,
+    metres. An axis that is much less certain than the others drops out; for an isotropic covariance
+    it equals `sigma`.
     """
     pairs = P[0, 0] * P[1, 1] + P[0, 0] * P[2, 2] + P[1, 1] * P[2, 2]
     pairs -= P[0, 1] * P[1, 0] + P[0, 2] * P[2, 0] + P[1, 2] * P[2, 1]
@@ -122,12 +127,14 @@ def _across(P):
 
 @kernel("f3 f4 f2 f2 f1 f0", Bones, "f2 f3 f4 b2")
 def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after, covariance_after, lost):
-    """F m and F P F^T + q Q of all joints, with F and Q (n, n) for each axis; `room` (2, S) is for work."""
+    """Predict all joints: F m and F P F^T + q Q, with F and Q (n, n) per axis; `room` (2, S) is
+    workspace.
+    """
     people, joints, size = mean.shape
     half, moving, core, order, parents = room[0], room[1], bones.core, bones.order, bones.parents
     right, left, velocity = bones.hips[0], bones.hips[1], np.empty(3)
     for a in range(people):
-        # What nothing is known of stands still: it must not drift along a ray.
+        # Without information the velocity is 0; else the joint would drift along a ray.
         certain = 1 / TRUSTED_M**2
         velocity[0] = velocity[1] = velocity[2] = 0.0
         for j in range(joints):
@@ -164,14 +171,14 @@ def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after
             lost[a, j] = _across(covariance_after[a, j]) > LOST_M and was_m > TRUSTED_M
             any_placed = any_placed or (core[j] and not lost[a, j])
         for j in order:
-            lost[a, j] = lost[a, j] and any_placed  # beside whom would they be sought?
+            lost[a, j] = lost[a, j] and any_placed  # else no parent is placed
             if lost[a, j]:
                 _put_beside(mean_after[a], covariance_after[a], j, parents[j], right, left, bones.longest_m[j])
 
 
 @part
 def _put_beside(mean, covariance, j, above, right, left, longest_m):
-    """A joint where its parent is, of a person's states (J, S)."""
+    """Place joint `j` of a person's states (J, S) at its parent."""
     size = mean.shape[1]
     for i in range(size):
         mean[j, i] = mean[above, i] if above >= 0 else (mean[right, i] + mean[left, i]) / 2
@@ -181,5 +188,5 @@ def _put_beside(mean, covariance, j, above, right, left, longest_m):
             else:
                 covariance[j, i, k] = 0.0 if (i < 3) != (k < 3) else covariance[above, i, k]
         if above >= 0:
-            # The sigma of a direction that is not known.
+            # Standard deviation along an unknown direction.
             covariance[j, i, i] += (longest_m / 1.5) ** 2 if i < 3 else 1.0

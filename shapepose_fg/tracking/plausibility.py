@@ -1,4 +1,6 @@
-"""Which joints cannot be a person's own: those that are farther from their neighbours than any bone is long."""
+"""Find joints that cannot belong to a person: farther from their neighbours than any
+bone is long.
+"""
 
 import numpy as np
 
@@ -7,15 +9,17 @@ from shapepose_fg.core.compiled import part
 
 @part
 def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, count, too_long, torn):
-    """Fill in `torn` (J,): joints without which no bone of a person is longer than `longest_m` (J,).
+    """Fill in `torn` (J,): joints to remove so that no bone of the person exceeds `longest_m` (J,).
 
-    `places` (J, S) begin with positions; only joints that are `trusted` (J,) are judged. Of two ends of a bone
-    the one goes of which the larger share of bones is too long, of equals the one that fewer `views` (J,) see; and
-    so on until nothing is too long. `above`, `way_m`, `count` and `too_long` (J,) are room to work in.
+    `places` (J, S) begin with positions; only `trusted` (J,) joints are checked. Of a bone that is
+    too long, the end with the larger share of too long bones is removed; on a tie, the one seen by
+    fewer `views` (J,). This repeats until no bone is too long. `above`, `way_m`, `count` and
+    `too_long` (J,) are workspace.
 
-    A joint whose parent is not judged is judged by the next such joint above it, with the bones between added up;
-    where there is none, by the first of the person: legs below a pelvis that nobody sees may be another's. It goes
-    where it is `reach_m` farther than bones are long: nearer, whole bodies put it right.
+    If its parent is not checked, a joint is compared with the next checked joint above it, over the
+    sum of the bones between; without one, with the first checked joint of the person, since legs
+    below an unseen pelvis may be another person's. Such a joint is removed if it is `reach_m`
+    farther than the bones allow; a smaller excess is left to the body fit.
     """
     joints, worst = len(trusted), 0
     torn[:] = False
@@ -37,7 +41,7 @@ def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, coun
                 too_long[i] += long
         worst, most = -1, 0.0
         for j in range(joints):
-            # The doubt is less than any difference of shares of a joint's few bones.
+            # This term only breaks ties: shares of a joint's few bones differ by more.
             share = too_long[j] / count[j] + 0.1 / (1.0 + views[j])
             if too_long[j] > 0 and share > most:
                 worst, most = j, share
@@ -47,9 +51,10 @@ def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, coun
 
 @part
 def _judged_above(trusted, torn, longest_m, parents, above, way_m, count, too_long):
-    """For each joint the nearest one `above` (J,) it that is judged, and the longest way there, metres (J,).
+    """For each joint, the nearest checked joint `above` it (J,), and the longest possible distance
+    to it, m (J,).
 
-    Joints with none above them have the first of these, by way of the root; that one has itself.
+    A joint with none above it gets the first checked one, by way of the root; that one gets itself.
     """
     first, top_m = -1, 0.0
     for j in range(len(parents)):

@@ -1,4 +1,6 @@
-"""Who was there, by evidence: what only a person explains, against what should have been seen of that person."""
+"""Track selection by evidence: detections that only one person explains, against those expected and
+missing.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,70 +17,75 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, limbs_of, tie
 
 _PRICE = 0.4
-"""What a place costs where a joint should be seen and is not, in places that are seen: the price of being there is
-the mean over a person's places, in seconds in which every joint is seen by every view."""
+"""Cost of an expected but missing detection, relative to a present one. The price of a person's
+presence is the mean over all expected detections, in seconds in which every view sees every
+joint."""
 _PRICE_HIDDEN = 0.05
-"""Price of a place behind somebody else, or of a joint whose place is not known. With these a person is believed
-in of whom a fourth of what nobody hides has detections of their own. In simulated crowds of eight before three
-cameras (seeds 6101, 6104) joints that nobody hides have a detection in 76 of 100 places, those behind a limb in
-20."""
+"""Cost where the joint is occluded by another person, or its position unknown. With these costs a
+person is accepted if a quarter of the unoccluded joints have detections of their own. In simulated
+crowds of eight before three cameras (seeds 6101, 6104), 76 % of unoccluded joints have a detection,
+and 20 % of those behind a limb."""
 _LIMB_M = 0.12
-"""A joint is hidden whose ray passes somebody's limb, or spine, this near."""
+"""Distance from a limb or spine of another person, m, within which a joint's ray is occluded."""
 _IN_FRONT_M = 0.15
 """Minimum depth gap for an occlusion, metres; below it the order of two people is ambiguous."""
 _SURE_AFFINITY = 0.6
-"""Mean affinity to the person's other detections from which on a detection counts wholly."""
+"""Mean affinity to the person's other detections at which a detection gets its full weight."""
 _ALONE = 0.5
-"""What a detection counts whose neighbours on the skeleton nobody saw: affinities say nothing of it."""
+"""Weight of a detection without detected neighbours on the skeleton, for which there are no
+affinities."""
 APPEARS_S = 0.125
-"""What it costs to appear or vanish while others are watched, as much as not being seen in plain view for 0.3
-seconds: people are where they were, and nobody comes out of nothing."""
+"""Cost of a track birth or death within the observed time, s of evidence; as much as 0.3 s of
+missed detections in plain view. People rarely appear or disappear in the middle of the scene."""
 _WORLDS = 8
-"""How many worlds are tried as those that come first, the most promising ones."""
+"""Maximum number of worlds given priority in turn, the most promising ones."""
 LEAST_S = 0.1
-"""Minimum evidence of a person, seconds; less in short recordings (`_EVEN`)."""
+"""Minimum evidence of a person, s; less in short recordings (`_EVEN`)."""
 _ON_TRIAL = 0.25
-"""Share of `APPEARS_S` and `LEAST_S` that is enough for people who are followed again: who is with them in one
-world may leave them more."""
+"""Factor of `APPEARS_S` and `LEAST_S` for people who are tracked again: in a world with the others
+they may gain evidence."""
 _SCALE, _PRIOR = 13.7, -0.6
-"""Evidence to log-odds, and those of a person without any: logistic fit to 482 people, of whom 11 were nobody or
-somebody once more, in simulated crowds, crossings and pairs before two to four cameras. How long somebody is there
-says nothing more. Of 364 others, said to be 0.74 / 0.87 / 0.96 / 0.996, 8 of 11, 19 of 20, 70 of 70 and 263 of 263
-were there."""
+"""Scale and offset of the log-odds of a person's existence by evidence: logistic fit to 482 people,
+11 of them false positives or duplicates, in simulated crowds, crossings and pairs before two to
+four cameras. A track's duration adds nothing. On 364 others, predicted probabilities 0.74 / 0.87 /
+0.96 / 0.996 were correct for 8 of 11, 19 of 20, 70 of 70 and 263 of 263."""
 _EVEN = -_PRIOR / _SCALE
-"""Evidence a second at which a person is as probable as not: who is seen by one view at a time, behind others, has
-hardly more, and a recording of half a second has no time to gather `LEAST_S` of it."""
+"""Evidence per second at which existence has probability 0.5. An occluded person seen by one view
+at a time has hardly more, and a recording of half a second is too short to gather `LEAST_S`."""
 
 
 @dataclass(frozen=True)
 class Chosen(Rows):
-    """K people and from when to when they are there, in the order in which they were chosen, best first."""
+    """K selected tracks and the frames in which they are present, in order of selection, best
+    first.
+    """
 
     hypothesis: Index
-    """(K,) which hypothesis."""
+    """(K,) index of the track hypothesis."""
     start: Index
     """(K,) index of the first frame."""
     stop: Index
-    """(K,) the one after the last."""
+    """(K,) index after the last frame."""
     evidence_s: Array
-    """(K,) evidence, in seconds in which all of a person is seen by all views; what being there costs taken
-    off."""
+    """(K,) evidence less the price of presence, in seconds in which all views see all
+    of a person."""
 
     def during(self, frame: int) -> Mask:
-        """(K,) who is there in a frame."""
+        """(K,) whether each is present in a frame."""
         return (self.start <= frame) & (frame < self.stop)
 
 
 def weighed(
     candidate: Index, places: Array, sight: Sight, skeleton: Skeleton, world: Index
 ) -> tuple[Array, Array]:
-    """What each detection of A people counts (A, J, V), and what being there costs (A,), both as shares of the
-    places where they should be seen.
+    """Weight of each detection of A people (A, J, V), and price of their presence (A,), as shares
+    of expected detections.
 
-    `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints, metres, NaN
-    where unknown; people of the same `world` (A,) hide each other. A detection counts by its affinity to the same
-    person's others, and pays for its place. A place is a joint in the picture of a view; joints whose place is
-    unknown are thought to be where the others are in the mean.
+    `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints,
+    metres, NaN where unknown; people of the same `world` (A,) occlude each other. A detection is
+    weighted by its affinity to the same person's others, and pays the cost of its place. A
+    detection is expected for each joint within a view's image; a joint of unknown position is
+    assumed at the mean of the others.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
     weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
@@ -92,10 +99,12 @@ def weighed(
 def _weigh(
     candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight, price
 ):  # fmt: skip
-    """Fill in what `weighed` returns, zeros before; `expected` (A,) is how many places there are.
+    """Fill in the results of `weighed`, zero before; `expected` (A,) counts the expected
+    detections.
 
-    For one view after the other: `seen` (3, A, J) x, y and depth of all joints, and between what they are, `box`
-    (A, 3): left, right and the nearest. Joints are `at` (A, J, 3), or where the others are in the mean.
+    Per view: `seen` (3, A, J) has x, y and depth of all joints, `box` (A, 3) the left and right
+    limits and the smallest depth. `at` (A, J, 3) are the joints, unknown ones at the mean of the
+    others.
     """
     people, joints, views = weight.shape
     cameras, count, whose, which, neighbours = sight.cameras, 0, lists[0], lists[1], lists[2]
@@ -136,7 +145,7 @@ def _weigh(
 
 @part
 def _fill(places, known, at):
-    """A person's joints (J, 3), those that are not known where the others are in the mean."""
+    """Copy a person's joints (J, 3) to `at`, with unknown ones at the mean of the known."""
     for x in range(3):
         total, count = 0.0, 0
         for j in range(len(places)):
@@ -148,7 +157,9 @@ def _fill(places, known, at):
 
 @part
 def _picture(places, known, camera, focal, a, seen, box):
-    """Put a person's joints in a view, in `seen` and in `box`, which has a limb's width more on both sides."""
+    """Project a person's joints into `seen`, and their extent into `box`, widened by a limb on both
+    sides.
+    """
     box[0], box[1], box[2] = np.inf, -np.inf, np.inf
     for j in range(len(places)):
         x, y, depth = project(camera, places[j])
@@ -164,8 +175,8 @@ def _picture(places, known, camera, focal, a, seen, box):
 
 @part
 def _behind(place, known, world, limbs, seen, box, focal):
-    """Whether the `place` (whose, x, y, depth) is behind a limb of somebody else of the same world, both of whose
-    ends are known.
+    """Whether the `place` (person, x, y, depth) is occluded by a limb, both ends known, of another
+    person of the same world.
     """
     a, x, y, depth = place
     for b in range(len(world)):
@@ -186,10 +197,10 @@ def _behind(place, known, world, limbs, seen, box, focal):
 
 
 def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:
-    """(A,) evidence of A people in a frame, for each second that it stands for: 1 where all of a person is seen.
+    """(A,) evidence of A people in a frame, per second; 1 if all of a person is seen.
 
-    Of their detections `candidate` (A, J, V), with `weight` (A, J, V) and `price` (A,) of `weighed`; a detection
-    that several have is nobody's own.
+    Computed from detections `candidate` (A, J, V) with `weight` (A, J, V) and `price` (A,) of
+    `weighed`; detections that several people share are not evidence.
     """
     owners = np.bincount(candidate[candidate >= 0], minlength=1)
     own = (candidate >= 0) & (owners[np.maximum(candidate, 0)] == 1)
@@ -197,42 +208,43 @@ def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:
 
 
 def probability(evidence: float) -> float:
-    """How probable somebody of so much evidence is (mean of `own_evidence` over the frames) to be there.
+    """Probability that a person exists, by mean evidence over the frames (`own_evidence`).
 
-    That is, to be nearest to one and the same real person in more than half of the frames.
+    A person exists if the track is nearest to one and the same real person in more than half of the
+    frames.
     """
     return float(1 / (1 + np.exp(-(_SCALE * evidence + _PRIOR))))
 
 
 @dataclass(frozen=True)
 class Account:
-    """H hypotheses as detections with weights, in T frames: who of them is there is chosen from this."""
+    """H track hypotheses in T frames as weighted detections, from which tracks are selected."""
 
     place: NDArray[np.int32]
-    """(H, T, J V) each detection's place among those of all frames; one more stands for none."""
+    """(H, T, J V) index of each detection among those of all frames; one past the last for none."""
     weight: NDArray[np.float32]
-    """(H, T, J V) what it counts."""
+    """(H, T, J V) weight of each detection."""
     price: Array
-    """(H, T) what being there costs."""
+    """(H, T) price of presence."""
     there: Mask
-    """(H, T) where there is something to say."""
+    """(H, T) frames in which the hypothesis is followed."""
     lasts_s: Array
-    """(T,) what each frame stands for, seconds."""
+    """(T,) duration that each frame represents, s."""
     detections: int
-    """How many there are."""
+    """Number of detections."""
     begins: int
-    """The first frame in which anything is seen."""
+    """First frame with a detection."""
     ends: int
-    """The last frame in which anything is seen."""
+    """Last frame with a detection."""
     least_s: float
-    """Least evidence of a person, seconds."""
+    """Minimum evidence of a person, s."""
 
     @classmethod
     def of(
         cls, candidate: Whole, weight: Real, price: Real, there: Mask, counts: Index, lasts_s: Array
     ) -> "Account":
-        """Make the account of detections `candidate` (H, T, J, V), of `counts` (T,) in each frame, with `weight`
-        (H, T, J, V) and `price` (H, T) of `weighed`.
+        """Build it from detections `candidate` (H, T, J, V), the number of detections per frame
+        `counts` (T,), and `weight` (H, T, J, V) and `price` (H, T) of `weighed`.
         """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
         first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())
@@ -244,17 +256,19 @@ class Account:
         return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
 
     def choose(self, world: Index) -> Chosen:
-        """The first of `ways`."""
+        """The best selection of `ways`."""
         return self.ways(world)[0]
 
     def ways(self, world: Index, *, on_trial: bool = False) -> list[Chosen]:
-        """Ways to choose hypotheses, and from when to when, so that each detection is evidence of one person only.
+        """Selections of hypotheses and their time spans, such that each detection is evidence of
+        one person only; best first.
 
-        What explains most is the first. `world` (H,) are people who were followed together; `on_trial` takes
-        those, too, who lack a little to be chosen. The best segment of the best hypothesis comes first; its
-        detections are evidence of nobody else then. In other ways the people of one world come first: a hypothesis
-        that goes over from one person to another, always to who is seen better, is better than either of them, and
-        leaves the others with too little.
+        Hypotheses with the same `world` (H,) were tracked together; `on_trial` also accepts tracks
+        with slightly too little evidence. Selection is greedy: the best segment of the best
+        hypothesis comes first, and its detections are evidence of no other. Alternative selections
+        give priority to the people of one world: a hypothesis that switches from one person to
+        another, always to the better visible one, beats either of the two, and leaves too little
+        for the others.
         """
         first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(world) == 0:
@@ -267,19 +281,21 @@ class Account:
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
     def agreement(self, one: Chosen, other: Chosen) -> float:
-        """The share of the detections of `one` and `other` that are evidence of the same people in both."""
+        """Share of the detections of `one` and `other` that are evidence of the same people in
+        both.
+        """
         owners = np.full((2, self.detections + 1), -1)
         for owner, chosen in zip(owners, (one, other), strict=True):
             for n, (h, start, stop) in enumerate(zip(chosen.hypothesis, chosen.start, chosen.stop, strict=True)):
                 owner[self.place[h, start:stop]] = n
         owners = owners[:, :-1][:, (owners[:, :-1] >= 0).any(axis=0)]
         shared = np.zeros((len(one.start) + 1, len(other.start) + 1))
-        np.add.at(shared, tuple(owners), 1.0)  # the last row and column are nobody's
+        np.add.at(shared, tuple(owners), 1.0)  # the last row and column are unassigned
         same = least_cost_pairs(-shared[:-1, :-1])
         return float(shared[same].sum() / owners.shape[1]) if owners.shape[1] > 0 else 1.0
 
     def left_over(self, chosen: Chosen) -> Chosen:
-        """Who would be there besides those whom `choose` has `chosen`, if appearing cost nothing."""
+        """Tracks that could be added to the `chosen` ones if births and deaths cost nothing."""
         return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
     @cached_property
@@ -290,8 +306,8 @@ class Account:
 
     @cached_property
     def holders(self) -> tuple[Index, NDArray[np.int32], NDArray[np.float32]]:
-        """Where those who have each detection begin, (D + 1,), who they are, and what it counts for them, one
-        detection after the other.
+        """Hypotheses that use each detection: offsets (D + 1,), their indices, and the weight of
+        the detection in each, sorted by detection.
         """
         counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
         begin = np.cumsum(np.concatenate([[0, 0], counts]))
@@ -300,10 +316,11 @@ class Account:
         return begin[:-1], who, what
 
     def in_turn(self, first: Mask, asked: float = 1.0, besides: Chosen | None = None) -> Chosen:
-        """People one after the other, the best of those `first` (H,) before all others: so many as have the least
-        evidence, or the share of it that is `asked` for.
+        """Select tracks greedily, those in `first` (H,) with priority, while they have the minimum
+        evidence times `asked`.
 
-        Those `besides` come before all, and are not returned; for who comes besides them appearing costs nothing.
+        The tracks `besides` are selected before all and not returned; with them, births and deaths
+        cost nothing.
         """
         before = np.zeros((0, 3), dtype=np.intp)
         if besides is not None:
@@ -321,7 +338,9 @@ class Account:
 
 @kernel("w3 s3 i1 w1 s1")
 def _holders(place, weight, begin, who, what):
-    """Fill in `Account.holders` of places and weights (H, T, K); `begin` (D + 2,) has its first entry twice."""
+    """Fill in `Account.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts with
+    two zeros.
+    """
     people, frames, places = place.shape
     for h in range(people):
         for t in range(frames):
@@ -338,8 +357,8 @@ def _in_turn(
     gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free, changed, segment,
     value, chosen, evidence,
 ):  # fmt: skip
-    """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of those whom `Account.in_turn`
-    chooses; returns how many there are.
+    """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of the tracks that
+    `Account.in_turn` selects; returns their number.
     """
     people, count = len(gains), 0
     for n in range(len(besides)):
@@ -366,7 +385,7 @@ def _in_turn(
 
 @part
 def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
-    """Somebody is there for some frames: their detections are evidence of nobody else."""
+    """Select a segment: its detections are no longer evidence of any other hypothesis."""
     person = chosen[0]
     changed[person] = True
     for t in range(chosen[1], chosen[2]):
@@ -382,10 +401,11 @@ def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
 
 @kernel("f1 f0 i0 i0 i0 i1")
 def _best_segment(gains, appears, begins, ends, person, segment):
-    """The segment of `gains` (T,) with the greatest sum, which is returned; `segment` (3,) is who, start and stop.
+    """Return the maximum sum of a segment of `gains` (T,); `segment` (3,) is set to `person`, start
+    and stop.
 
-    Where it begins after the frame `begins`, or stops before the frame `ends`, it costs `appears` each. No part of
-    it costs more than to vanish and to appear again.
+    A start after the frame `begins` and a stop before the frame `ends` cost `appears` each. A
+    segment is split where a part of it costs more than a death and a birth.
     """
     running, peak, since, best = -np.inf, -np.inf, 0, -np.inf
     segment[0], segment[1], segment[2] = person, 0, 0

@@ -1,4 +1,4 @@
-"""Detections are reassociated, once it is known where people's joints are."""
+"""Reassociation of detections with people, given estimates of their joints."""
 
 from collections.abc import Sequence
 
@@ -17,10 +17,11 @@ from shapepose_fg.tracking.following import core_distance
 from shapepose_fg.tracking.view_assignment import Predicted, assign_with_probability
 
 LEAST_PROBABILITY = 0.6
-"""How probable it must be that somebody is there in a frame that stands alone: of those who have 0.6, six in ten
-are, in simulated crowds and in a real operating room alike."""
+"""Minimum existence probability of a person in an isolated frame. Of people with probability 0.6,
+six in ten are real, in simulated crowds and in a real operating room alike."""
 _DOUBLE_M = 0.2
-"""Mean distance of core joints below which two people are one, metres: a pelvis is 20 cm deep."""
+"""Mean distance of core joints below which two people are duplicates, metres: a pelvis is 20 cm
+deep."""
 
 
 def reassociate(
@@ -31,11 +32,13 @@ def reassociate(
     skeleton: Skeleton,
     least: float | None = None,
 ) -> Observations:
-    """Return the rows with the detections around their `joints` (N, J, 3), known to `covariance` (N, J, 3, 3).
+    """Assign detections again around `joints` (N, J, 3) with covariance (N, J, 3, 3); returns the
+    rows with these.
 
-    All views and people of a frame at once, one-to-one. Rows without any joint keep their place, without
-    detections: motion carries them. Where frames stand alone people may go: those who have no joints, who are
-    less probable than the `least` that is asked for, and doubles. Rows come back sorted by frame.
+    All views and people of a frame are assigned together, one-to-one. Rows without any joint stay,
+    without detections: the motion model bridges them. If `least` is given, frames are isolated, and
+    people are removed who have no joints, are less probable than `least`, or are duplicates. Rows
+    are sorted by frame.
     """
     sigma_m = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 3)
     parts = []
@@ -59,25 +62,29 @@ def reassociate(
 
 
 def changed(before: Observations, now: Observations) -> float:
-    """Share of the places where somebody is seen by a view, in the same rows, whose detection is another."""
+    """Share of detection slots, used before or now in the same rows, that hold another detection
+    now.
+    """
     seen = before.seen | now.seen
     return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
 
 
 def _given_out(frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton) -> tuple[Index, Array]:
-    """(P, J, V) the detections of one frame's people, and how probably they are theirs."""
+    """(P, J, V) detections assigned to one frame's people, and their probabilities."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
     return assign_with_probability(predicted, Sight.of(frame.detections, frame.rig, skeleton))
 
 
 def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:
-    """(P,) how probable each person of a frame is."""
+    """(P,) existence probability of each person of a frame."""
     there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
     return existence(PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
 
 
 def who_goes(sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = _DOUBLE_M) -> Mask:
-    """(P,) who is not probable enough, the least probable of them, or is a double of one who is more probable."""
+    """(P,) whether to remove: the least probable person below `least`, and the less probable of
+    duplicates.
+    """
     doubles = ((core_distance(joints, joints, skeleton) < double_m) & lesser(sure)).any(axis=1)
-    # What one leaves may be what another lacks.
+    # Detections that one person releases may help another.
     return doubles | ((sure < least) & (sure == sure.min()))

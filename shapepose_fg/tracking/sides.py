@@ -1,10 +1,11 @@
-"""Left and right of a person: a detector exchanges them for a while in some views, or arms, legs or face alone.
+"""Left-right swaps: detectors exchange a person's sides for a while in some views, or of arms, legs
+or face only.
 
-Nobody turns inside out between two frames. A 2D person whose sides are surely not those of the tracked person
-is corrected if another view has the sides as predicted, or if all views have them exchanged. Whether the person
-has them right is inferred from the body: with arms, legs or face exchanged no body fits, and with the whole person
-exchanged knees, feet and nose point backwards. Detections keep the probability that they are of the other side
-(`Detections.mirrored`).
+A person's sides cannot change between two frames. A 2D person with sides unlike those of the track
+is corrected if another view has the sides as predicted, or if all views have them exchanged.
+Whether the track itself is right is inferred from the body: with arms, legs or face exchanged no
+body fits, and with the whole person exchanged knees, feet and nose point backwards. Detections keep
+the probability that they are of the other side (`Detections.mirrored`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,40 +26,42 @@ from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 _NEAR_M = 0.05
-"""Standard deviation of a detection from where an exactly predicted joint is, as a length at its depth."""
+"""Standard deviation of a detection from a perfectly predicted joint, as a length at
+its depth, m."""
 _FARTHEST = 9.0
-"""Squared distance in variances at which a joint is no more evidence against a place, or against a body."""
+"""Upper limit of the squared distance, in variances, of one joint."""
 _FITS = 3.0
-"""Mean squared distance in variances up to which a 2D person is that of a predicted one."""
+"""Maximum mean squared distance, in variances, between a 2D person and its predicted person."""
 _EXCHANGED = 0.02
-"""Probability that a view has a person's sides, or a part's, exchanged: on Shelf 22 of 1,573 times."""
+"""Probability that a view swaps the sides of a person or a part; on Shelf, 22 of 1,573 times."""
 _SURE = 6.0
-"""Log odds against sides as they are from which on they are exchanged. At 0 the mean error of three crowds before
-three cameras is 54 mm, with 6 it is 43, without any exchange 40. A memory of what a view had exchanged makes it
-worse."""
+"""Minimum log-odds for correcting a swap. The mean error of three crowds before three cameras is 43
+mm with 6, 54 mm with 0, and 40 mm without any swaps in the data. A memory of each view's earlier
+swaps makes it worse."""
 _AGREES = 0.99
-"""Least probability with which another view must have a part's sides as predicted, where they are exchanged."""
+"""Minimum probability with which another view must have a part's sides as predicted to correct a
+swap."""
 _LOST = 0.001
-"""Probability that a followed person's sides, or a part's, are exchanged from one comparison to the next."""
+"""Probability that a track's sides, or a part's, swap from one comparison to the next."""
 _LOOK_S = 0.3
-"""Interval between comparisons of a person with a body, and between searches for people, s."""
+"""Interval between comparisons of a track with a body, and between searches for people, s."""
 
 
 @dataclass(frozen=True)
 class _Compared:
-    """2D people of a frame, compared with people who are predicted there."""
+    """2D people of a frame, matched with the predicted people."""
 
     groups: Sequence[Index]
-    """(G) the detections of each."""
+    """(G) indices of the detections of each 2D person."""
     who: Index
-    """(G,) number of the predicted person that each is; -1 for none."""
+    """(G,) number of the matched person; -1 for none."""
     log: Array
-    """(G, S) log probability of each of the `exchanges`: that this view has these parts' sides the other way round
-    than the predicted person."""
+    """(G, S) log-probability of each of the `exchanges`: which parts this view has swapped against
+    the prediction."""
 
     @classmethod
     def of(cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton) -> "_Compared":
-        """2D people of a frame and the people `ids` (A,) whose `joints` (A) are predicted there."""
+        """Match the 2D people of a frame with the people `ids` (A,) of predicted `joints` (A)."""
         found, rig, mirror, part = given.detections, given.rig, np.array(skeleton.mirror), paired_parts(skeleton)
         states = exchanges(skeleton)
         if len(ids) == 0:
@@ -84,7 +87,9 @@ class _Compared:
         return cls(groups, who, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
-        """(G, K) which parts have sides exchanged, most probably, where another view has not, or all have."""
+        """(G, K) parts most probably swapped that may be corrected: another view is right, or all
+        are swapped.
+        """
         states = exchanges(skeleton)
         right = np.exp(self.log) @ ~states > _AGREES
         same = (self.who[:, None] == self.who) & (self.who >= 0)
@@ -97,10 +102,10 @@ class _Compared:
         return self.log[self.who == number]
 
     def corrected(self, given: Input, own: Mapping[int, tuple[Mask, Array]], skeleton: Skeleton) -> Input:
-        """The frame with sides exchanged where they must be.
+        """The frame with left-right swaps corrected.
 
-        Some people have parts exchanged themselves: `own` is by their numbers which (K,), and the
-        probability (K,) that this is wrong. All others have their sides right.
+        `own` has, by number, the people who are swapped themselves: which parts (K,), and the
+        probability (K,) that this is wrong. All others are assumed to be right.
         """
         found, mirror, part = given.detections, np.array(skeleton.mirror), paired_parts(skeleton)
         wrong, mirrored, right = np.zeros(len(found), dtype=bool), found.mirrored.copy(), np.zeros(part.max())
@@ -124,20 +129,22 @@ class _Compared:
 
 @dataclass(frozen=True)
 class _Look:
-    """Where a person was when some view had sides exchanged."""
+    """State of a person in a frame in which some view had sides exchanged."""
 
     frame: int
     """Index of the frame."""
     time_s: float
-    """When, seconds."""
+    """Time of the frame, s."""
     joints: JointStates
-    """(1) the person's."""
+    """(1) states of the person's joints."""
     views: Array
-    """(G', S) what the views had exchanged (`_Compared.log`)."""
+    """(G', S) log-probabilities of swaps in the views (`_Compared.log`)."""
 
 
 def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Input]:
-    """The frames with people's sides held over time, beginning with the people of the frame before."""
+    """Correct left-right swaps in consecutive frames; `carried` are the people of the
+    frame before.
+    """
     tracks, sought_s, count = replace(carried, ids=np.arange(len(carried))), -np.inf, len(carried)
     compared, looks = list[_Compared](), dict[int, list[_Look]]()
     for n, each in enumerate(frames):
@@ -174,9 +181,9 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
 
 
 def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool = True) -> tuple[Tracks, Input]:
-    """The tracks and the next frame, both with people's sides as they are most probably.
+    """Correct left-right swaps in the tracks and the next frame; returns both.
 
-    `followed` says whether people had their sides right most probably before this frame.
+    `followed`: people most probably had their sides right before this frame.
     """
     joints, skeleton = tracker.ahead(tracks, float(given.time_s.mean())), tracker.skeleton
     seen, own = _Compared.of(given, tracks.ids, joints, skeleton), dict[int, tuple[Mask, Array]]()
@@ -193,17 +200,18 @@ def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool =
 
 
 def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> tuple[Mask, Array]:
-    """Which parts (N, K) a person has exchanged in each look, and probabilities (N, K) that this is wrong.
+    """Parts (N, K) that a person has swapped in each look, and probabilities (N, K) that this is
+    wrong.
 
-    A hidden Markov model: in each look the person is compared with a body, and views that would have sides
-    exchanged are counted. `followed`: the person had them right before.
+    A hidden Markov model: in each look the person is compared with a body, and with the swaps that
+    each state implies for the views. `followed`: the sides were right before.
     """
     states = exchanges(tracker.skeleton)
     order = np.array([_order(state, tracker.skeleton) for state in states])  # (S, J)
     joints = JointStates.concatenate([look.joints for look in looks])
     weight = _likeness(joints.position[:, order], joints.sigma_m[:, order], tracker.fitter)
     number = np.arange(len(states))
-    prior = _prior(len(states))[number ^ number[:, None]]  # of what a view has exchanged, if the person has
+    prior = _prior(len(states))[number ^ number[:, None]]  # view's swaps given person's
     for look, row in zip(looks, weight, strict=True):
         row += np.logaddexp.reduce(look.views[:, None] + prior, axis=2).sum(axis=0)
     change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))
@@ -219,8 +227,8 @@ def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> t
 
 
 def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array:
-    """(N, S) log-likelihood of people with joints at `places` (N, S, J, 3), metres, to `sigma_m` (N, S, J), from
-    how near to them a body's can be; 0 without a `fitter`.
+    """(N, S) log-likelihood of joints at `places` (N, S, J, 3), metres, with sigma `sigma_m` (N, S,
+    J), by their distance from a fitted body; 0 without a `fitter`.
     """
     N, S, J, _ = places.shape
     if fitter is None:
@@ -234,16 +242,18 @@ def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array
 
 
 def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
-    """Whether the sides of most joints are uncertain, by the probability (K,) that a part's are wrong.
+    """Whether the sides of most joints are uncertain, given the probability (K,) that a part's are
+    wrong.
 
-    Joints in the middle count with the last part: with a count of none a crowd before three cameras is worse. The
-    person may be a mixture of views, or people, that contradict each other, and is left as it is.
+    Joints in the middle count with the last part; counting them as certain is worse in a crowd
+    before three cameras. Such a person may mix views, or people, that contradict each other, and is
+    not corrected.
     """
     return bool(np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED)
 
 
 def _order(exchanged: Array, skeleton: Skeleton) -> Index:
-    """(J,) the joints in order when some parts (K,) are exchanged."""
+    """(J,) order of the joints with the sides of some parts (K,) exchanged."""
     mirror = np.array(skeleton.mirror)
     return np.where(np.append(False, exchanged)[paired_parts(skeleton)], mirror, np.arange(len(mirror)))
 
@@ -255,7 +265,7 @@ def _prior(count: int) -> Array:
 
 @cache
 def exchanges(skeleton: Skeleton) -> Mask:
-    """(S, K) which parts have their sides exchanged: all that may be; entry n is n in binary."""
+    """(S, K) all combinations of parts with exchanged sides; entry n is n in binary."""
     return np.array(list(product([False, True], repeat=paired_parts(skeleton).max())))
 
 

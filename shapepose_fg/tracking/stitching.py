@@ -1,4 +1,6 @@
-"""Who comes back after a longer time out of sight: tracks are joined whose ends fit in place, time and build."""
+"""Re-identification after longer gaps: tracks are joined if their ends fit in place, time and
+build.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,37 +15,39 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 
 _BONE_SIGMA_M = 0.015
-"""Error of a bone's mean length in a track: errors of detectors last, so that it does not vanish with time."""
+"""Standard deviation of a bone's mean length in a track, m; detector errors are correlated over
+time."""
 _PLACE_SIGMA_M = 0.05
-"""Error of the centre of somebody's core joints, metres, at the least."""
+"""Minimum standard deviation of the centre of the core joints, m."""
 LEAST_ROWS = 10
-"""Rows that a track needs for its build to be known."""
+"""Minimum number of rows with a bone for its length in a track to be known."""
 _BUILD = 2.0
-"""Mean squared difference of bone lengths, in their standard deviations, up to which two builds are one. For
-one person it is 1 in the mean; lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
+"""Maximum mean squared difference of bone lengths, in variances, of one person. Its expectation is
+1 for one person; bone lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
 
 _WALK_MPS = 1.5
-"""How much farther somebody may be for each second: people walk at 1.4 m/s."""
+"""Growth of the maximum distance with the gap, m/s: people walk at 1.4 m/s."""
 
 
 @dataclass(frozen=True)
 class StitchingConfig(Settings):
-    """When two tracks are one person."""
+    """When two tracks are joined."""
 
     longest_gap_s: Annotated[float, Interval(ge=0, le=86400)] = 10.0
-    """Nobody is recognised after a longer time. 0: tracks are never joined."""
+    """Longest gap over which a person is re-identified, s. 0: tracks are never joined."""
     reach_m: Annotated[float, Interval(ge=0, le=10)] = 0.5
-    """How far from where a track ended the next may begin, at once; 1.5 m farther for each second that passed."""
+    """Maximum distance between the end of a track and the start of the next, m; plus 1.5 m per
+    second of gap."""
 
 
 @dataclass(frozen=True)
 class Trace(Rows):
-    """What stitching looks at, of the N solved rows of one track."""
+    """Data for stitching from the N solved rows of one track."""
 
     track: int
     """The identity."""
     time_s: Array
-    """(N,) when each row is; rising."""
+    """(N,) time of each row, s; ascending."""
     centre: Array
     """(N, 3) centre of the core joints, metres."""
     bones: Array
@@ -68,20 +72,20 @@ class Trace(Rows):
 
 @dataclass(frozen=True)
 class Ends:
-    """Where and when G tracks begin and end, and how their people are built."""
+    """Start and end of G tracks in time and place, and their bone lengths."""
 
     track: Index
     """(G,) identities."""
     time_s: Array
     """(G, 2) times of the first and the last row, seconds."""
     place: Array
-    """(G, 2, 3) centre of the core joints there, metres."""
+    """(G, 2, 3) centre of the core joints at these times, metres."""
     bones: Array
-    """(G, B) median length of each bone between core joints, metres; NaN where it is not known."""
+    """(G, B) median length of each bone between core joints, metres; NaN where unknown."""
 
     @classmethod
     def of(cls, traces: Iterable[Trace]) -> "Ends":
-        """Summarise tracks, one of which at a time is in memory."""
+        """Summarise tracks one at a time, to save memory."""
         rows = [(each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces]
         if len(rows) == 0:
             return cls(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0)))
@@ -89,11 +93,12 @@ class Ends:
 
 
 def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
-    """What each track is called after tracks are joined: of two that are one the earlier one's number stays.
+    """New identity of each track after joining: that of the earliest track of each chain.
 
-    Each track has one before it and one after it at the most. Which, is decided for all together: as many as can
-    be are joined, in the likeliest way by place and build. Nothing is joined across `cuts_s`.
-    Time and memory grow with the pairs of tracks of which one begins within `longest_gap_s` of the other's end.
+    Each track has at most one predecessor and one successor. The assignment is global: the largest
+    number of joints, and of these the likeliest by place and build. Nothing is joined across the
+    times `cuts_s`. Time and memory grow with the number of pairs in which one track begins within
+    `longest_gap_s` of another's end.
     """
     joined = _matched(*_pairs(ends, config, cuts_s))
     names = {}
@@ -104,11 +109,13 @@ def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) ->
 
 
 def _pairs(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]) -> tuple[Index, Index, Array]:
-    """Tracks (K,) of whom others (K,) may be what comes after, and what that costs: see `_costs`."""
+    """Possible pairs: tracks (K,), possible successors (K,), and the cost of each pair
+    (`_costs`).
+    """
     begin_s, end_s = ends.time_s.T
     order = np.argsort(begin_s, kind="stable")
     first = np.searchsorted(begin_s[order], end_s, side="right")
-    latest_s = np.nextafter(end_s + config.longest_gap_s, np.inf)  # no rounding leaves one out
+    latest_s = np.nextafter(end_s + config.longest_gap_s, np.inf)  # rounding must not exclude one
     last = np.searchsorted(begin_s[order], latest_s, side="right")
     count = np.maximum(last - first, 0)
     before = np.repeat(np.arange(len(end_s)), count)
@@ -121,13 +128,13 @@ def _pairs(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]) -> tupl
         may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))
     before, after, apart_m, reach_m = before[may], after[may], apart_m[may], reach_m[may]
     unlike = _unlike(ends.bones[before], ends.bones[after])
-    alike = unlike <= _BUILD  # not where it is not known
+    alike = unlike <= _BUILD  # false where unknown
     cost = _costs(apart_m, reach_m, ends.bones.shape[1] * unlike)[alike]
     return before[alike], after[alike], cost
 
 
 def _unlike(bones: Array, others: Array) -> Array:
-    """(K,) mean squared difference of builds (K, B) and others (K, B), in its variances.
+    """(K,) mean squared difference of bone lengths (K, B) and others (K, B), in variances.
 
     NaN where fewer than half of the bones are known.
     """
@@ -140,26 +147,28 @@ def _unlike(bones: Array, others: Array) -> Array:
 
 
 def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
-    """(K,) how unlikely it is that two tracks are one, -2 log of a density but for a constant.
+    """(K,) cost of joining two tracks: -2 log-density up to a constant.
 
-    Places `apart_m` (K,) are Gaussian on the floor, two standard deviations being what is in reach (K,); bones of
-    one person differ by `unlike` (K,) squared standard deviations, all bones together.
+    Distances `apart_m` (K,) are Gaussian on the floor, with `reach_m` (K,) as two standard
+    deviations; `unlike` (K,) is the sum of squared differences of bone lengths, in variances.
     """
     sigma_m = np.maximum(reach_m / 2, _PLACE_SIGMA_M)
     return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike
 
 
 def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
-    """For tracks that are joined the one before, of pairs (K,) that may be: as many as can be, the likeliest."""
+    """Predecessor of each joined track, from possible pairs (K,): the largest matching, then the
+    least cost.
+    """
     rows, row = np.unique(before, return_inverse=True)
     columns, column = np.unique(after, return_inverse=True)
-    if len(rows) == len(columns) == len(before):  # nobody has a choice
+    if len(rows) == len(columns) == len(before):  # no conflicts
         return dict(zip(after.tolist(), before.tolist(), strict=True))
-    from scipy.sparse import csr_array  # with all of SciPy that it needs: a sixth of a second
+    from scipy.sparse import csr_array  # imported here because it takes a sixth of a second
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-    count, nobody = len(rows), len(columns) + np.arange(len(rows))  # each track may have nobody after it
-    # A pair more counts more than all that others can gain by it. A cost of 0 would be no pair.
+    count, nobody = len(rows), len(columns) + np.arange(len(rows))  # or no successor
+    # One more pair outweighs all savings of others. A cost of 0 would mean no edge.
     alone = 2.0 + count * float(cost.max(initial=0.0))
     costs = np.concatenate([1.0 + cost, np.full(count, alone)])
     places = np.concatenate([row, np.arange(count)]), np.concatenate([column, nobody])

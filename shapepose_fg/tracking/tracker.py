@@ -1,8 +1,8 @@
-"""People are followed from frame to frame: predicted, found again in the views, measured.
+"""Tracking from frame to frame: prediction, assignment of detections in all views, Kalman update.
 
-A track predicts where its joints are; the detections there are its observations, whether or not stage I would have
-found the person in this frame. Several worlds are followed at once (`worlds.py`): a world is a set of people,
-of whom each detection has one; worlds know nothing of each other.
+The detections around a track's predicted joints are its observations, whether or not stage I would
+find the person in this frame. Several worlds are tracked at once (`worlds.py`): a world is a global
+hypothesis, a set of tracks that share no detection; worlds are independent of each other.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,57 +29,60 @@ from shapepose_fg.tracking.view_assignment import Predicted, assign
 FindPeople = Callable[[Detections, Rig], Observations]
 """Stage I of one frame: detections and rig to people."""
 NoteDropped = Callable[[str, list[int]], None]
-"""Notes down a reason, and the frames in which somebody was not kept for it."""
+"""Records a reason, and the frames in which a person was dropped for it."""
 
 
 _APART_M = 0.25
-"""A new person's joints are at least this far from any track's, in the mean: nearer is the same person."""
+"""Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
 _MOST_PEOPLE = 64
-"""Where stage I finds as many as it may (`ProposalConfig.most_people`), nobody is sought among the rest."""
+"""Maximum number of new people; no further search where stage I reaches it
+(`ProposalConfig.most_people`)."""
 _BIRTH_SIGMA_M = 0.04
-"""Sigma of a new person's joints as stage I places them."""
+"""Standard deviation of a new person's joints from stage I, m."""
 
 
 @dataclass(frozen=True)
 class TrackingConfig(Settings):
-    """How people are followed."""
+    """Settings of the tracker."""
 
     min_new_joints: Count = 4
-    """Core joints that two views must see, by detections that no track has, for a new person."""
+    """Minimum number of core joints that two views see, by unassigned detections, for a
+    new person."""
     patience_s: Seconds = 0.5
-    """A track without evidence for longer has ended."""
+    """A track ends after this time without evidence, s."""
 
 
 @dataclass(frozen=True)
 class BodyScale:
-    """What is known of all people before anybody is seen, in the order of the skeleton's joints."""
+    """Prior knowledge of people's size and motion, in the order of the skeleton's joints."""
 
     longest_m: Array
-    """(J,) the longest distance of a joint to its parent on the skeleton, metres; the root's counts nothing."""
+    """(J,) maximum distance of each joint from its parent on the skeleton, metres; unused for the
+    root."""
     density: Array
     """(J,) density of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
     motion: Motion = CONSTANT_VELOCITY
-    """How joints move."""
+    """Motion model of the joints."""
 
 
 @dataclass(frozen=True)
 class Tracks(Rows):
-    """The people who are followed, of all worlds; arrays only, so that they can be saved."""
+    """The current tracks of all worlds; arrays only, so that they can be saved."""
 
     time_s: float
-    """Time of the last frame."""
+    """Time of the last frame, s."""
     ids: Index
     """(A,) number of each track."""
     world: Index
-    """(A,) the world that it is in."""
+    """(A,) world of each track."""
     joints: JointStates
-    """Where the A people's joints were."""
+    """(A, J) states of the joints in the last frame."""
     evident_s: Array
-    """(A,) time of the last frame with evidence."""
+    """(A,) time of the last frame with evidence, s."""
 
     @classmethod
     def none(cls, skeleton: Skeleton, motion: Motion = CONSTANT_VELOCITY) -> "Tracks":
-        """Nobody."""
+        """No tracks."""
         shape, empty = (0, len(skeleton)), np.zeros(0, dtype=np.intp)
         joints = JointStates.at(np.zeros((*shape, 3)), np.zeros(shape), motion.start)
         return cls(-np.inf, empty, empty, joints, np.zeros(0))
@@ -87,32 +90,32 @@ class Tracks(Rows):
 
 @dataclass(frozen=True)
 class Tracker:
-    """Follows the people of a recording; `step` is a function of its arguments alone."""
+    """Tracks the people of a recording; `step` has no state of its own."""
 
     skeleton: Skeleton
     """The detector's joints."""
     scale: BodyScale
-    """How large people are, and how fast they change speed."""
+    """Size of people and noise of their motion."""
     find: Sequence[FindPeople]
-    """Stage I, for new people: one way after the other, among what those before left over."""
+    """Variants of stage I for new people; each searches what the earlier ones left."""
     config: TrackingConfig
-    """How people are followed."""
+    """Settings of the tracker."""
     observation: ObservationConfig
-    """How far detections are trusted."""
+    """Noise model of the detections."""
     fitter: BodyFitter | None = None
-    """Fits bodies: tells whether people have left and right exchanged (`sides.py`)."""
+    """Fits bodies to detect left-right swaps (`sides.py`)."""
     drop: NoteDropped = lambda reason, frames: None
-    """Is told why somebody was not kept, and in which frames."""
+    """Called with the reason and the frames when a person is dropped."""
     search: Callable[[int], None] = lambda frame: None
-    """Is told in which frame new people are sought."""
+    """Called with each frame in which new people are searched for."""
 
     def nobody(self) -> Tracks:
         """Tracks of no people."""
         return Tracks.none(self.skeleton, self.scale.motion)
 
     def step(self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float) -> tuple[Tracks, Index]:
-        """The next frame, at `time_s` (earlier than the last where time runs backwards), and the detections of
-        each track (A, J, V), -1 for none. No track ends here.
+        """Advance the tracks to the frame at `time_s` (earlier than the last if time runs
+        backwards); returns them and their detections (A, J, V), -1 for none. No track ends here.
         """
         if len(tracks) == 0:
             return replace(tracks, time_s=time_s), np.zeros((0, len(self.skeleton), len(rig)), dtype=np.intp)
@@ -127,7 +130,7 @@ class Tracker:
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 
     def ahead(self, tracks: Tracks, time_s: float) -> JointStates:
-        """Where the joints of the tracks are predicted at `time_s`."""
+        """Predicted states of the tracks' joints at `time_s`."""
         if len(tracks) == 0:
             return tracks.joints
         step_s = time_s - tracks.time_s
@@ -142,11 +145,13 @@ class Tracker:
         return Trust.of(self.observation, self.skeleton.joints)
 
     def alive(self, tracks: Tracks) -> Mask:
-        """(A,) tracks that had evidence lately."""
+        """(A,) tracks with evidence within the last `patience_s`."""
         return np.abs(tracks.time_s - tracks.evident_s) <= self.config.patience_s
 
     def at(self, places: Array, ids: Index, world: Index, time_s: float) -> Tracks:
-        """People at `places` (P, J, 3), metres, at `time_s`; joints that are NaN are lost."""
+        """Tracks of people at `places` (P, J, 3), metres, at `time_s`; joints that are NaN are
+        lost.
+        """
         known = np.asarray(np.isfinite(places).all(axis=-1))
         count = np.maximum(known.sum(axis=1), 1)[:, None]
         centre = (np.where(known[..., None], places, 0.0).sum(axis=1) / count)[:, None]
@@ -155,8 +160,8 @@ class Tracker:
         return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
 
     def newcomers(self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig) -> tuple[Array, Index]:
-        """New people among the detections that the `tracks` of one world do not have: places (P, J, 3), metres,
-        with NaN where unknown, and their detections (P, J, V).
+        """New people among the detections not assigned to the `tracks` of one world: positions (P,
+        J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
         core, J = list(self.skeleton.core), len(self.skeleton)
         there, found, theirs = tracks.joints.position, [np.zeros((0, J, 3))], [np.zeros((0, J, len(rig)), np.intp)]
@@ -178,7 +183,9 @@ class Tracker:
         return np.concatenate(found), np.concatenate(theirs)
 
     def enough(self, detections: Detections, free: Mask) -> bool:
-        """Whether the free detections can be a person: enough core joints, each in two views."""
+        """Whether the unassigned detections suffice for a person: enough core joints, each in two
+        views.
+        """
         core = np.zeros(len(self.skeleton), dtype=bool)
         core[list(self.skeleton.core)] = True
         use = free & core[detections.joint]
@@ -189,9 +196,10 @@ class Tracker:
 
 
 def mean_distance(places: Array, others: Array) -> Array:
-    """(P, Q) mean distance of the joints of people (P, J, 3) from those of others (Q, J, 3), metres.
+    """(P, Q) mean distance of the joints of people (P, J, 3) from those of others (Q, J, 3),
+    metres.
 
-    Infinite where no joint is known of both.
+    Infinite if they have no known joint in common.
     """
     distance = np.linalg.norm(places[:, None] - others[None], axis=-1)
     known = np.isfinite(distance)

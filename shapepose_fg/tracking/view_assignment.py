@@ -1,4 +1,4 @@
-"""Which detections are whose when it is known where people's joints should be: one-to-one in every view."""
+"""Assignment of detections to predicted joints, one-to-one in every view."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,82 +10,88 @@ from shapepose_fg.core.compiled import kernel
 from shapepose_fg.proposal.nearby import LEAST_AFFINITY, OVERLAP_M, Sight, claim, find_near, share
 
 _NEAR_M = 0.06
-"""How closeness to the predicted joint falls off where the prediction is exact: sigma of a Gaussian, as a length
-at the joint's depth."""
+"""Standard deviation of the nearness score around an exact prediction, as a length at the joint's
+depth, m."""
 _FAR_M = 0.12
-"""Distance, beside twice the prediction's sigma, up to which a detection is near, m."""
+"""Distance, plus twice the prediction's sigma, up to which a detection is near, m."""
 FARTHEST_M = 0.5
-"""Most of that, however uncertain the prediction, m."""
+"""Upper limit of that distance for any uncertainty, m."""
 _REACH_M = 0.8
-"""Farthest distance of a detection from a predicted joint of arms and legs, m; of a lost joint, from its neighbour
-on the skeleton. What is not near must be tied by affinities to a person whose trunk the view sees near. A foot
-that kicks at 150 m/s² goes so far in 0.1 s."""
+"""Maximum distance of a detection from a predicted joint of arms or legs, m; for a lost joint, from
+its neighbour on the skeleton. Detections that are not near need affinities to a person with a trunk
+seen near in this view. A foot kicking at 150 m/s² moves this far in 0.1 s."""
 _TRUNK_JOINTS = 2
-"""Joints of trunk and head that a view must see near, for those of arms and legs to be far."""
+"""Joints of trunk and head that a view must see near before far detections of arms and legs are
+accepted."""
 _PASSES = 2
-"""How often the choice is made again with the affinities to what the last one chose."""
+"""Number of further passes, each with the affinities to the previous assignment."""
 _ODDS = 5.0
-"""What a score's point adds to the logarithm of the odds that a detection is somebody's."""
+"""Log-odds that a detection is a person's, per unit of score."""
 _EVEN = 0.45
-"""The score at which a detection that only one person can have is as likely theirs as nobody's.
+"""Score at which a detection with a single candidate person is as likely theirs as unassigned.
 
-Both from simulated crowds of eight (seeds 4711, 777, 90211; three and four cameras, 198,000 choices of which 2.2 %
-are wrong): of choices of probability 0.62 / 0.75 / 0.86 / 0.93 / 0.97 / 0.985 / 0.997 0.63 / 0.75 / 0.83 / 0.91 /
-0.97 / 0.990 / 0.998 are right."""
+Both are fitted to simulated crowds of eight (seeds 4711, 777, 90211; three and four cameras,
+198,000 assignments, 2.2 % wrong): of assignments with probability 0.62 / 0.75 / 0.86 / 0.93 / 0.97
+/ 0.985 / 0.997, the shares 0.63 / 0.75 / 0.83 / 0.91 / 0.97 / 0.990 / 0.998 are right."""
 _MESSAGES = 6
-"""Rounds of messages between people and detections: changes are under 0.01 from then on."""
+"""Iterations of belief propagation; later changes are under 0.01."""
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """Where the joints of A people should be."""
+    """Predicted joints of A people."""
 
     places: Array
-    """(A, J, 3) metres."""
+    """(A, J, 3) positions, metres."""
     sigma_m: Array
-    """(A, J) how surely."""
+    """(A, J) standard deviations, m."""
     lost: Mask
-    """(A, J) joints that are found by affinity alone; their place is that of their neighbour."""
+    """(A, J) lost joints, at the position of their neighbour; they are assigned by
+    affinity only."""
     world: Index | None = None
-    """(A,) people of different worlds do not compete for detections."""
+    """(A,) world of each person; people of different worlds do not compete for detections."""
 
 
 class Scored(NamedTuple):
-    """What speaks for each of N detections being people's, by joint and view, then by world, then by person."""
+    """Scores of N pairs of person and detection, sorted by joint and view, then world,
+    then person.
+    """
 
     kinds = "i1 i1 i1 f1 f1 b1"
     first: Index
-    """(J V + 1,) where those of each joint and view begin."""
+    """(J V + 1,) offsets of the pairs of each joint and view."""
     person: Index
-    """(N,) whose joint it is."""
+    """(N,) person."""
     detection: Index
-    """(N,) which of the frame's."""
+    """(N,) index of the detection in the frame."""
     distance_m: Array
-    """(N,) from the joint's projection, metres at its depth."""
+    """(N,) distance from the joint's projection, metres at its depth."""
     score: Array
-    """(N,) nearness, and affinity to what the person has at the other ends of the joint's limbs."""
+    """(N,) nearness plus affinity to the person's detections at the other ends of the joint's
+    limbs."""
     possible: Mask
-    """(N,) near a joint whose place is known, or likely by affinity."""
+    """(N,) whether the pair is possible: near a joint of known position, or likely by affinity."""
 
 
 def assign(predicted: Predicted, sight: Sight) -> Index:
-    """The detection (A, J, V) of each person's joint in each view, -1 where there is none: the best score first,
-    each detection once, but for those on which several people's joints lie.
+    """Detection (A, J, V) of each person's joint in each view, -1 for none: greedy by score, each
+    detection once, except those on which joints of several people coincide.
     """
     return _assigned(predicted, sight)[0]
 
 
 def assign_with_probability(predicted: Predicted, sight: Sight) -> tuple[Index, Array]:
-    """What `assign` gives, and how probably (A, J, V) each of these detections is the person's; 0 where none is.
+    """`assign`, and the probability (A, J, V) that each detection is the person's; 0 without a
+    detection.
 
-    A detection that serves two people, because it lies on the joints of both, is in the right place for either if
-    it is anybody's.
+    A detection that two people share, because joints of both coincide, is well placed for both if
+    it is right for either.
     """
     chosen, near = _assigned(predicted, sight)
     probable = probabilities(near, len(sight.of_view))
     of, count = near.detection, len(sight.of_view)
     serves = np.bincount(chosen[chosen >= 0], minlength=count)[of] > 1
-    # Marginals of competitors that form a cycle are not exact: their sum may be over 1 by a little.
+    # Belief propagation is inexact with cycles of competitors: the sum may slightly exceed 1.
     together = np.minimum(np.bincount(of, probable, count)[of], 1.0)
     place = near.person, sight.of_joint[of], sight.of_view[of]
     taken, probability = chosen[place] == of, np.zeros(chosen.shape)
@@ -94,11 +100,11 @@ def assign_with_probability(predicted: Predicted, sight: Sight) -> tuple[Index, 
 
 
 def probabilities(near: Scored, detections: int) -> Array:
-    """(N,) how probably each detection is the person's, of those that are possible, by their score.
+    """(N,) probability that each possible detection is the person's, by the scores.
 
-    A person has at most one detection of a joint in a view, and a detection is one person's or nobody's: the
-    marginals of all ways to give them out, by belief propagation (Williams and Lau, 2014), which is exact where
-    who competes for what has no cycle.
+    A person has at most one detection of a joint per view, and a detection at most one person. The
+    marginals over all such assignments are computed by belief propagation (Williams and Lau, 2014),
+    exact if the graph of competitors has no cycle.
     """
     weight = np.where(near.possible, np.exp(_ODDS * (near.score - _EVEN)), 0.0)
     probable = np.empty_like(weight)
@@ -109,7 +115,7 @@ def probabilities(near: Scored, detections: int) -> Array:
 
 
 def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
-    """The detections (A, J, V), and what speaks for all that are near."""
+    """The detections (A, J, V), and the scores of all near pairs."""
     (A, J), V = predicted.sigma_m.shape, len(sight.cameras)
     world = np.zeros(A, dtype=np.intp) if predicted.world is None else predicted.world
     people, given = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
@@ -132,8 +138,8 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
 def _assign(
     places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought, both
 ):  # fmt: skip
-    """Fill in `near`, and the first of `both` (2, A, J, V), as far as there is room for what is near; returns how
-    much there is.
+    """Fill in `near` and the first of `both` (2, A, J, V), as far as the arrays reach; returns the
+    number of near pairs.
     """
     gate_m, reach_m, chosen, before = gates[0], gates[1], both[0], both[1]
     nearness, tied, key = reals[0], reals[1], reals[2]
@@ -183,8 +189,8 @@ def _assign(
 
 @kernel("i1 i1 i1 f1 i0 f1 f1 f1 f1")
 def _marginals(first, person, detection, weight, rounds, of_person, of_detection, unclaimed, probable):
-    """Fill in `probable` (N,) from `weight` (N,), joint by joint and view by view; zeros by person and detection
-    and ones (N,) to begin with.
+    """Fill in `probable` (N,) from `weight` (N,) for each joint and view; `of_person` and
+    `of_detection` must be zeros, `unclaimed` (N,) ones.
     """
     for slot in range(len(first) - 1):
         span = range(first[slot], first[slot + 1])

@@ -1,9 +1,10 @@
-"""Ways in which people may have gone through some frames: worlds, each followed from one frame to both ends.
+"""Multiple-hypothesis tracking through a block of frames: worlds, each tracked from one frame to
+both ends.
 
-A world is a set of people of whom each detection has one. People are sought in several frames, followed from
-there forwards and backwards, and what explains most is chosen (`presence.py`). Whoever was chosen is put together
-in one world in the frames in which they are seen best, and followed from there again: people of one world do not
-take each other's detections.
+A world is a global hypothesis: a set of tracks that share no detection. People are searched for in
+several frames, tracked from there forwards and backwards, and the tracks that explain most are
+selected (`presence.py`). The selected people are then joined in one world in the frames that show
+them best, and tracked again from there, so that they no longer take each other's detections.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,58 +25,59 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 Array = NDArray[np.float64]
 
 _SEARCH_S = 0.3
-"""Interval between searches for new people in each world, seconds; twice that between the frames in which people
-are sought among all detections. In a world that lacks somebody the others take that person's detections, so new
-people are sought in all of them: crowds before three cameras gain two to six people of a hundred."""
+"""Interval between searches for new people in each world, s; half that between searches among all
+detections. In a world that lacks a person, the others take that person's detections, so every world
+is searched: in crowds before three cameras this finds two to six more people of a hundred."""
 _TWINS_S = 0.1
-"""Interval between checks for worlds that have become one, seconds."""
+"""Interval between checks for duplicate worlds, s."""
 _RESTART_S = 1.3
-"""Whoever was chosen is followed again from a frame in each so many seconds."""
+"""Interval between the frames from which the selected people are tracked again, s."""
 _ROUNDS = 2
-"""How often that is done."""
+"""Maximum number of these rounds."""
 _ALIKE = 0.95
-"""Two ways to choose people that agree on so many of the detections are one. The best is followed again, and the
-best of the others: of ten simulated recordings, most before three cameras, IDF1 is 95.0 (92.8 without; 95.2 with
-two others, for twice the time)."""
+"""Agreement of detections above which two selections count as one. The best selection is tracked
+again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is
+95.0 (92.8 without; 95.2 with two others, at twice the time)."""
 PLACED_M = 0.2
-"""Sigma of a track's joint that counts as placed."""
+"""Standard deviation below which a track's joint has a known position, m."""
 _PLAIN, _PLAIN_S = 0.25, 0.3
-"""People whose evidence is so much a second, at any time for so many seconds, are followed once: in simulated
-crowds others are found for people who had less."""
+"""Minimum evidence per second, over any window of `_PLAIN_S` s, with which people are tracked only
+once; in simulated crowds, alternatives are found only for people with less."""
 _SAME_M = 0.02
-"""Worlds with the same detections whose people are nowhere farther apart are one from there on."""
+"""Maximum distance between joints of two worlds with the same detections for these to
+be merged, m."""
 _GAIN = 0.01
-"""A round that explains less than this share more is the last one."""
+"""Minimum relative gain of evidence for another round."""
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """H people as they may have gone through T frames."""
+    """H track hypotheses through T frames."""
 
     carried: NDArray[np.intp]
-    """(H,) whom of those who were there before the first frame each one goes on from; -1 for none."""
+    """(H,) index of the carried person that each continues; -1 for none."""
     world: NDArray[np.intp]
-    """(H,) numbers of the worlds that they are in."""
+    """(H,) world of each."""
     there: NDArray[np.bool_]
-    """(H, T) frames in which they are followed."""
+    """(H, T) frames in which each is tracked."""
     candidate: NDArray[np.int32]
-    """(H, T, J, V) the detections that would be theirs, -1 for none."""
+    """(H, T, J, V) detections of each, -1 for none."""
     places: Array
-    """(H, T, J, 3) where their joints would be, metres; NaN where that is not known well."""
+    """(H, T, J, 3) positions of the joints, metres; NaN where uncertain."""
     weight: NDArray[np.float32]
-    """(H, T, J, V) what each detection counts as evidence (`weighed`)."""
+    """(H, T, J, V) weight of each detection as evidence (`weighed`)."""
     price: NDArray[np.float32]
-    """(H, T) what being there costs (`weighed`)."""
+    """(H, T) price of presence (`weighed`)."""
     joints: JointStates
-    """Where their joints are in the frame from which people are carried on."""
+    """(H, J) states of the joints in the frame from which people are carried on."""
     counts: NDArray[np.intp]
-    """(T,) how many detections each frame has."""
+    """(T,) number of detections in each frame."""
     lasts_s: Array
-    """(T,) what each frame stands for, seconds (`lasting`)."""
+    """(T,) duration that each frame represents, s (`lasting`)."""
 
     @cached_property
     def account(self) -> Account:
-        """The hypotheses as evidence."""
+        """The hypotheses as weighted detections for the selection."""
         return Account.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
 
     def __len__(self) -> int:
@@ -83,7 +85,7 @@ class Hypotheses:
 
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
-        """All of several, whose worlds are other ones."""
+        """Concatenate hypotheses; their worlds are renumbered and stay separate."""
         names = ("carried", "there", "candidate", "places", "weight", "price")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
@@ -93,26 +95,27 @@ class Hypotheses:
 
 @dataclass(frozen=True)
 class Seed:
-    """A world: who is in it to begin with."""
+    """Start of a world: its first people and their frame."""
 
     frame: int
-    """Index of the frame in which they are; -1 for the one before the first."""
+    """Index of that frame; -1 for the one before the first."""
     tracks: Tracks
-    """Where they are."""
+    """States of the people."""
     candidate: NDArray[np.intp]
-    """(A, J, V) their detections there."""
+    """(A, J, V) their detections in that frame."""
     forwards: bool = True
-    """Whether they are followed forwards."""
+    """Whether to track forwards."""
     backwards: bool = True
-    """Whether they are followed backwards."""
+    """Whether to track backwards."""
     births: bool = True
-    """Whether others are sought beside them."""
+    """Whether to search for further people."""
 
 
 def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: int) -> tuple[Hypotheses, Chosen]:
-    """The people who explain T frames best, and from when to when they are there.
+    """Track hypotheses of T frames, and the best selection of them.
 
-    `carried` are the people of the frame before; `keep` is the index of the frame from which they are carried on.
+    `carried` are the people of the frame before; `keep` is the index of the frame from which they
+    are carried on.
     """
     times, unseen = times_of(frames), np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1)
     on = Seed(-1, carried, unseen, backwards=False)
@@ -134,7 +137,7 @@ def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: 
 
 
 def _plain(found: Hypotheses, times: Array) -> bool:
-    """Whether everybody is there in all frames, and always seen well."""
+    """Whether all tracks span all frames with high evidence throughout."""
     if not found.there.all():
         return False
     evidence = found.weight.sum(axis=(2, 3)) - found.price
@@ -148,14 +151,16 @@ def times_of(frames: Sequence[Input]) -> Array:
 
 
 def lasting(times_s: Array) -> Array:
-    """(T,) the seconds that each frame stands for: up to halfway to its neighbours; a frame alone stands for
-    one.
+    """(T,) duration that each frame represents, s: up to halfway to its neighbours; 1 for a single
+    frame.
     """
     return np.gradient(times_s) if len(times_s) > 1 else np.ones(len(times_s))
 
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
-    """Worlds beside the one that goes on: people met on the way back, and those seen in single frames."""
+    """Further worlds: one tracked backwards from the last frame, and one from each of several
+    frames.
+    """
     times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False)
@@ -168,7 +173,7 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
 def _newcomers(
     tracker: Tracker, tracks: Tracks, candidate: NDArray[np.intp], frame: Input
 ) -> tuple[Array, NDArray[np.intp]]:
-    """New people in a frame; the tracker is told in which."""
+    """New people in a frame; calls the tracker's `search`."""
     tracker.search(frame.frame)
     return tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
 
@@ -182,7 +187,9 @@ def _seed(tracker: Tracker, frames: Sequence[Input], key: int, places: Array, ca
 def _restarts(
     tracker: Tracker, frames: Sequence[Input], times: Array, found: Hypotheses, chosen: Chosen
 ) -> list[Seed]:
-    """Worlds of all who were chosen, in the frames in which they are seen best, one in each `_RESTART_S`."""
+    """Worlds of all selected people, each from the frame of a `_RESTART_S` interval that shows them
+    best.
+    """
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
     there = np.array([chosen.during(t) for t in range(T)]).T & placed
@@ -204,9 +211,9 @@ Followed = tuple[int, Seed, NDArray[np.intp]]
 
 
 def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int) -> Hypotheses:
-    """Follow all `seeds` forwards and backwards through T frames, side by side.
+    """Track all `seeds` forwards and backwards through T frames, in parallel.
 
-    Who is found on the way forwards is followed back, too.
+    People found on the forward pass are also tracked backwards.
     """
     log = _Log(tracker, frames, keep)
     given, born = list[Followed](), list[Followed]()
@@ -222,7 +229,9 @@ def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[See
 def _follow(
     tracker: Tracker, frames: Sequence[Input], seeds: Iterable[Followed], log: "_Log", *, forwards: bool
 ) -> list[Followed]:
-    """One way through the frames, each seed from its frame on; returns who was found on the way."""
+    """One pass through the frames, each seed from its frame on; returns the people found on the
+    way.
+    """
     tracks, births = tracker.nobody(), dict[int, int]()
     born = list[Followed]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
@@ -274,9 +283,10 @@ def _follow(
 
 
 def _twins(tracks: Tracks, candidate: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of `tracks` (A) whose whole world is as another one is, and the rows of the same people there.
+    """Rows of `tracks` (A) of duplicate worlds, and the rows of the same people in the world that
+    is kept.
 
-    Their detections (A, J, V) are the same, and what is placed is in the same places.
+    Duplicate worlds have the same detections (A, J, V) and the same positions of placed joints.
     """
     gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     known, kept = tracks.joints.sigma_m < PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
@@ -292,7 +302,7 @@ def _twins(tracks: Tracks, candidate: NDArray[np.intp]) -> tuple[NDArray[np.intp
 
 
 class _Log:
-    """What becomes of people on their way."""
+    """Collects the states of all tracks on their way."""
 
     def __init__(self, tracker: Tracker, frames: Sequence[Input], keep: int) -> None:
         self.tracker, self.frames, self.keep = tracker, frames, keep
@@ -300,17 +310,17 @@ class _Log:
         self.carried, self.world = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
-        self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()  # frames, who, as whom
+        self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()  # frames, duplicates, kept
 
     def more(self, count: int, world: int, carried: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
-        """Numbers of people who are new here, in a world."""
+        """Numbers for `count` new people of a world."""
         first = len(self.carried)
         self.world += [world] * count
         self.carried += [-1] * count if carried is None else carried.tolist()
         return np.arange(first, first + count)
 
     def add(self, t: int, tracks: Tracks, candidate: NDArray[np.intp]) -> None:
-        """Where tracks are in frame `t`, and their detections (A, J, V)."""
+        """Record the tracks in frame `t`, with their detections (A, J, V)."""
         if len(tracks) == 0:
             return
         frame, joints = self.frames[t], tracks.joints
@@ -322,7 +332,7 @@ class _Log:
             self.kept.append((tracks.ids, joints))
 
     def hypotheses(self) -> Hypotheses:
-        """All of it."""
+        """Everything recorded, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         there = np.zeros((H, T), dtype=bool)
         candidate, price = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.float32)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.decompositions import rigid
 
 NEAR_M = 0.05
 """Depth below which faces with a corner are dropped, m: nothing is clipped."""
@@ -45,10 +46,7 @@ def look_at(eye: Array, target: Array, up: Array) -> Array:
     if np.linalg.norm(right) < 1e-9:
         raise ValueError("look_at: the line of sight must not be parallel to up; move the eye or the target")
     right /= np.linalg.norm(right)
-    wTc = np.eye(4)
-    wTc[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    wTc[:3, 3] = eye
-    return wTc
+    return rigid(np.column_stack([right, np.cross(forward, right), forward]), eye)
 
 
 def zoom(camera: Camera, box: tuple[float, float, float, float], width: int) -> Camera:

@@ -185,7 +185,7 @@ print(1, 1, 1)
 SLOW = """
 import time
 from shapepose_fg.core import compiled, compiling
-compiling._BYTES_S, compiling._cores = 1, lambda: 2
+compiling._BYTES_S, compiling.cores = 1, lambda: 2
 real = compiling._share_out
 compiling._share_out = lambda *arguments: (real(*arguments), time.sleep(1.5))
 """

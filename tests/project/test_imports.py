@@ -14,9 +14,9 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.kept_kernels core.errors core.rows",
-    "core.compiling",
+    "core.compiling core.decompositions",
     "core.compiled",
-    "core.decompositions core.skeleton core.pieces core.assignment core.lens core.trajectory",
+    "core.skeleton core.pieces core.assignment core.lens core.trajectory",
     "core.joint_names",
     "core.camera",
     "core.drawing",
@@ -58,7 +58,7 @@ LEVELS = (
     "live.outputs viz.report",
     "evaluation",
     "cli.options",
-    "cli.pictures cli.found_cameras",
+    "cli.pictures cli.found_cameras cli.setup_table",
     "cli.reconstruct",
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"

@@ -153,7 +153,7 @@ def test_what_others_explain_is_no_evidence(five_cameras, two_people, seen_exact
     # 125 places without a detection of one's own, in views that see nothing else of the person: 0.07 each, twice.
     np.testing.assert_allclose(evidence.score(~nobody_else), -125 * (0.07 + 0.07) + evidence.bones[0], rtol=1e-9)
     assert existence(one, frame)[0] > 0.99
-    assert existence(one.with_more(one), frame).max() < 0.01
+    assert existence(type(one).concatenate([one, one]), frame).max() < 0.01
 
 
 def test_bones_of_usual_length_speak_for_a_person(five_cameras, two_people, seen_exactly):

@@ -119,7 +119,9 @@ class BatchRunner:
                 continue
             before = None if entry.after is None else batch_status.of[entry.after].status
             if before == "failed":
-                reason = f"it begins with the shapes that {entry.after} leaves, which failed; see there"
+                reason = (
+                    f"it needs the body shapes of recording {entry.after}, which failed; correct that one first"
+                )
                 batch_status.set(entry.name, own.failed(reason, 0.0, 0))
             elif before in (None, "done"):
                 found.append(entry)
@@ -170,7 +172,7 @@ class Leader:
         try:
             return self.told.recv()
         except (EOFError, OSError):
-            return "its process was ended from outside; there may be too little memory"
+            return "its process was killed; there may be too little memory"
 
     def end(self) -> Ended | None:
         """Wait for the process to end, or end it; returns the last `Ended` message, if there is one."""
@@ -227,7 +229,7 @@ def _lead(assignment: Assignment) -> None:
     except Exception as error:
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
-        _tell.send(f"{type(error).__name__}: {words} (all of it in {log})")
+        _tell.send(f"{type(error).__name__}: {words} (details in {log})")
     finally:
         _tell.close()
 
@@ -248,17 +250,20 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
     if len(problems) > 0:
         others = [problem.split(":")[0].removeprefix("recording ") for problem in problems[1:]]
         listed = ", ".join(others[:5]) + (f" and {len(others) - 5} more" if len(others) > 5 else "")
-        more = f" (and something is wrong with {listed}, too)" if len(others) > 0 else ""
+        more = f" (other recordings with problems: {listed})" if len(others) > 0 else ""
         raise InputError(f"{table}: {problems[0]}{more}")
     whole, free = sum(sizes.values()), shutil.disk_usage(output).free
     if free < _LEAST * whole:
         raise InputError(
-            f"{output}: at least {decimal(int(_LEAST * whole))} are needed for {len(entries)} recordings, and"
-            f" {decimal(free)} are free; make room, give another --output, or split the table"
+            f"{output}: {len(entries)} recordings need at least {decimal(int(_LEAST * whole))} of disk space,"
+            f" and {decimal(free)} are free; free some space, give another --output, or split the table"
         )
     if free < _USUAL * whole:
         usual = decimal(int(_USUAL * whole))
-        note(f"{output}: {decimal(free)} are free, and results of so much footage mostly take {usual}")
+        note(
+            f"{output}: {decimal(free)} of disk space are free; results of recordings of this size usually"
+            f" take {usual}"
+        )
     return sizes
 
 
@@ -277,8 +282,10 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     prepare_output(folder, (*OUTPUTS, LOG))
     refuse_corrected(folder)
     if (folder / PARTS).exists() and not begun:
-        raise InputError(f"{folder / PARTS}: a run was stopped here; go on with --resume, or anew with --restart")
+        raise InputError(
+            f"{folder / PARTS}: there is an interrupted run; continue with --resume, or start again with --restart"
+        )
     if (folder / PEOPLE).exists() and not begun:
-        raise InputError(f"{folder}: a finished result is here; move it away, or give another --output")
+        raise InputError(f"{folder}: there is a finished result; move it, or give another --output")
     files = (file for path in places for file in (path.rglob("*") if path.is_dir() else (path,)))
     return sum(file.stat().st_size for file in files if file.is_file())

@@ -97,7 +97,7 @@ class BatchStatus:
             rows.append((Text(name), Text(each.status, style=_STYLES[each.status]), *row))
         counts = [f"{len(self.names(each))} {each}" for each in _STYLES if len(self.names(each)) > 0]
         frames = sum(each.frames or 0 for each in self.of.values())
-        caption = f"{', '.join(counts)}; {frames} frames; this time {clock(seconds)}"
+        caption = f"{', '.join(counts)}; {frames} frames; time of this run {clock(seconds)}"
         heads = ("recording", "", "frames", "people", "rows", "time", "warnings")
         return table(heads, rows, left=2, caption=caption)
 
@@ -105,9 +105,9 @@ class BatchStatus:
 def read_status(file: Path) -> dict[str, RecordingStatus]:
     """Read the status of each recording from batch.json; InputError if it is damaged."""
     content = read_json(file)
-    cure = "begin anew with --restart"
+    cure = "start again with --restart"
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
-        raise InputError(f"{file}: not of a batch of this program; {cure}, or give another --output")
+        raise InputError(f"{file}: this is not the status file of a batch; {cure}, or give another --output")
     try:
         kind = TypeAdapter(dict[str, RecordingStatus], config=ConfigDict(strict=True, allow_inf_nan=False))
         return kind.validate_json(json.dumps(content.get("recordings")))
@@ -142,7 +142,7 @@ class Bars:
             people = "" if each.people is None else f"{each.people} people, "
             words = ("done: ", "green"), f"{name}, {each.frames} frames, {people}{clock(each.seconds)}"
         else:
-            more = " (it is tried once more, after the others)" if again else ""
+            more = " (tried once more after the others)" if again else ""
             words = ("failed: ", "bold red"), f"{name}: {failed}{more}"
         self._bars.console.print(Text.assemble(*words), soft_wrap=True)
 

@@ -8,7 +8,7 @@ from typing import Any
 from shapepose_fg.cli.reconstruct.request import Request
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
-from shapepose_fg.core.storage.files import read_toml
+from shapepose_fg.core.storage.files import is_inside, read_toml
 from shapepose_fg.io.config import config_from
 from shapepose_fg.io.validation import describe
 
@@ -46,7 +46,7 @@ def read_table(path: Path) -> list[Entry]:
     recordings = _table(tables.get("recordings", {}), path, "recordings")
     if not 1 <= len(recordings) <= _MOST:
         raise InputError(
-            f"{path}: {len(recordings)} recordings; give 1 to {_MOST} of them, each as [recordings.NAME]"
+            f"{path}: the table has {len(recordings)} recordings; give 1 to {_MOST}, each as [recordings.NAME]"
         )
     _check_names(list(recordings), path)
     config_from(defaults, Request, path, place="defaults", cure=_CURE)
@@ -74,12 +74,15 @@ def _check_names(names: list[str], path: Path) -> None:
     for name in names:
         if _NAME.fullmatch(name) is None:
             raise InputError(
-                f"{path}: recordings.{name[:100]}: a name has up to 100 letters, digits, dots, - and _, and begins"
-                " with a letter or digit, because a folder is called so; rename it"
+                f"{path}: recordings.{name[:100]}: the name is also that of a folder, so it must have up to 100"
+                " letters, digits, dots, - and _, and begin with a letter or digit; rename it"
             )
         if name.lower() in seen:
             other = seen[name.lower()]
-            raise InputError(f"{path}: recordings.{name}: {other} has this name on some systems, too; rename it")
+            raise InputError(
+                f"{path}: recordings.{name}: some file systems do not distinguish this name from"
+                f" {other}; rename it"
+            )
         seen[name.lower()] = name
 
 
@@ -94,16 +97,13 @@ def _located(request: Request, path: Path, place: str) -> Request:
 
 def _inside(given: Path, path: Path, place: str) -> Path:
     """A path relative to the table's folder, inside it; or an absolute one."""
-    found = path.parent / given  # itself, where it is absolute
-    try:
-        inside = found.resolve().is_relative_to(path.parent.resolve())
-    except (OSError, RuntimeError, ValueError):  # links in a circle, a zero byte
-        raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it") from None
-    if not (inside or given.is_absolute()):
+    if "\0" in str(given):
+        raise InputError(f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it")
+    if not (is_inside(path.parent, given) or given.is_absolute()):
         raise InputError(
-            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, make it absolute"
+            f"{path}: {place}: {given} is outside the table's folder; if this is intended, give an absolute path"
         )
-    return found
+    return path.parent / given  # itself, where it is absolute
 
 
 def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
@@ -119,8 +119,8 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
             other = projects.setdefault((project.resolve(), each.request.frames), each.name)
             if other != each.name:
                 raise InputError(
-                    f"{path}: recordings.{each.name}: {project} is that of {other}, too, and TRC of one would be"
-                    " written over those of the other; leave one out"
+                    f"{path}: recordings.{each.name}: {project} is also the project of {other}, and their TRC"
+                    " files would overwrite each other; remove one of them"
                 )
         if shapes is not None:
             each = replace(each, after=last.get(shapes.resolve()))

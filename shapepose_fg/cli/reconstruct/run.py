@@ -72,7 +72,7 @@ def carry_out(
     output = known.output
     refuse_corrected(output)
     if (output / PEOPLE).exists() and not (overwrite or (resume and (output / manifest.PARTS).is_dir())):
-        raise InputError(f"{output}: a finished result is here; give another --output, or --overwrite")
+        raise InputError(f"{output}: there is a finished result; give another --output, or --overwrite")
     settings = known.settings()  # what is wrong with them is said before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
         known = _synchronised(known, kept=resume and (output / manifest.PARTS).is_dir())
@@ -82,7 +82,7 @@ def carry_out(
         reading = ReadInputs((*files, known.detections))
         rig, own = asked.rig(), output / CAMERAS
         if (asked.cameras or asked.without) and own.exists() and own.samefile(known.calibration):
-            raise InputError(f"{own}: results replace this file, all of whose cameras are needed; copy it first")
+            raise InputError(f"{own}: the result would replace this file by fewer cameras; copy it first")
         recording, times = read_recording(known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps)
         note(*recording.notes)
         count = len(recording)
@@ -94,7 +94,9 @@ def carry_out(
             fitter = make_fitter(settings.body, model, settings.law)
             if fitter.weights is None and settings.body.method != "plain":
                 cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(asked.body)])}"
-                note(f"{asked.body}: fitted by the plain optimiser; {cure} trains a better one for it, once")
+                note(
+                    f"{asked.body}: bodies are fitted by the plain optimiser; {cure} trains a better fitter, once"
+                )
         task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
         inputs = reading.checksums((known.calibration, *recording.sources, *files[1:]))
         beside = rig.trajectories[: len(rig.trajectories) - len(poses)]
@@ -132,13 +134,11 @@ def _about_moving(task: Task) -> list[str]:
     rig, (_, times, _) = task.rig, task.whole()
     if not rig.moves:
         return []
-    told = ["cameras move: the check whether cameras and detections fit is of fixed cameras, and is left out"]
+    told = ["cameras move: the set-up check needs fixed cameras and is left out"]
     if (rig.carrier >= 0).all():
-        told.append(
-            "no camera stands still: the world is that of the first trajectory's start, and drifts with it"
-        )
+        told.append("no camera is fixed: the world frame is the start of the first trajectory, and drifts with it")
     if not task.config.temporal:
-        told.append("frames stand alone: trajectories are taken as they are, with no error")
+        told.append("frame by frame: trajectories are used as given, without uncertainty")
     spells = without_poses(rig, times)
     for view in sorted({view for view, _, _ in spells}):
         spans = [(first, last) for each, first, last in spells if each == view]
@@ -216,7 +216,7 @@ class _Run:
             needed = manifest.expected_bytes(self.recording, self.task.rig, self.task.whole()[0])
             manifest.check_room(output, needed)
             if resume:
-                note(f"{output}: no run was stopped here; this one begins anew")
+                note(f"{output}: there is no run to resume; a new one is started")
         kept = manifest.open_run(output, self.begun(), resume=resume, restart=restart)
         try:
             # Of what is kept everything may be in order, and yet make no sense.
@@ -256,7 +256,7 @@ class _Run:
         result = result.with_run(**about)
         every = max(1, -(-len(result) // MOST_ROWS))
         if every > 1:
-            note(f"check and report are made of every {th(every)} frame: the result has {len(result)} rows")
+            note(f"check and report use every {th(every)} frame, because the result has {len(result)} rows")
         rig = kept_rig(kept, rig) or rig
         people = result.reconstruction(every=every)
         report = self.report
@@ -302,9 +302,9 @@ class _Run:
         files = ["people.npz", "run.json", *(["observations.npz"] if len(result) > 0 else []), CAMERAS]
         written = [str(output / name) for name in files]
         if rig.moves:
-            written.append(f"{output / 'trajectories'}  where cameras went: CSV with covariances, and TUM")
+            written.append(f"{output / 'trajectories'}  poses of moving cameras: CSV with covariances, and TUM")
         if self.known.request.report:
-            written.append(f"{write_report(output, people, rig, every=every)}  to look at, in a browser")
+            written.append(f"{write_report(output, people, rig, every=every)}  open it in a browser")
         else:  # that of an earlier result would say what is no longer true
             (output / REPORT).unlink(missing_ok=True)
         if project is not None:
@@ -323,7 +323,7 @@ class _Run:
             done = manifest.frames_done(output)
         except InputError as error:
             return str(error)
-        return f"{done} of {count} frames are kept in {output / manifest.PARTS}; go on with --resume"
+        return f"{done} of {count} frames are stored in {output / manifest.PARTS}; continue with --resume"
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:

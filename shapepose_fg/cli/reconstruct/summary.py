@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
-from rich.text import Text
 
 from shapepose_fg.cli.reconstruct.request import Prepared
+from shapepose_fg.cli.setup_table import use_table
 from shapepose_fg.cli.terminal import note, show, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
@@ -17,15 +17,14 @@ from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
 from shapepose_fg.setup_check.report import ResultCheck, SetupReport, unseen
 from shapepose_fg.setup_check.report import check_setup as check_detections
-from shapepose_fg.setup_check.table import use_table
 
 _SURE = 0.9
 """Probability below which people are listed."""
 _KNOWN_WORDS = {
     "seen": "seen by two views",
-    "weak": "seen by one or weakly",
+    "weak": "seen by one view or weakly",
     "body": "inferred from the body",
-    "motion": "carried by motion",
+    "motion": "inferred from motion",
     "unknown": "unknown",
 }
 
@@ -62,14 +61,14 @@ def summary_table(
     over_time = run.get("configuration", {}).get("temporal", False)
     for each in run.get("trajectories", []):
         corrected = f"corrected by up to {each['moved_mm']:.0f} mm and {each['turned_deg']:.1f} degrees"
-        known = f"known to {each['sigma_mm']:.0f} mm and {each['sigma_deg']:.1f} degrees"
+        known = f"sigma {each['sigma_mm']:.0f} mm and {each['sigma_deg']:.1f} degrees"
         words = (
             f"{each['way_m']:.1f} m; {corrected}; {known}"
             if each["refined"]
             else f"{each['way_m']:.1f} m, as given"
         )
         table.add_row("moving", f"{' '.join(each['cameras'])}: {words}")
-    count = f"{len(result.rows_of)} people over time" if over_time else "no identities"
+    count = f"{len(result.rows_of)} people over time" if over_time else "without identities"
     table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
     table.add_row("rows", f"{len(result)} in all")
     for status, count in sorted(counts["status"].items()):
@@ -86,9 +85,11 @@ def summary_table(
     if len(lost) > 0:
         table.add_row("lost", "; ".join(lost), style="yellow")
     for what, spans in run.get("thinned_frames", {}).items():
-        table.add_row("", f"too many {what}, the surest were taken{_frames_words(spans)}", style="yellow")
+        table.add_row(
+            "", f"too many {what}; those of highest confidence were used{_frames_words(spans)}", style="yellow"
+        )
     for camera, spans in run.get("repeated_pictures", {}).items():
-        words = f"{camera} shows one picture again, which is left out{_frames_words(spans)}"
+        words = f"{camera} repeats pictures; the repeated ones are left out{_frames_words(spans)}"
         table.add_row("", words, style="yellow")
     if len(people) > 0:
         table.add_row("joints", _joints(counts["joints"], people))
@@ -107,9 +108,9 @@ def _doubtful(run: dict[str, Any]) -> str:
     said = run.get("probability", [])
     if isinstance(said, dict):
         count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
-        return f"{count} are less probable than {_SURE}" if count > 0 else ""
+        return f"{count} have a probability below {_SURE}" if count > 0 else ""
     few = [f"{each['person']} ({each['probability']:.2f})" for each in said if each["probability"] < _SURE]
-    return f"less probable than {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}" if few else ""
+    return f"probability below {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}" if few else ""
 
 
 def _frames_words(spans: list[list[int]]) -> str:
@@ -133,10 +134,5 @@ def show_check(checked: ResultCheck) -> None:
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))
-        meaning = (
-            "error: median / 90 % of all detections given to people, before gates; used: after;\n"
-            "left out: median, from where the other cameras alone put the joint"
-        )
-        show(Text(meaning, style="dim"))
     for each in checked.warnings:
         warn(each)

@@ -1,7 +1,8 @@
-"""Replaces the numbers of cameras in the files of a calibration: XML, OpenCV's and ROS' YAML, COLMAP's text.
+"""Replaces the values of cameras in existing calibration files: XML, YAML of OpenCV and ROS,
+COLMAP's text.
 
-Each function returns the texts of the files by their paths; what does not fit is left unchanged, and the caller
-reads the result back.
+Each function returns the new texts of the files by path. Values that cannot be written are left
+unchanged; the caller reads the files back to check them.
 """
 
 import re
@@ -52,7 +53,7 @@ def _numbers(values: ArrayLike) -> str:
 
 
 def _set(element: ET.Element | None, names: str, values: ArrayLike) -> None:
-    """Attributes, a number each."""
+    """Set numeric attributes `names` of an XML element to `values`."""
     if element is not None:
         for name, value in zip(names.split(), np.ravel(values).tolist(), strict=True):
             element.set(name, repr(value))
@@ -90,7 +91,9 @@ def _vicon(content: Content, rig: Rig, metres: float) -> Files:
 
 
 def _matrices(text: str, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
-    """FileStorage's text; matrices are replaced for which `value(keys, count)` is one, keys from the outermost."""
+    """FileStorage's text with new matrices: `value(keys, count)` returns a new matrix or None; keys
+    are the outermost first.
+    """
     if text.lstrip().startswith("<"):
         return _matrices_of_xml(text, value)
     pieces, above, place = list[str](), list[tuple[int, str]](), 0
@@ -130,7 +133,7 @@ def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLik
 
 
 def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
-    """The `count` numbers of a camera that programs store under `name`; None for unknown names."""
+    """The `count` values of a camera that programs store under `name`; None for unknown names."""
     R, cTw, wTc = camera.cTw[:, :3], camera.cTw.copy(), camera.wTc.copy()
     cTw[:, 3] /= metres
     wTc[:3, 3] /= metres
@@ -140,56 +143,37 @@ def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLik
     return next((each for names, each in kinds.items() if name in names.split()), None)
 
 
-def _nodes(content: Content, rig: Rig, metres: float) -> Files:
-    cameras = dict(zip(rig.names, rig.cameras, strict=True))
-
-    def file(path: Path, inside: tuple[str, ...]) -> str:
-        def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
-            whose = (*inside, *keys)[-2:]
-            return numbers_of(keys[-1], cameras[whose[0]], metres, count) if whose[0] in cameras else None
-
-        return _matrices(read_text(path), value)
-
-    if content.syntax != "folder":
-        return {content.path: file(content.path, ())}
-    return {path: file(path, (path.stem,)) for path in content.value if path.stem in cameras}
-
-
-def _multiview(content: Content, rig: Rig, metres: float) -> Files:
-    V = len(rig)
+def _opencv(content: Content, rig: Rig, metres: float) -> Files:
+    """Rewrite a FileStorage: matrices of all cameras; of the camera whose name or number is the
+    suffix of the matrix's name (EasyMocap); or of the camera after which the node or file is named.
+    """
+    V, tags = len(rig), {str(n): camera for n, camera in enumerate(rig.cameras, 1)}
+    tags |= (cameras := dict(zip(rig.names, rig.cameras, strict=True)))
+    tagged = {"K": INTRINSIC, "dist": BEND, "R": TURN, "Rot": TURN, "T": SHIFT}
+    of_all = {"Ks": INTRINSIC, "Rs": TURN, "Ts": SHIFT, "distortions": BEND}
 
     def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
-        names = {"Ks": INTRINSIC, "Rs": TURN, "Ts": SHIFT, "distortions": BEND}
-        kind = names.get(keys[-1])
-        if kind is None:
-            return None
-        # Four coefficients of a fisheye, equally many of every other camera.
-        four = [kind == BEND and camera.lens == "fisheye" for camera in rig.cameras]
+        (whose, key), (name, _, tag) = keys[-2:], keys[-1].partition("_")
+        if name in tagged and tag in tags:
+            return numbers_of(tagged[name].split()[0], tags[tag], metres, count)
+        if whose in cameras or key not in of_all:
+            return numbers_of(key, cameras[whose], metres, count) if whose in cameras else None
+        # Four coefficients per fisheye camera, and an equal number for each other camera.
+        kind, four = of_all[key], [key == "distortions" and camera.lens == "fisheye" for camera in rig.cameras]
         each, rest = divmod(count - 4 * sum(four), max(V - sum(four), 1))
-        if rest != 0:
-            return None
-        counts = [4 if short else each for short in four]
-        parts = [
-            numbers_of(kind.split()[0], *both) for both in zip(rig.cameras, [metres] * V, counts, strict=True)
-        ]
-        return np.concatenate([np.ravel(part) for part in parts if part is not None])
+        counts = zip(rig.cameras, [4 if short else each for short in four], strict=True)
+        numbers = [numbers_of(kind.split()[0], camera, metres, own) for camera, own in counts]
+        return np.concatenate([np.ravel(np.asarray(own)) for own in numbers]) if rest == 0 else None
 
-    return {content.path: _matrices(read_text(content.path), value)}
-
-
-def _easymocap(content: Content, rig: Rig, metres: float) -> Files:
-    tags = {tag: camera for n, camera in enumerate(rig.cameras, 1) for tag in (camera.name, str(n))}
-    tags |= {camera.name: camera for camera in rig.cameras}
-    kinds = {"K": INTRINSIC, "dist": BEND, "R": TURN, "Rot": TURN, "T": SHIFT}
-
-    def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
-        kind, _, tag = keys[-1].partition("_")
-        known = kind in kinds and tag in tags
-        return numbers_of(kinds[kind].split()[0], tags[tag], metres, count) if known else None
-
-    folder = content.path if content.syntax == "folder" else content.path.parent
-    halves = [path for path in folder.iterdir() if re.fullmatch(r"(intri|extri)\.ya?ml", path.name)]
-    return {path: _matrices(read_text(path), value) for path in sorted(halves)}
+    whole = content.syntax == "folder"
+    beside = content.value if whole else list(content.path.parent.iterdir())
+    files = {path for path in beside if re.fullmatch(r"(intri|extri)\.ya?ml", path.name)}
+    files = files if whole or content.path in files else {content.path}
+    files |= {path for path in beside if path.stem in cameras} if whole else set()
+    return {
+        path: _matrices(read_text(path), lambda keys, count, stem=path.stem: value((stem, *keys), count))
+        for path in sorted(files)
+    }
 
 
 def _ros(content: Content, rig: Rig, metres: float) -> Files:
@@ -229,7 +213,7 @@ def _colmap(content: Content, rig: Rig, metres: float) -> Files:
     cameras, place, of = list(rig.cameras), 0, dict[str, Camera]()
     for number, line in enumerate(outer):
         words = line.split(maxsplit=9)
-        # Every image is followed by a line of points, which may be empty.
+        # Each line of an image is followed by a line of points, which may be empty.
         if line.startswith("#") or place % 2 == 1 or len(words) != 10:
             place += not line.startswith("#") and place % 2 == 1
             continue
@@ -254,10 +238,8 @@ def _colmap(content: Content, rig: Rig, metres: float) -> Files:
 REWRITTEN: dict[str, Callable[[Content, Rig, float], Files]] = {
     QUALISYS.name: _qualisys,
     VICON.name: _vicon,
-    OPENCV[0].name: _easymocap,
-    OPENCV[1].name: _multiview,
-    OPENCV[3].name: _nodes,
+    **dict.fromkeys((OPENCV[0].name, OPENCV[1].name, OPENCV[3].name), _opencv),
     COLMAP.name: _colmap,
     ROS.name: _ros,
 }
-"""Functions that rewrite each format, by its name."""
+"""Rewriting functions, by name of the format."""

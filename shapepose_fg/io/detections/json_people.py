@@ -1,27 +1,27 @@
-"""People in JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures, OpenPifPaf, Ultralytics, AlphaPose's
-sep-json), or one file per camera with all its frames (COCO's keypoint results, AlphaPose, MMPose of a video,
-OpenPifPaf of a video).
+"""Reads people from JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures, OpenPifPaf,
+Ultralytics, AlphaPose's sep-json), or one file per camera with all its frames (COCO's keypoint
+results, AlphaPose, MMPose of a video, OpenPifPaf of a video).
 
-Pose2Sim (RTMLib's people written in OpenPose's way) leaves `_keypoints` out of the names, writes NaN for people
-that it dropped, and `{}` for people that a camera does not see.
+Pose2Sim (RTMLib's people in OpenPose's format) has no `_keypoints` in the file names, NaN for
+people that it dropped, and `{}` for people that a camera does not see.
 """
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from itertools import chain, islice, pairwise
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, FiniteFloat, TypeAdapter
+from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
-from shapepose_fg.io.camera_names import MOST_FRAME, in_order
+from shapepose_fg.core.storage.files import BIG, LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
+from shapepose_fg.io.camera_names import MOST_FRAME, in_order, last_number, numbered
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
-from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock, check_one_model, frame_blocks
 from shapepose_fg.io.json_items import JsonItems
 from shapepose_fg.io.validation import describe, validated, validated_list
 
@@ -40,36 +40,43 @@ _RERUN = {
     _SEPARATE: "run AlphaPose again, without --format",
 }
 _LONGEST_GAP = 1000
-"""Largest ratio of missing to existing frames: more are numbers of something else."""
+"""Maximum ratio of missing to existing frames; a larger ratio means that the numbers are not frame
+numbers."""
 _LOOKED_AT = 100
-"""Maximum number of files without people that are read to recognise the program."""
-_LONGEST_NAME = 4096
-"""Maximum number of characters of a picture's path: the time of the search grows with their square."""
-_FRAME_FILE = re.compile(r"(\d+)(_keypoints|(\.\w{1,5})?\.predictions)?\.json$")
-"""Pattern of the names of files of frames."""
-_FRAME_NUMBER = re.compile(r"(\d+)\D*$")
-"""The last number in the name of a picture."""
+"""Maximum number of files without people that are read before the program is identified."""
+FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
+"""Pattern of what follows the frame number in file names."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
-"""AlphaPose's file of all frames, and its folder for a file a frame, of --format open and cmu."""
+"""AlphaPose's file with all frames, and its folder with a file per frame (--format open and cmu)."""
 _LISTS = ("annotations", "instance_info")
-"""Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
+"""Keys of the list if the file is an object: COCO's data sets, and MMPose."""
 _AT_ONCE = 1024
-"""Number of items that are checked together: as Python's numbers they take several times the memory of an
-array."""
+"""Number of items that are validated together: as Python objects they need several times the memory
+of arrays."""
 
 
 class _Person(BaseModel, strict=True, extra="allow"):
-    """A person of a frame of OpenPose; hands and face are passed over."""
+    """A person in OpenPose's format, or in AlphaPose's formats `open` and `cmu`; hands and face are
+    ignored.
+    """
 
     pose_keypoints_2d: list[float] | None = None
+    joints: list[float] | None = None
+
+    def flat(self, place: str, program: str) -> list[float]:
+        """x, y and score of each keypoint; empty if the person has none."""
+        values = self.joints if self.pose_keypoints_2d is None else self.pose_keypoints_2d
+        if values is None and self.model_extra:
+            raise InputError(f"{place}.pose_keypoints_2d is missing; {_RERUN[program]}")
+        return _checked(values or [], f"{place}.pose_keypoints_2d", program)
 
 
 class _Frame(BaseModel, strict=True):
-    people: list[_Person]
+    people: list[_Person] = Field(validation_alias=AliasChoices("people", "bodies"))
 
 
 class _Instance(BaseModel, strict=True):
-    """A person of MMPose."""
+    """A person in MMPose's format."""
 
     keypoints: list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
     keypoint_scores: list[FiniteFloat]
@@ -77,35 +84,45 @@ class _Instance(BaseModel, strict=True):
     def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint."""
         if len(self.keypoints) != len(self.keypoint_scores):
-            problem = f"{len(self.keypoints)} keypoints have {len(self.keypoint_scores)} keypoint_scores"
+            problem = f"there are {len(self.keypoints)} keypoints, but {len(self.keypoint_scores)} keypoint_scores"
             raise InputError(f"{place}: {problem}; {_RERUN[program]}")
         pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
         return [number for (x, y), score in pairs for number in (x, y, score)]
 
 
 class _VideoFrame(BaseModel, strict=True):
-    """A frame of MMPose."""
+    """A frame of a video in MMPose's format."""
 
     frame_id: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
     instances: list[_Instance]
 
 
-class _Result(BaseModel, strict=True):
-    """A person of COCO's results."""
+class _Flat(BaseModel, strict=True):
+    """A person in OpenPifPaf's format."""
+
+    keypoints: Annotated[list[float], Field(min_length=1)]
+
+    def flat(self, place: str, program: str) -> list[float]:
+        """x, y and score of each keypoint."""
+        return _checked(self.keypoints, f"{place}.keypoints", program)
+
+
+class _Result(_Flat):
+    """A person in COCO's result format."""
 
     image_id: int | str
-    keypoints: Annotated[list[float], Field(min_length=1)]
     category_id: int | str | None = None
 
 
-class _Flat(BaseModel, strict=True):
-    """A person of OpenPifPaf."""
+class _PifPafFrame(BaseModel, strict=True):
+    """A frame of a video in OpenPifPaf's format."""
 
-    keypoints: Annotated[list[float], Field(min_length=1)]
+    frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
+    predictions: list[_Flat]
 
 
 class _Columns(BaseModel, strict=True):
-    """The keypoints of a person of Ultralytics."""
+    """The keypoints of a person in Ultralytics' format."""
 
     x: list[FiniteFloat]
     y: list[FiniteFloat]
@@ -113,46 +130,34 @@ class _Columns(BaseModel, strict=True):
 
 
 class _Object(BaseModel, strict=True):
-    """A person, or another thing, of Ultralytics."""
+    """A detected person, or other object, in Ultralytics' format."""
 
     keypoints: _Columns | None = None
 
-    def flat(self, place: str) -> list[float]:
-        """x, y and score of each keypoint; those that are hardly seen are at 0 0."""
+    def flat(self, place: str, program: str) -> list[float]:
+        """x, y and score of each keypoint; keypoints with a low score are at 0 0."""
         own = self.keypoints
         if own is None:
             return []
         scores = [1.0] * len(own.x) if own.visible is None else own.visible
         if not len(own.x) == len(own.y) == len(scores):
-            raise InputError(f"{place}.keypoints must have as many x, y and visible; {_RERUN[_YOLO]}")
+            raise InputError(f"{place}.keypoints must have the same number of x, y and visible; {_RERUN[program]}")
         rows = zip(own.x, own.y, scores, strict=True)
         return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
 
 
-class _Body(BaseModel, strict=True):
-    """A person of AlphaPose's --format cmu."""
-
-    joints: Annotated[list[float], Field(min_length=1)]
-
-
-class _Bodies(BaseModel, strict=True):
-    bodies: list[_Body]
-
-
-class _PifPafFrame(BaseModel, strict=True):
-    """A frame of OpenPifPaf's video."""
-
-    frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
-    predictions: list[_Flat]
-
-
-_INSTANCES = TypeAdapter(list[_Instance])
-_FLAT, _OBJECTS = TypeAdapter(list[_Flat]), TypeAdapter(list[_Object])
+_LIST_OF = {
+    _PIFPAF: TypeAdapter(list[_Flat]),
+    _YOLO: TypeAdapter(list[_Object]),
+    _PICTURES: TypeAdapter(list[_Instance]),
+}
+"""Validators of a frame's people, for programs that write them as a list; others write an object
+(`_Frame`)."""
 _RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
 
 
 def _checked(values: list[float], place: str, program: str) -> list[float]:
-    """Flat keypoints; a joint that was not seen may be NaN."""
+    """Check flat keypoints; a joint that was not detected may be NaN."""
     if len(values) % 3 != 0:
         problem = f"must hold x, y and score of each keypoint, got {len(values)} numbers"
         raise InputError(f"{place} {problem}; {_RERUN[program]}")
@@ -161,20 +166,23 @@ def _checked(values: list[float], place: str, program: str) -> list[float]:
     return values
 
 
-def _of_one_model(known: set[int], people: Iterable[list[float]], source: Path, program: str) -> None:
-    """Add numbers of keypoints to `known`; InputError where there are several."""
-    known |= {len(person) // 3 for person in people}
-    if len(known) > 1:
-        counts = " and ".join(map(str, sorted(known)))
-        what = f"recognised as {program}, with people of {counts} keypoints"
-        raise InputError(f"{source}: {what}; give the detections of one model")
+def _people(content: Any, place: object, program: str) -> list[list[float]]:
+    """Flat keypoints of the people of a frame; people without keypoints are skipped."""
+    if program in _LIST_OF:
+        key, people = "", validated_list(_LIST_OF[program], content, place, _RERUN[program])
+    else:
+        key, people = "people", validated(_Frame, content, place, _RERUN[program]).people
+    every = (each.flat(f"{place}: {key}[{number}]", program) for number, each in enumerate(people))
+    return [each for each in every if each]
 
 
 def read_json_people(place: Path) -> CameraPeople:
-    """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
+    """The people of one camera: from a JSON file with all frames (which may be the only one of a
+    folder), or from a file per frame.
+    """
     if not place.is_dir():
         return read_one_file(place)
-    if (place / _SEP_JSON).is_dir() and len(frame_files(place)) == 0:
+    if (place / _SEP_JSON).is_dir() and len(numbered(place, FRAME_FILE)) == 0:
         return read_frame_files(place / _SEP_JSON)
     lists = _lists(place)
     if [each.name for each in lists] == [_ALL_FRAMES]:
@@ -189,7 +197,7 @@ def read_json_people(place: Path) -> CameraPeople:
 
 
 def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
-    """The joints that MMPose's `meta_info` names: one by one, or as a data set; None where it names none."""
+    """The joints in MMPose's `meta_info`: names, or the name of a data set; None if it has neither."""
     if not isinstance(meta, dict):
         return None
     names, count = meta.get("keypoint_id2name"), meta.get("num_keypoints")
@@ -203,13 +211,15 @@ def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
 
 
 def _texts(names: Any) -> tuple[str, ...]:
-    """A list of texts as a tuple; empty where it is anything else."""
+    """A list of texts as a tuple; empty for any other value."""
     listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
     return tuple(names) if listed else ()
 
 
 def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple[str, ...] | None:
-    """The joints that COCO's `categories` name for those in use; None where they name none, or different ones."""
+    """The joint names of the `used` categories in COCO's `categories`; None if there are none, or
+    if they differ.
+    """
     found = set[tuple[str, ...]]()
     for each in categories if isinstance(categories, list) else []:
         named = _texts(each.get("keypoints")) if isinstance(each, dict) else ()
@@ -221,49 +231,40 @@ def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple
 # A file per frame.
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """Files of a folder that are named after a frame, in order of their names."""
-    # macOS leaves ._000000_keypoints.json beside each file that it copies.
-    found = [each for each in folder.iterdir() if _FRAME_FILE.search(each.name) and not each.name.startswith(".")]
-    return sorted(each for each in found if each.is_file())
-
-
-def frame_number(file: Path) -> int:
-    """The number of the frame that one of `frame_files` is named after."""
-    match = _FRAME_FILE.search(file.name)
-    assert match is not None
-    return int(match[1])
-
-
 def read_frame_files(folder: Path) -> CameraPeople:
-    """The frames that one camera saw; InputError naming file, key and cure.
+    """Read a file per frame of one camera; InputError naming file, key and cure.
 
-    A frame's number is in its file's name. No people are seen in frames whose files are missing in between
+    Frame numbers are in the file names. Missing files in between are frames without people
     (`gaps`).
     """
-    files = frame_files(folder)
-    if len(files) == 0:
+    found = numbered(folder, FRAME_FILE)
+    if len(found) == 0:
         lists = sorted(each.name for each in _lists(folder))
-        what = "no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; run one of them into it"
+        what = (
+            "there is no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; write the"
+            " detections of one of them into it"
+        )
         if len(lists) > 1:
             names = " ".join(lists[:4])
-            what = f"several JSON files without frame numbers ({names}); leave the one to be read"
+            what = f"there are several JSON files without frame numbers ({names}); keep only one"
         raise InputError(f"{folder}: {what}")
     program, joints = _OPENPOSE, None
-    if not files[0].name.endswith("_keypoints.json"):
-        program, joints = _program_of_frames(files)
-    numbered = in_order([(frame_number(file), file) for file in files])
-    first, last = numbered[0][0], numbered[-1][0]
-    if last - first + 1 > 2 * len(numbered) + _LONGEST_GAP:
-        problem = f"{len(numbered)} files are numbered from {first} to {last}"
+    if not found[0][1].name.endswith("_keypoints.json"):
+        program, joints = _program_of_frames([file for _, file in found])
+    in_order(found)
+    first, last = found[0][0], found[-1][0]
+    if last - first + 1 > 2 * len(found) + _LONGEST_GAP:
+        problem = f"{len(found)} files are numbered from {first} to {last}"
         raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
-    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(numbered) if other > one + 1)
-    blocks = _frame_blocks(folder, program, numbered, joints)
+    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(found) if other > one + 1)
+    blocks = frame_blocks(folder, program, found, partial(_people_of_file, program=program, joints=joints))
     return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints)
 
 
 def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | None]:
-    """The program that wrote files of frames, by the first with people, and the joints that it names."""
+    """The program that wrote a file per frame, identified by the first file with people, and the
+    joint names in it.
+    """
     program, joints = _POSE2SIM, None
     for n, file in enumerate(files[:_LOOKED_AT]):
         content = read_json(file, most=MIDDLE)
@@ -287,49 +288,16 @@ def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | 
     return program, joints
 
 
-def _frame_blocks(
-    folder: Path, program: str, numbered: list[tuple[int, Path]], joints: str | tuple[str, ...] | None
-) -> Iterator[PeopleBlock]:
-    """The people of the files, block by block."""
-    counts = set[int]()
-    for start in range(0, len(numbered), BLOCK_FRAMES):
-        frames, people = list[int](), list[list[float]]()
-        for number, file in numbered[start : start + BLOCK_FRAMES]:
-            found = _people_of_frame(file, program, joints)
-            people += found
-            frames += [number] * len(found)
-        _of_one_model(counts, people, folder, program)
-        yield PeopleBlock.of(frames, people)
-
-
-def _people_of_frame(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
-    """Flat keypoints of the people of a frame; people without keypoints are left out."""
-    content, rerun, found = read_json(file, most=MIDDLE), _RERUN[program], list[list[float]]()
-    if program in (_PIFPAF, _SEPARATE):
-        if program == _PIFPAF:
-            flat = [each.keypoints for each in validated_list(_FLAT, content, file, rerun)]
-        else:
-            flat = [each.joints for each in validated(_Bodies, content, file, rerun).bodies]
-        return [_checked(each, f"{file}: [{number}]", program) for number, each in enumerate(flat)]
-    if program == _YOLO:
-        objects = validated_list(_OBJECTS, content, file, rerun)
-        return [own for number, each in enumerate(objects) if (own := each.flat(f"{file}: [{number}]"))]
-    if program == _PICTURES:
-        if isinstance(content, dict):
-            if _joints_of_meta(content.get("meta_info")) != joints:
-                raise InputError(
-                    f"{file}: meta_info names other joints than the first file; give one model's files"
-                )
-            content = content.get("instance_info")
-        instances = validated_list(_INSTANCES, content, file, rerun)
-        return [person.flat(f"{file}: [{number}]", program) for number, person in enumerate(instances)]
-    for number, person in enumerate(validated(_Frame, content, file, rerun).people):
-        values, place = person.pose_keypoints_2d, f"{file}: people[{number}].pose_keypoints_2d"
-        if values is None and person.model_extra:
-            raise InputError(f"{place} is missing; {rerun}")
-        if values:
-            found.append(_checked(values, place, program))
-    return found
+def _people_of_file(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
+    """Flat keypoints of the people of a frame."""
+    content = read_json(file, most=MIDDLE)
+    if program == _PICTURES and isinstance(content, dict):
+        if _joints_of_meta(content.get("meta_info")) != joints:
+            raise InputError(
+                f"{file}: its meta_info names other joints than the first file; give the files of one model"
+            )
+        content = content.get("instance_info")
+    return _people(content, file, program)
 
 
 # One file with all frames.
@@ -340,12 +308,12 @@ def _lists(folder: Path) -> list[Path]:
 
 
 def _known(item: Any) -> bool:
-    """Whether this is an item of one of the programs' lists."""
+    """Whether this is an item of a list in one of the programs' formats."""
     return isinstance(item, dict) and ("image_id" in item or "instances" in item)
 
 
 def read_one_file(path: Path) -> CameraPeople:
-    """Read all frames that one camera saw; InputError naming file, key and cure."""
+    """Read a file with all frames of one camera; InputError naming file, key and cure."""
     if (lines := _pifpaf_video(path)) is not None:
         return lines
     items = JsonItems(path, _LISTS)
@@ -359,8 +327,8 @@ def read_one_file(path: Path) -> CameraPeople:
     if not items.found or (items.key is None and first is not None and not _known(first)):
         found = "a list" if items.found else describe(items.value)
         raise InputError(
-            f"{path}: recognised as JSON ({found}), expected a list of people with image_id (COCO,"
-            " AlphaPose) or of frames with instances (MMPose); give one of these"
+            f"{path}: recognised as JSON ({found}), but a list of people with image_id (COCO, AlphaPose) or of"
+            " frames with instances (MMPose) is expected; give one of these"
         )
     again = every if first is None else chain([first], every)
     if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
@@ -370,14 +338,14 @@ def read_one_file(path: Path) -> CameraPeople:
 
 
 class _Collected:
-    """People of one file as they are read, in arrays."""
+    """Collects the people of one file in arrays while they are read."""
 
     def __init__(self, path: Path, program: str) -> None:
         self.path, self.program = path, program
         self._keypoints, self._counts = list[Array](), set[int]()
 
     def valid(self, kind: TypeAdapter[list[Any]], items: Iterable[Any]) -> Iterator[tuple[int, list[Any]]]:
-        """The items, some at a time, and the index of the first of them."""
+        """The validated items in batches, with the index of each batch's first item."""
         items, start = iter(items), 0
         while len(some := list(islice(items, _AT_ONCE))) > 0:
             yield start, validated_list(kind, some, self.path, _RERUN[self.program], start)
@@ -385,20 +353,22 @@ class _Collected:
 
     def add(self, rows: list[list[float]]) -> None:
         """Add people with flat keypoints."""
-        _of_one_model(self._counts, rows, self.path, self.program)
+        check_one_model(self._counts, rows, self.path, self.program)
         if len(rows) > 0:
             self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
 
     def camera(
         self, frames: list[int], listed: tuple[int, int], joints: str | tuple[str, ...] | None
     ) -> CameraPeople:
-        """All people, in these `frames` (N); `listed` are the first and last that the file knows."""
+        """All people, with their `frames` (N); `listed` are the first and last frame number in the
+        file.
+        """
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
         how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun, "joints": joints}
         return CameraPeople(self.path, self.program, blocks, *listed, **how)
 
     def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
-        """People in the order of their frames (N,), some frames at a time."""
+        """People sorted by frame, with `frames` (N,), in blocks of frames."""
         if len(frames) == 0:
             return
         order, parts = np.argsort(frames, kind="stable"), self._keypoints
@@ -413,7 +383,7 @@ class _Collected:
 
 
 def _pifpaf_video(path: Path) -> CameraPeople | None:
-    """OpenPifPaf's file of a video, a line of JSON a frame; None where it is another file."""
+    """Read OpenPifPaf's file of a video, a line of JSON per frame; None for other files."""
     with open_regular(path) as stream:
         begin = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").replace(b" ", b"")
     if not begin.startswith(b'{"frame":'):
@@ -425,49 +395,43 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
             continue
         one = validated(_PifPafFrame, parse_json(line, path), path, _RERUN[_PIFPAF])
         if one.frame <= last:
-            raise InputError(f"{path}: line {number}: frames must rise; {_RERUN[_PIFPAF]}")
+            raise InputError(f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}")
         last = one.frame
         place = f"{path}: line {number}"
-        people.add([_checked(each.keypoints, place, _PIFPAF) for each in one.predictions])
+        people.add([each.flat(place, _PIFPAF) for each in one.predictions])
         frames += [one.frame] * len(one.predictions)
     return people.camera(frames, (min(frames, default=0), last), None)
 
 
 def _by_picture(path: Path) -> CameraPeople | None:
-    """AlphaPose's file of --format open and cmu, people by the name of their picture; None where it is another."""
-    content = read_json(path, most=2**28)
+    """Read AlphaPose's file of --format open and cmu: people by name of the picture; None for other
+    files.
+    """
+    content = read_json(path, most=BIG)
     kinds = {key for each in content.values() for key in (each if isinstance(each, dict) else ())}
     if len(content) == 0 or not kinds & {"people", "bodies"}:
         return None
-    people, numbered = _Collected(path, _SEPARATE), list[tuple[int, list[list[float]]]]()
+    people, numbers, frames = _Collected(path, _SEPARATE), list[int](), list[int]()
     for name, frame in content.items():
-        place, rerun = f"{path}: {name[:40]!r}", _RERUN[_SEPARATE]
-        number = _number(name, None, place, _SEPARATE)
-        if "bodies" in kinds:
-            flat = [each.joints for each in validated(_Bodies, frame, path, rerun).bodies]
-        else:
-            flat = [each.pose_keypoints_2d or [] for each in validated(_Frame, frame, path, rerun).people]
-        numbered.append((number, [_checked(each, place, _SEPARATE) for each in flat if each]))
-    for _, flat in numbered:
-        people.add(flat)
-    listed = [number for number, _ in numbered]
-    frames = [number for number, flat in numbered for _ in flat]
-    return people.camera(frames, (min(listed), max(listed)), "openpose coco")
+        place = f"{path}: {name[:40]!r}"
+        numbers.append(_number(name, None, place, _SEPARATE))
+        people.add(flat := _people(frame, place, _SEPARATE))
+        frames += [numbers[-1]] * len(flat)
+    return people.camera(frames, (min(numbers), max(numbers)), "openpose coco")
 
 
 def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
-    """A list of people, each with the picture that it is of. Pictures without people are not in it.
+    """Read a list of people, each with the picture to which it belongs. Pictures without people are
+    not listed.
 
-    `others` has the pictures' names when all items have been read.
+    `others` has the names of the pictures after all items have been read.
     """
     path, program, images = people.path, people.program, list[int | str]()
     categories = set[int | str | None]()
     for start, results in people.valid(_RESULTS, items):
         images += [person.image_id for person in results]
         categories |= {person.category_id for person in results}
-        places = (f"{path}: [{index}].keypoints" for index in range(start, start + len(results)))
-        pairs = zip(results, places, strict=True)
-        people.add([_checked(person.keypoints, place, program) for person, place in pairs])
+        people.add([person.flat(f"{path}: [{index}]", program) for index, person in enumerate(results, start)])
     names = _names(others, path, program)
     frames: dict[int | str, int] = {}
     known = [(image, f"[{index}].image_id") for index, image in enumerate(images)]
@@ -478,7 +442,10 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     first: dict[int, int | str] = {}
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
-            problem = f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} are both frame {frame}"
+            problem = (
+                f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} have the same frame"
+                f" number {frame}"
+            )
             raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
     listed = (min(first), max(first)) if first else (0, -1)
     joints = _joints_of_categories(others.get("categories"), categories)
@@ -486,7 +453,7 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
 
 
 def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
-    """The files of the pictures of a COCO data set by their ids, also of those without people."""
+    """File names of the pictures of a COCO data set by id, including pictures without people."""
     names, images = {}, others.get("images")
     for index, image in enumerate(images if isinstance(images, list) else []):
         one = image.get("id") if isinstance(image, dict) else None
@@ -497,20 +464,23 @@ def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | st
 
 
 def _number(image: int | str, name: str | None, place: str, program: str) -> int:
-    """The frame of a picture: the last number in its name, or its id where that is a number and it has no name."""
+    """Frame number of a picture: the last number in its name; without a name, its id, if that is a
+    number.
+    """
     if name is None and isinstance(image, int):
         if 0 <= image < MOST_FRAME:
             return image
-        raise InputError(f"{place} '{image}' is no frame's number; {_RERUN[program]}, of numbered pictures")
+        raise InputError(f"{place} '{image}' is not a frame number; {_RERUN[program]}, of numbered pictures")
     name = str(image) if name is None else name
-    match = _FRAME_NUMBER.search(Path(name).stem) if len(name) <= _LONGEST_NAME else None
-    if match is None or len(match[1]) > len(str(MOST_FRAME)):
+    if (number := last_number(Path(name).stem)) in (None, MOST_FRAME):
         raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
-    return int(match[1])
+    return number
 
 
 def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
-    """A list of frames, each with its people; `others` has `meta_info` when all have been read."""
+    """Read a list of frames, each with its people; `others` has `meta_info` after all items have
+    been read.
+    """
     frames, first, last = list[int](), MOST_FRAME, -1
     for start, found in people.valid(_FRAMES, items):
         rows = list[list[float]]()

@@ -31,7 +31,7 @@ def write_glb(job: Job) -> Written:
     if len(motions) == 0:
         return written
     if job.arrays.pose_blend is not None:
-        written.notes.append("glb: the body's pose-dependent corrections of the skin are left out")
+        written.notes.append("glb: pose-dependent corrections of the body's surface are left out")
     written.add(job.folder / "people.glb", glb_bytes(motions, job.arrays, take.times_s, origin))
     return written
 

@@ -161,8 +161,8 @@ def _write_c3d(
         path = folder / f"{name(None if stop - first <= _MOST else span)}.c3d"
         fits = span[1] < _MOST
         if not fits:
-            counts = f"{path.name} counts its frames from 1, not {span[0] + 1}"
-            written.notes.append(f"{counts}: numbers in C3D end at {_MOST}")
+            counts = f"{path.name} numbers its frames from 1, not {span[0] + 1}"
+            written.notes.append(f"{counts}: frame numbers in C3D are at most {_MOST}")
         written.add(path, c3d_bytes(markers, span[0] if fits else 0, take.fps, part, origin_m))
 
 
@@ -213,7 +213,7 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
     try:
         take = Take.of(people, up)
     except ValueError as error:
-        written.notes.append(f"no TRC and no C3D: {error}")
+        written.notes.append(f"TRC and C3D are not written: {error}")
         return written
     first = project.first_number
     take = replace(take, frames=take.frames + first, times_s=take.times_s + first / take.fps)
@@ -222,7 +222,7 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
         optional("ezc3d", "export")
         even, origin = _c3d_take(written, take)
     except InputError as error:
-        written.notes.append(f"no C3D: {error}")
+        written.notes.append(f"C3D is not written: {error}")
     before = {each.name for each in folder.glob("*.trc")} if folder.is_dir() else set()
     seen = Known.observed(take.people.known)
     chosen = list(range(len(take.persons)))
@@ -242,13 +242,13 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
         written.add(path, trc_text(markers, take.frames, take.times_s, take.fps, path.name))
         holes = int(np.ptp(markers.frames)) + 1 - len(markers.frames)
         if holes > 0:
-            written.notes.append(f"{path.name} leaves out {holes} frames in which nothing is known of the person")
+            written.notes.append(f"{path.name} leaves out {holes} frames without data of the person")
         if even is not None:
             _write_c3d(markers_of(even, person, MarkerSet.OPENSIM), even, folder, name, written, origin)
     left = sorted(before - {each.name for each in written.files})
     if len(left) > 0:
         written.notes.append(
-            f"{folder} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of before; take"
-            " out what the next steps are not to read"
+            f"{folder} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of an earlier run; remove"
+            " the files that other programs should not read"
         )
     return written

@@ -42,7 +42,7 @@ def write_amass(job: Job) -> Written:
         write_atomically(path, lambda stream, columns=columns: write_npz(stream, columns))
         written.files.append(path)
     if job.body is None and len(written.files) > 0:
-        written.notes.append("amass: betas are those of the open body that ships, not SMPL's; poses fit both")
+        written.notes.append("amass: betas are those of the built-in body model, not of SMPL; poses fit both")
     return written
 
 

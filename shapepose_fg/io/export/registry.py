@@ -86,8 +86,8 @@ class Written:
         if origin.any():
             listed = " ".join(f"{each:.0f}" for each in origin)
             self.notes.append(
-                f"{kind}: coordinates are from {listed} m of the world, in the axes of the file ({where}), because"
-                " the format keeps seven digits"
+                f"{kind}: coordinates are relative to {listed} m of the world, in the axes of the file"
+                f" ({where}), because the format keeps seven digits"
             )
         return local, origin
 
@@ -95,7 +95,9 @@ class Written:
         """The take for formats with one rate; frames that have no place at it are noted."""
         even, lost = take.at_one_rate()
         if lost > 0:
-            self.notes.append(f"{lost} frames left out: at {take.fps:g} a second others are nearer to their place")
+            self.notes.append(
+                f"{lost} frames are left out: at {take.fps:g} Hz, other frames are nearer to their times"
+            )
         return even
 
 
@@ -149,7 +151,7 @@ def chosen(names: Sequence[str]) -> list[Format]:
     """The formats of these names, each once, in the order given; InputError for unknown names."""
     for name in names:
         if name not in FORMATS:
-            raise InputError(f"format {name}: there is none of this name; there are {' '.join(FORMATS)}")
+            raise InputError(f"format {name}: must be one of {' '.join(FORMATS)}")
     return [FORMATS[name] for name in dict.fromkeys(names)]
 
 
@@ -209,8 +211,8 @@ def read_take(
         axis: Any = up or (None if rig is None else rig.up)
         if axis is None:
             raise InputError(
-                f"{cameras}: it is not there to say which axis is up: give --up, such as --up z, or write them"
-                " with `people.save(folder, rig)`"
+                f"{cameras}: this file is missing, and it contains the up axis; give --up, such as --up z, or"
+                " write it with `people.save(folder, rig)`"
             )
         people = opened.rows(chosen_rows(opened, path, frames, persons), observations=observations)
     if frames is not None:  # of those that were reconstructed the ones that are asked for

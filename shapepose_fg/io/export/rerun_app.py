@@ -72,7 +72,9 @@ def quiet_viewer() -> list[str]:
     viewer = viewer_file()
     if viewer is None or not switch_off(viewer):
         return []
-    return ["rerun's statistics of use were on and are off now; `rerun analytics enable` switches them on"]
+    return [
+        "rerun's usage statistics were on and have been switched off; `rerun analytics enable` switches them on"
+    ]
 
 
 def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
@@ -80,7 +82,7 @@ def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
     try:
         return job.arrays, []
     except InputError as error:
-        return None, [f"no bodies are drawn ({error})"]
+        return None, [f"bodies are not drawn ({error})"]
 
 
 @contextmanager
@@ -102,7 +104,7 @@ def write_rrd(job: Job) -> Written:
     found, path = Written(), job.folder / "people.rrd"
     take, origin = found.near_origin(job.take, np.eye(3), "rrd", "origin_m of the entity world/origin")
     arrays, notes = body_if_there(job)
-    notes += ["no cameras, for there is no cameras.json"] if take.rig is None else []
+    notes += ["cameras are not drawn, because cameras.json is missing"] if take.rig is None else []
     with written(path, layout_of(take)) as stream:
         log_take(stream, take, arrays)
         if origin.any():
@@ -192,6 +194,6 @@ def switch_off(viewer: str) -> bool:
     except (OSError, ValueError, AttributeError, subprocess.SubprocessError) as error:
         problem = " ".join(str(error).split())
     raise InputError(
-        f"rerun's statistics of use cannot be switched off ({problem}); run `rerun analytics disable`, "
-        "or give --statistics if they may be sent"
+        f"rerun's usage statistics cannot be switched off ({problem}); run `rerun analytics disable`, or give"
+        " --statistics to allow them"
     )

@@ -129,8 +129,8 @@ def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) ->
             continue
         if motion.spread_m > _VISIBLE_M:
             written.notes.append(
-                f"{kind}: person {who} has several shapes, and the mean of them in the file: joints are up to"
-                f" {1e3 * motion.spread_m:.0f} mm from where they were"
+                f"{kind}: person {who} has several body shapes; the file has their mean, which moves joints by"
+                f" up to {1e3 * motion.spread_m:.0f} mm"
             )
         yield who, motion
 

@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.filesize import decimal
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_times import rate_of, typed_rate
+from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS, rate_of, typed_rate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
-from shapepose_fg.core.result_files import free_memory
+from shapepose_fg.core.result_files import check_memory
 from shapepose_fg.core.run_summary import covered_frames
 
 _TO_Y_UP: dict[Axis, list[list[int]]] = {
@@ -37,8 +36,6 @@ _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
 """Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
 _FAR_M = 1000.0
 """Largest coordinate that a float of 32 bits keeps to a tenth of a millimetre, metres."""
-_SHORTEST_S, _LONGEST_S = 1e-6, 1e5
-"""Shortest and longest time between frames, s; outside of these, times have another unit."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +77,11 @@ class Take:
         result without identities is a Take too: a person is then a number within the frame.
         """
         if len(people) == 0:
-            raise ValueError("no people were found, so there is nothing to export")
+            raise ValueError("the result has no people, so there is nothing to export")
         if identities and not people.run.get("configuration", {}).get("temporal", True):
             raise ValueError(
-                "this result is frame by frame, so people cannot be followed; reconstruct with --temporal, "
-                "or export csv or rrd"
+                "this result is frame by frame and has no identities; reconstruct with --temporal, or export"
+                " csv or rrd"
             )
         people = _seen(people) if seen_only else people
         # All frames that were reconstructed, those without people too.
@@ -98,12 +95,12 @@ class Take:
         lost = np.flatnonzero(rows[person, place] != np.arange(len(people)))
         if len(lost) > 0:
             raise ValueError(
-                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; "
-                "correct that with `shapepose-fg tracks`"
+                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; correct them"
+                " with `shapepose-fg tracks`"
             )
         times = _times(people, frames, fps)
         steps = np.diff(times) / np.diff(frames)
-        if len(steps) > 0 and not _SHORTEST_S <= np.median(steps) <= _LONGEST_S:
+        if len(steps) > 0 and not 1 / MOST_FPS <= np.median(steps) <= 1 / LEAST_FPS:
             raise ValueError(f"frames are {np.median(steps):g} s apart by time_s; give --fps")
         rate = rate_of(times) if len(steps) > 0 else typed_rate(fps or _fps_of(people))
         return cls(people, persons.astype(np.int64), rows, frames, times, rate, up, rig)
@@ -141,8 +138,8 @@ class Take:
         step = (self.times_s - self.times_s[0]) * self.fps
         if step[-1] >= _LONGEST:
             raise InputError(
-                f"people.npz: the times run over {self.times_s[-1] - self.times_s[0]:.0f} s, {step[-1]:.0f} frames"
-                f" at {self.fps:g} a second; give --fps, or part of it with --frames"
+                f"people.npz: the times cover {self.times_s[-1] - self.times_s[0]:.0f} s, which is"
+                f" {step[-1]:.0f} frames at {self.fps:g} Hz; give --fps, or a part with --frames"
             )
         place = np.rint(step).astype(np.intp)
         nearest = np.lexsort((np.abs(step - place), place))
@@ -170,18 +167,14 @@ def _moved(rig: Rig, origin: Array) -> Rig:
 
 def _check_memory(persons: int, frames: int) -> None:
     """InputError where joints of all people in all frames, and one person's body, do not fit in memory."""
-    needed, free = frames * (2 * 8 * persons + _BODY_BYTES), free_memory()
-    if free is not None and needed > free:
-        raise InputError(
-            f"people.npz: {persons} people over {frames} frames would take {decimal(needed)} of memory, and"
-            f" {decimal(free)} are free; take some frames or people at a time (--frames, --person)"
-        )
+    what = f"people.npz: {persons} people over {frames} frames"
+    check_memory(what, frames * (2 * 8 * persons + _BODY_BYTES), "--frames, --person")
 
 
 def _seen(people: Reconstruction) -> Reconstruction:
     """The people without joints that no view saw."""
     if not (people.known != Known.UNKNOWN).any():
-        raise ValueError("people.npz does not say how joints are known; leave out --seen-only")
+        raise ValueError("people.npz does not contain how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
     columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
     for names, kept in ((_OF_JOINTS, seen), (BODY, seen.any(axis=1))):
@@ -199,9 +192,9 @@ def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None)
     times = people.time_s[first]
     known, times = known[np.isfinite(times)], times[np.isfinite(times)]
     if len(known) == 0:
-        raise ValueError("people.npz does not say when its frames were taken; give --fps")
+        raise ValueError("people.npz does not contain the times of its frames; give --fps")
     if (np.diff(times) <= 0).any():
-        raise ValueError("time_s does not rise from frame to frame; give --fps")
+        raise ValueError("time_s does not increase from frame to frame; give --fps")
     rate = (known[-1] - known[0]) / (times[-1] - times[0]) if len(known) > 1 else _fps_of(people)
     between = np.interp(frames, known, times)
     return between + (np.minimum(frames - known[0], 0) + np.maximum(frames - known[-1], 0)) / rate
@@ -211,7 +204,7 @@ def _fps_of(people: Reconstruction) -> float:
     """Frame rate according to run.json, Hz."""
     fps = people.run.get("time", {}).get("fps")
     if fps is None or not fps > 0:
-        raise ValueError("one frame does not say how many there are a second; give --fps")
+        raise ValueError("one frame does not determine the frame rate; give --fps")
     return float(fps)
 
 

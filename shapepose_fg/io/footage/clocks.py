@@ -25,7 +25,7 @@ def clocks_of(
     has_clock = any(timed)
     if has_clock and not all(timed):
         name = cameras[timed.index(False)]
-        raise InputError(f"camera {name}: pictures do not say when they were taken; give --fps {name}=RATE")
+        raise InputError(f"camera {name}: the pictures have no times; give --fps {name}=RATE")
     # Pictures of one number belong together: all are counted from the first number that any camera has.
     first = min((each.number[0] for each in footage if each.time_s is None), default=0)
     clocks = []
@@ -47,7 +47,7 @@ def typed_rate(text: str | None) -> float | None:
     if text is None:
         return None
     if not is_number(text) or not 0.01 <= float(text) <= 1e5:
-        raise InputError(f"--fps {text}: must be a number of frames a second, such as 25")
+        raise InputError(f"--fps {text}: must be a frame rate in Hz, such as 25")
     return float(text)
 
 
@@ -57,7 +57,7 @@ def typed_start(text: str | None, period: float, has_clock: bool) -> float:
         return 0.0
     match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())
     if match is None:
-        raise InputError(f"--start {text}: must be seconds such as 0.2s, or the camera's own frames such as 12f")
+        raise InputError(f"--start {text}: must be seconds, such as 0.2s, or frames of the camera, such as 12f")
     if match[2] == "s" and not has_clock:
-        raise InputError(f"--start {text}: nothing says how many frames a second there are; give --fps, or 12f")
+        raise InputError(f"--start {text}: the frame rate is unknown; give --fps, or frames such as 12f")
     return float(match[1]) * (1.0 if match[2] == "s" else period)

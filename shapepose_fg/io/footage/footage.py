@@ -1,7 +1,6 @@
 """The pictures of one camera, frame by frame: from a video, a folder of pictures, or a single picture."""
 
 import os
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_bytes
-from shapepose_fg.io.camera_names import in_order
+from shapepose_fg.io.camera_names import in_order, last_number
 from shapepose_fg.io.footage.places import PICTURES
 
 Picture = NDArray[np.uint8]
@@ -33,7 +32,6 @@ _MOST_BYTES = 2**29
 """Maximum size of a picture's file, bytes."""
 _LARGEST = 16384
 """Longest side of a picture, pixels: a file with a larger one is damaged, or malicious."""
-_LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
 def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
@@ -83,7 +81,9 @@ class Video:
         capture = _capture(path)
         size, fps = glance(path, capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
-            raise InputError(f"{path}: its pictures would be {size[0]} x {size[1]}; give an undamaged video")
+            raise InputError(
+                f"{path}: its pictures would have {size[0]} x {size[1]} pixels; give an undamaged video"
+            )
         announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         stamps = []
         while capture.grab():
@@ -97,8 +97,8 @@ class Video:
         # Files tell of a frame or two that players do not show; more is a file that was cut or damaged.
         if announced - len(stamps) > 2:
             notes.append(
-                f"{path}: only {len(stamps)} of the {announced} frames that the file tells of can be read; it was"
-                " cut or is damaged"
+                f"{path}: only {len(stamps)} of the {announced} frames in its header can be read; the file is"
+                " truncated or damaged"
             )
         return cls(path, size, time_s, tuple(notes))
 
@@ -141,15 +141,19 @@ class PictureFiles:
         if path.is_dir():
             files = [each for each in path.iterdir() if each.suffix.lower() in PICTURES and each.name[0] != "."]
         if len(files) == 0:
-            raise InputError(f"{path}: no pictures in this folder; known are {' '.join(sorted(PICTURES))}")
-        found = [_LAST_NUMBER.search(each.stem) for each in files]
+            raise InputError(
+                f"{path}: there are no pictures in this folder; known formats are {' '.join(sorted(PICTURES))}"
+            )
+        found = [last_number(each.stem) for each in files]
         if path.is_file() or (len(files) == 1 and found[0] is None):
             return cls(path, _size(files[0]), tuple(files), np.zeros(1, dtype=np.intp))
         if None in found:
             unnumbered = files[found.index(None)]
-            raise InputError(f"{unnumbered}: no number in its name says which frame this is; number the pictures")
+            raise InputError(f"{unnumbered}: its name has no frame number; number the pictures")
         pairs = zip(found, files, strict=True)
-        numbers, paths = zip(*in_order([(int(match[0]), file) for match, file in pairs if match]), strict=True)
+        numbers, paths = zip(
+            *in_order([(number, file) for number, file in pairs if number is not None]), strict=True
+        )
         count = numbers[-1] - numbers[0] + 1
         notes = (f"{path}: {count - len(files)} of {count} pictures are missing",) if count > len(files) else ()
         return cls(path, _size(paths[0]), paths, np.array(numbers, dtype=np.intp), notes)
@@ -187,7 +191,7 @@ def _capture(path: Path) -> Any:
         os.environ.pop(_READ_OPTIONS)
         os.environ.update({} if before is None else {_READ_OPTIONS: before})
     if not capture.isOpened():
-        raise InputError(f"{path}: not a video that can be read; give another copy, or convert it to H.264 in MP4")
+        raise InputError(f"{path}: cannot be read as a video; give another copy, or convert it to H.264 in MP4")
     return capture
 
 
@@ -198,16 +202,16 @@ def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
     """
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if fps < 0.01:
-            raise InputError(f"{path}: the video says neither times nor rate; give --fps CAMERA=RATE")
+            raise InputError(f"{path}: the video has neither times nor a frame rate; give --fps CAMERA=RATE")
         return np.arange(len(stamp_s)) / fps, [
-            f"{path}: the frames' times in the file do not rise; its rate of {fps:g} a second was taken instead"
+            f"{path}: the times of frames do not increase; the frame rate of the file, {fps:g} Hz, is used instead"
         ]
     time_s = stamp_s - stamp_s[0]
     steps = np.diff(time_s)
     gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) > 1 else steps
     return time_s, [] if len(gaps) == 0 else [
-        f"{path}: the time from frame to frame varies, {len(gaps)} steps are longer than one and a half frames"
-        f" (the first after frame {gaps[0]}); frames were taken by their times"
+        f"{path}: the time between frames varies: {len(gaps)} steps are longer than one and a half frames (the"
+        f" first after frame {gaps[0]}); the times in the file are used"
     ]
 
 
@@ -215,7 +219,7 @@ def _size(file: Path) -> tuple[int, int]:
     """Return the width and height of a picture, pixels."""
     picture = _decoded(file)
     if picture is None:
-        raise InputError(f"{file}: not a picture that can be read; give an undamaged one")
+        raise InputError(f"{file}: cannot be read as a picture; give an undamaged one")
     return picture.shape[1], picture.shape[0]
 
 

@@ -112,28 +112,31 @@ def place(
     """
     (width, height), (full_width, full_height) = picture_size, calibrated_size
     full = f"{full_width} x {full_height}"
-    sizes = f"camera {name}: the pictures are {width} x {height}, the calibration is for {full}"
+    sizes = f"camera {name}: the pictures have {width} x {height} pixels, but the calibration is for {full}"
     kind, note = wanted, None
     if wanted is PlacementKind.SAME and picture_size != calibrated_size:
-        raise InputError(f"{sizes}: not the same size; give another --image-placement")
+        raise InputError(f"{sizes}; give another --image-placement")
     if wanted is not None or picture_size == calibrated_size:
         kind = wanted or PlacementKind.SAME
     elif max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
         kind = PlacementKind.CROP
         note = (
-            f"{sizes}: the first column and row are taken to be the calibrated ones (--image-placement"
-            f" {name}=crop); if it was cut on both sides, give {name}=crop-centre; if resized, {name}=scale"
+            f"{sizes}: they are assumed to be cropped on the right or at the bottom (--image-placement"
+            f" {name}=crop); if they were cropped on both sides, give {name}=crop-centre; if resized,"
+            f" {name}=scale"
         )
     # Of one shape, to within the rounding of both sides to whole pixels.
     elif abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
         kind = PlacementKind.SCALE
-        note = f"{sizes}, of the same shape: taken as resized (--image-placement {name}=scale)"
+        note = f"{sizes} of the same aspect ratio: they are assumed to be resized (--image-placement {name}=scale)"
     elif (height, width) == calibrated_size:
-        raise InputError(f"{sizes}: the pictures lie on their side; turn the video, or calibrate it as it is")
+        raise InputError(
+            f"{sizes}: the pictures are rotated by 90 degrees; rotate the video, or calibrate it as it is"
+        )
     else:
         raise InputError(
-            f"{sizes}; say what was done to them with --image-placement: letterbox (resized, with bars), scale"
-            " (resized), crop or crop-centre (cut)"
+            f"{sizes}; give --image-placement: letterbox (resized, with bars), scale"
+            " (resized), crop or crop-centre (cropped)"
         )
     return Placement(kind, picture_size, calibrated_size), note
 

@@ -53,8 +53,8 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
     for name, path in named.items():
         if path is None:
             raise InputError(
-                f"--videos: nothing is given for camera {name}; add --videos {name}=PATH, or take the camera out"
-                " of the calibration"
+                f"--videos: there is no footage for camera {name}; add --videos {name}=PATH, or leave the"
+                " camera out with --without"
             )
         if not Path(path).exists():
             raise InputError(f"{path}: there is no such file or folder; check the path")
@@ -72,7 +72,7 @@ def names_of_footage(given: Sequence[str]) -> list[str]:
     offered = [each for each in entries if not each.name.startswith(".") and _is_footage(each)]
     videos = [each for each in offered if each.suffix.lower() in VIDEOS] or offered
     if len(videos) == 0:
-        raise InputError(f"{folder}: no videos or pictures here; give the folder with those of all cameras")
+        raise InputError(f"{folder}: there are no videos or pictures; give the folder with those of all cameras")
     return [each.name if each.is_dir() else each.stem for each in videos]
 
 
@@ -85,7 +85,7 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
             f"{folder}: this is one file; give the folder with the footage of all cameras, or CAMERA=PATH for each"
         )
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; check the path of the videos")
+        raise InputError(f"{folder}: there is no such folder; check the path")
     entries = [each for each in sorted(folder.iterdir()) if not each.name.startswith(".")]
     offered = [each for each in entries if _is_footage(each)]
     names = [each.name if each.is_dir() else each.stem for each in offered]
@@ -93,9 +93,7 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
     for camera, found in zip(cameras, exact, strict=True):
         if len(found) > 1:
             what = " and ".join(path.name for path in found)
-            raise InputError(
-                f"{folder}: {what} could all be camera {camera}'s; give --videos {camera}=PATH for each"
-            )
+            raise InputError(f"{folder}: {what} all match camera {camera}; give --videos {camera}=PATH for each")
     if all(exact):
         return [found[0] for found in exact], []
     if not any(exact):
@@ -108,7 +106,7 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
     missing = next(camera for camera, found in zip(cameras, exact, strict=True) if len(found) == 0)
     holds = listing([path.name for path in offered], "no video, picture or folder of pictures")
     cure = f"name a video or a folder of pictures after each camera, or give --videos {missing}=PATH for each"
-    raise InputError(f"{folder}: nothing here is named after camera {missing}, it holds {holds}; {cure}")
+    raise InputError(f"{folder}: nothing in it is named after camera {missing}; it contains {holds}; {cure}")
 
 
 def _is_footage(path: Path) -> bool:

@@ -155,9 +155,9 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
     yield from placed(math.inf)
     for (camera, frame), count in unplaced.items():
         what = f"frame {frame} has no pose within {LONGEST_GAP_S:g} s"
-        note(f"{file}: {count} pictures of {camera} are left out; {what}")
+        note(f"{file}: {count} pictures of {camera} are left out: {what}")
     if number == 0:
-        raise InputError(f"{file}: there is no detection in it; {_CURE}")
+        raise InputError(f"{file}: there are no detections in it; {_CURE}")
 
 
 def read_frame(file: Path, frame: str, name: str) -> Trajectory:
@@ -170,7 +170,7 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
     known, wanted = frames.moving, frame.lstrip("/")
     if (not wanted and len(known) != 1) or (wanted and not frames.moves(wanted)):
         which = listing(known) if known else "none"
-        raise InputError(f"{file}: frames that move in it are {which}; say which one, {file.name}#FRAME")
+        raise InputError(f"{file}: the moving frames in it are {which}; choose one with {file.name}#FRAME")
     with naming(f"{file}: frame {wanted or known[0]}", "record more"):
         return frames.trajectory(wanted or known[0], name)
 
@@ -183,7 +183,7 @@ def _whole(file: Path, cure: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, TypeError) as error:
-        raise InputError(f"{file}: cannot be read (a message lacks a field: {error}); {cure}") from None
+        raise InputError(f"{file}: cannot be read (field {error} of a message is missing); {cure}") from None
 
 
 def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
@@ -252,6 +252,6 @@ def _unpacked(chunk: Any) -> bytes:
         at, count = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little"), count + 1
         if at > len(data) or count > _MOST_RECORDS:
             raise ValueError(
-                "a record ends behind its chunk" if at > len(data) else "a chunk has too many records"
+                "a record ends beyond its chunk" if at > len(data) else "a chunk has too many records"
             )
     return data

@@ -14,6 +14,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.drawing import bones_of, colour_of
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -36,7 +37,7 @@ _LENSES = {4: "equidistant", 5: "plumb_bob"}
 def nanoseconds(time_s: float) -> int:
     """A time in nanoseconds for the log of an MCAP file; InputError before 1970 and after 2038."""
     if not 0 <= time_s < _LAST_S:
-        raise InputError(f"time {time_s:g} s: ROS's clocks run from 0 to 2^31 s; give times from 0 on")
+        raise InputError(f"time {time_s:g} s: ROS times must be 0 to 2^31 s; give times from 0 on")
     return round(time_s * NS)
 
 
@@ -71,20 +72,17 @@ def body_transforms(rows: Reconstruction, time_s: float) -> Message:
         hips, turn = _hips(rows, n), rows.global_orient[n]
         if np.isfinite(hips).all() and np.isfinite(turn).all():
             R = Rotation.from_rotvec(turn).as_matrix() @ _BODY_FROM_FRONT
-            made.append(_transform(WORLD, f"body_{rows.person[n]}", _matrix(R, hips), time_s))
+            made.append(_transform(WORLD, f"body_{rows.person[n]}", rigid(R, hips), time_s))
     return {"transforms": made}
 
 
 def fixed_transforms(rig: Rig, time_s: float) -> Message:
     """tf2_msgs/TFMessage of static frames: the world in `map`, and cameras in it or on their carriers."""
+    from scipy.spatial.transform import Rotation
+
     up, z = rig.up_vector, np.array([0.0, 0, 1])
-    axis, R = np.cross(up, z), np.eye(3)
-    if axis.any():
-        c = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        R = np.eye(3) + c + c @ c
-    elif up @ z < 0:
-        R = np.diag([1.0, -1, -1])
-    made = [_transform(MAP, WORLD, _matrix(R, np.zeros(3)), time_s)]
+    R = np.diag([1.0, -1, -1]) if up @ z < 0 else Rotation.align_vectors(z, up)[0].as_matrix()
+    made = [_transform(MAP, WORLD, rigid(R, np.zeros(3)), time_s)]
     for camera in rig.cameras:
         parent, pose = (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
         made.append(_transform(parent, optical(camera), pose, time_s))
@@ -161,10 +159,6 @@ def _hips(rows: Reconstruction, n: int) -> Array:
     names = rows.joint_names.tolist()
     at = [names.index(each) for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"]) if each in names]
     return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)
-
-
-def _matrix(R: Array, t: Array) -> Array:
-    return np.vstack([np.column_stack([R, t]), [0, 0, 0, 1.0]])
 
 
 def _transform(parent: str, child: str, pose: Array, time_s: float) -> Message:

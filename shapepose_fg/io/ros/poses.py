@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.trajectory import MOST_VARIANCE, Trajectory
+from shapepose_fg.core.trajectory import MOST_METRES, MOST_VARIANCE, UNIT_LENGTH, Trajectory
 from shapepose_fg.io.ros.definitions import type_name
 from shapepose_fg.io.ros.messages import NS, WORLD, ros_name
 
@@ -18,9 +19,6 @@ _ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"
 KINDS = tuple(map(type_name, (TREE, _WITH_CHILD, *_ALONE)))
 """Messages that hold poses."""
 _STATIC = "tf_static"
-_UNIT = 0.01
-"""Largest deviation of a quaternion's length from 1."""
-_MOST_METRES = 1e6
 _TURN_THEN_WAY = np.array([3, 4, 5, 0, 1, 2])
 """Order of rotation before translation in ROS's covariances, which have translation first."""
 
@@ -98,7 +96,7 @@ class Frames:
         time_s = np.array(sorted(self._told[most])) / NS
         poses, surely, there = self.at(frame, time_s)
         if there.sum() < 2:
-            raise ValueError(f"2 poses are needed, known along {' in '.join(self.chain(frame))} at the same time")
+            raise ValueError(f"2 poses are needed, with {' in '.join(self.chain(frame))} known at the same time")
         says = surely[there].any()
         return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
 
@@ -149,13 +147,11 @@ def frame_of(carrier: str) -> str:
 def _matrix(pose: Array, place: str) -> Array:
     from scipy.spatial.transform import Rotation
 
-    if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > _UNIT:
-        raise InputError(f"{place}: a pose must be finite, its quaternion of length 1; leave it out")
-    if np.abs(pose[:3]).max() > _MOST_METRES:
-        raise InputError(f"{place}: a pose is over {_MOST_METRES:g} m away; write metres")
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = Rotation.from_quat(pose[3:]).as_matrix(), pose[:3]
-    return found
+    if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > UNIT_LENGTH:
+        raise InputError(f"{place}: a pose must be finite, with a quaternion of length 1; leave it out")
+    if np.abs(pose[:3]).max() > MOST_METRES:
+        raise InputError(f"{place}: a pose is more than {MOST_METRES:g} m away; write metres")
+    return rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
 
 
 def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:

@@ -49,7 +49,7 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
     # A run that was killed at its very beginning leaves the manifest's temporary file alone.
     left = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     if not manifest.is_file() and any(not file.name.startswith(f".{_MANIFEST}.") for file in left):
-        raise InputError(f"{folder}: not of a run of this program; move it away, or give another --output")
+        raise InputError(f"{folder}: this is not a run of this program; move it, or give another --output")
     kept = InFolder(folder, _digest(begun))
     if manifest.is_file() and not restart:
         sweep(folder)
@@ -58,8 +58,8 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
             return kept
         if (done := frames_done(output)) > 0:
             raise InputError(
-                f"{folder}: a run was stopped here after {done} frames; go on with --resume, or begin anew with"
-                " --restart"
+                f"{folder}: there is an interrupted run after {done} frames; continue with --resume, or start"
+                " again with --restart"
             )
     end_run(output)
     write_content(manifest, json.dumps(begun, indent=1))
@@ -94,8 +94,8 @@ def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
     name, was, is_now = found
     how = f" ({was} then, {is_now} now)" if max(len(repr(was)), len(repr(is_now))) <= 40 else ""
     raise InputError(
-        f"{folder}: the run that was stopped here had another {_WORDS.get(name, name)}{how}; start it as it was to"
-        " go on, or begin anew with --restart"
+        f"{folder}: the interrupted run had another {_WORDS.get(name, name)}{how}; start it with the same"
+        " options to continue, or start again with --restart"
     )
 
 
@@ -121,7 +121,8 @@ def check_room(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise InputError(
-            f"{folder}: about {decimal(needed)} are needed here, and {decimal(free)} are free; make room, give"
+            f"{folder}: about {decimal(needed)} of disk space are needed, and {decimal(free)} are free; free"
+            " some space, give"
             " another --output, or take a part with --frames"
         )
 
@@ -143,12 +144,13 @@ def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShap
     about = kept.about(_KNOWN)
     with naming(kept.place(_KNOWN), ANEW):
         if not isinstance(about, dict) or not {"names", "body", "sha256"} <= about.keys():
-            raise ValueError("it does not say whose shapes they are")
+            raise ValueError("the persons of its shapes are missing")
         names = np.array([*map(str, about["names"])], dtype=str)
         known = SubjectShapes(names, *(kept.array(_KNOWN, name) for name in _ARRAYS), body=str(about["body"]))
     if now not in (about["sha256"], *map(kept.about, kept.names(_WRITTEN))):
         raise InputError(
-            f"{file}: this has changed since the run was stopped; begin anew with --restart to use what it holds"
+            f"{file}: this file has changed since the run was interrupted; start again with --restart to use"
+            " its new content"
         )
     return known
 

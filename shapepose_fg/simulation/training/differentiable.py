@@ -124,17 +124,6 @@ def positions(points: SkinnedPoints, state: State) -> Tensor:
     return still + torch.einsum("bjxy,bkyj->bkx", torch.stack(world, 1), terms)
 
 
-def exp_so3(axis_angle: Tensor) -> Tensor:
-    """Rotation matrices of axis-angle vectors in radians, any norm; (..., 3) -> (..., 3, 3) (Rodrigues)."""
-    angle = torch.linalg.vector_norm(axis_angle, dim=-1, keepdim=True)[..., None]
-    first = torch.sinc(angle / torch.pi)  # sin(t) / t, which torch has exact at 0
-    second = 0.5 * torch.sinc(angle / (2 * torch.pi)).square()  # (1 - cos(t)) / t^2 without cancellation
-    x, y, z = axis_angle.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-    return torch.eye(3, dtype=axis_angle.dtype) + first * cross + second * (cross @ cross)
-
-
 def inverse_3x3(matrix: Tensor) -> Tensor:
     """Inverses (..., 3, 3) by cross products of the rows; a singular matrix gives infinities, not an error.
 

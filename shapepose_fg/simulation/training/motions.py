@@ -3,7 +3,7 @@
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
-from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
+from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 
 Split = Literal["train", "validation", "test"]
@@ -77,36 +78,24 @@ def split_of(subject: str) -> Split:
 
 
 @dataclass(frozen=True)
-class Motions:
+class Motions(Table):
     """Poses of many people in SMPL's structure: N frames of S recordings.
 
     Collars that were not recorded follow the arms as they do in the simulator; unrecorded wrists, toes and hands
     are zero. World frame: y up, SMPL's own.
     """
 
-    poses: NDArray[np.float32]
+    poses: Annotated[NDArray[np.float32], Column("N 24 3", np.float32)]
     """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
-    weight: Array
+    weight: Annotated[Array, Column("N")]
     """(N,) weight of each frame, at most 1: recordings, subjects and walking are capped within their split."""
-    subject: NDArray[np.str_]
+    subject: Annotated[NDArray[np.str_], Column("N", np.str_)]
     """(N,) recorded subject."""
 
     def __post_init__(self) -> None:
-        N = len(self.poses)
-        expected = {"poses": (N, 24, 3), "weight": (N,), "subject": (N,)}
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} must be {shape}, got {getattr(self, name).shape}")
+        super().__post_init__()
         if not np.isfinite(self.poses).all():
             raise ValueError("poses must be finite: leave frames that were not recorded out")
-
-    def __len__(self) -> int:
-        """Count of frames, N."""
-        return len(self.poses)
-
-    def rows(self, index: Index | Mask) -> "Motions":
-        """The frames `index`, indices or a mask."""
-        return Motions(*(value[index] for value in vars(self).values()))
 
     def of(self, split: Split) -> "Motions":
         """The frames of the subjects of one part."""

@@ -18,6 +18,7 @@ from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.weights import FitterWeights
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
@@ -25,7 +26,6 @@ from shapepose_fg.simulation.training.differentiable import (
     DescentTargets,
     State,
     TrainedNetwork,
-    exp_so3,
     inverse_3x3,
     positions,
     unroll,
@@ -104,11 +104,10 @@ class PeopleSource:
         exchanged = torch.rand(count, generator=generator) < self.config.exchange
         part = _CHAINS[torch.randint(len(_CHAINS), (count,), generator=generator)] & exchanged[:, None]
         pose = torch.where(part[..., None], other, pose)
-        local = exp_so3(pose)
         shake = self.config.shake_rad * torch.randn(count, 24, 3, generator=generator)
         shake[:, 0] = 0
         betas = torch.randn(count, 10, generator=generator).clamp(-3, 3)
-        local = local @ exp_so3(shake)
+        local = _tensor(exp_so3(pose.numpy()) @ exp_so3(shake.numpy()))
         state = State(betas, local, _tensor(self._frame.transl).expand(count, 3))
         return People(state, positions(self.model.points, state))
 

@@ -9,12 +9,10 @@ import numpy as np
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.run_summary import MOST_FRAMES
 from shapepose_fg.io.footage.footage import Footage, open_footage
 from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, placements_of, read_used_footage
 from shapepose_fg.io.footage.places import find_footage
-
-_MOST_FRAMES = 10_000_000
-"""Maximum number of frames: larger numbers in the names of pictures are not those of frames."""
 
 
 def pictures_of(
@@ -92,7 +90,7 @@ def _counted(footage: Footage, numbered: bool) -> Index:
     """(T,) the picture of each frame, -1 where one is missing: by its number, or counted from the first."""
     first = 0 if numbered else int(footage.number[0])
     count = int(footage.number[-1]) - first + 1
-    if count > _MOST_FRAMES:
+    if count > MOST_FRAMES:
         raise InputError(
             f"{footage.path}: pictures are numbered from {footage.number[0]} to {footage.number[-1]}; number them"
             " by the frames of the recording"

@@ -12,6 +12,7 @@ from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
@@ -19,7 +20,7 @@ from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 pytest.importorskip("torch", reason='needs pip install "shapepose-fg[train]"')
 import torch
 
-from shapepose_fg.simulation.training.differentiable import TrainedNetwork, exp_so3, inverse_3x3, positions, unroll
+from shapepose_fg.simulation.training.differentiable import TrainedNetwork, inverse_3x3, positions, unroll
 from shapepose_fg.simulation.training.train import (
     INSIDE,
     PeopleSource,
@@ -172,14 +173,14 @@ def test_half_of_the_people_are_mirrored_and_some_have_a_limb_of_another(frame):
     poses = np.concatenate((recorded.poses, mirrored))
     source = PeopleSource(recorded, BodyModel.default(), frame, still)
     local = source.draw(200, torch.Generator().manual_seed(0)).state.local
-    apart = (local[:, None] - exp_so3(torch.from_numpy(poses))).abs().amax(dim=(2, 3, 4)).numpy()
+    apart = (local[:, None] - torch.from_numpy(exp_so3(poses))).abs().amax(dim=(2, 3, 4)).numpy()
     assert (apart.min(axis=1) < 1e-6).all()
     assert (apart.argmin(axis=1) == 0).mean() == pytest.approx(0.5, abs=0.11)  # three sigma of 200 coins
     assert [MIRROR_JOINTS[joint] for joint in MIRROR_JOINTS] == list(range(24))
     assert SMPL_24[MIRROR_JOINTS[SMPL_24.index("left_elbow")]] == "right_elbow"
     mixed = PeopleSource(recorded, BodyModel.default(), frame, replace(still, exchange=1.0))
     local = mixed.draw(200, torch.Generator().manual_seed(0)).state.local
-    apart = (local[:, None] - exp_so3(torch.from_numpy(poses))).abs().amax(dim=(3, 4)).numpy()
+    apart = (local[:, None] - torch.from_numpy(exp_so3(poses))).abs().amax(dim=(3, 4)).numpy()
     joints_of_another = (apart > 1e-6).sum(axis=2).min(axis=1)
     assert set(joints_of_another) == {0, 4}  # one whole arm or leg, or one's own by chance
 

@@ -1,11 +1,12 @@
 """The check of a set-up on a terminal of 80 columns: sentences, a row for each camera, how pairs agree."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from shapepose_fg.cli.terminal import table
 from shapepose_fg.setup_check.report import CameraFigures, CameraUse, PairFigures, SetupReport
 
 _WIDE = 12
@@ -21,9 +22,9 @@ def setup_report(report: SetupReport) -> RenderableType:
     return Group(*parts)
 
 
-def use_table(uses: Sequence[CameraUse]) -> Table:
+def use_table(uses: Sequence[CameraUse]) -> RenderableType:
     """A row for each camera of a reconstruction."""
-    return _table(
+    return table(
         ("camera", "offered", "used", "error px", "mm", "used px", "left out px", "mm"),
         (
             (
@@ -38,6 +39,10 @@ def use_table(uses: Sequence[CameraUse]) -> Table:
             )
             for each in uses
         ),
+        caption=(
+            "error: median / 90 % of all detections given to people, before gates; used: after; left out: median,"
+            " from where the other cameras alone put the joint"
+        ),
     )
 
 
@@ -45,17 +50,17 @@ def _sentences(report: SetupReport) -> RenderableType:
     """What is wrong, a paragraph each."""
     if len(report.warnings) == 0:
         return Text(f"Nothing looks wrong in the {report.frames} frames that were looked at.", style="green")
-    table = Table.grid(padding=(0, 1))
-    table.add_column(style="bold yellow")
-    table.add_column()
+    listed = Table.grid(padding=(0, 1))
+    listed.add_column(style="bold yellow")
+    listed.add_column()
     for number, words in enumerate(report.warnings, start=1):
-        table.add_row(f"{number}.", f"{words}.")
-    return table
+        listed.add_row(f"{number}.", f"{words}.")
+    return listed
 
 
 def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
     """How each camera fits."""
-    table = _table(
+    return table(
         ("camera", "people", "shared", "error px", "mm", "left out px", "mm", "fits", "late"),
         (
             (
@@ -71,19 +76,18 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
             )
             for each in cameras
         ),
+        caption=(
+            "people: seen in the frames that were looked at; shared: with another camera; error: median / 90 % of"
+            " joints, from where all cameras together put them; left out: median, from where the others alone put"
+            " them; fits: people of the others who are matched so; late: frames."
+        ),
     )
-    note = (
-        "people: seen in the frames that were looked at; shared: with another camera; error: median / 90 % of"
-        " joints, from where all cameras together put them; left out: median, from where the others alone put"
-        " them; fits: people of the others who are matched so; late: frames."
-    )
-    return Group(table, Text(note, style="dim"))
 
 
 def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> RenderableType:
     """How pairs of cameras agree: the share of the people that both see who fit."""
     of = {(pair.first, pair.second): pair for pair in pairs}
-    table = _table(
+    return table(
         ("agree", *(_short(each.camera) for each in cameras[1:])),
         (
             (
@@ -93,18 +97,8 @@ def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> Re
             )
             for row, first in enumerate(cameras[:-1])
         ),
+        caption="people seen by both at once who are one; how far rays miss, px",
     )
-    return Group(table, Text("people seen by both at once who are one; how far rays miss, px", style="dim"))
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> Table:
-    """A table without lines, its first column flush left."""
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for column, name in enumerate(heads):
-        table.add_column(Text(name), justify="right" if column > 0 else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(*(Text(each) if isinstance(each, str) else each for each in row))
-    return table
 
 
 def _cell(pair: PairFigures) -> Text:
