@@ -24,7 +24,7 @@ _MOST_VALUES = 2**29
 """Maximum number of values in a file: as many as one hour of four cameras with MediaPipe's 553
 points at 30 Hz."""
 _SMALL_BYTES = 2**27
-"""Size of an array, bytes, up to which its compression ratio is not limited."""
+"""Total size of a file's arrays, bytes, up to which the compression ratio is not limited."""
 _MOST_CAMERAS = 1000
 _MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
 _TABLE = "df_with_missing/table"
