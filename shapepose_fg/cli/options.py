@@ -200,7 +200,9 @@ class DetectionOptions(CameraOptions):
         return found
 
     def still_rig(self, what: str) -> "Rig":
-        """The cameras, which must be fixed because `what` requires it; InputError if one moves."""
+        """The cameras, which must be fixed; InputError if one moves. `what` names the command or
+        step that requires it.
+        """
         found = self.rig()
         moving = next((camera.name for camera in found.cameras if camera.carrier), None)
         if moving is not None:

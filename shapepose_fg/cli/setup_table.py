@@ -88,7 +88,9 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
 
 
 def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> RenderableType:
-    """Agreement of camera pairs: the share of the people seen by both whose positions match."""
+    """Agreement of camera pairs: of the people seen by both cameras, the share with matching
+    positions.
+    """
     of = {(pair.first, pair.second): pair for pair in pairs}
     return table(
         ("agree", *(_short(each.camera) for each in cameras[1:])),

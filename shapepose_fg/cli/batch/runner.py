@@ -112,7 +112,9 @@ class BatchRunner:
                     self._done(leader, found, batch_status)
 
     def _next(self, batch_status: BatchStatus, leaders: "Sequence[Leader]") -> Entry | None:
-        """The recording to start next; recordings whose predecessor failed are set to failed."""
+        """The recording to start next; if the predecessor of a recording failed, its status is set
+        to failed.
+        """
         led = {leader.assignment.name for leader in leaders}
         found: list[Entry] = []
         for entry in self.entries:

@@ -37,7 +37,7 @@ class CameraPage:
     time_s: Array
     """(T,) times of the frames, seconds."""
     skeleton: Skeleton
-    """Skeleton to whose core joints `points` belong."""
+    """Skeleton; `points` are its core joints."""
     heads: Sequence[str]
     """Column headings of the table of cameras."""
     rows: Sequence[tuple[str, Sequence[str]]]
