@@ -62,7 +62,7 @@ def estimate_offsets(
 def kept_offsets(
     kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """The offsets that a run stored when it began; `offsets_of` where it has none yet."""
+    """The offsets stored when the run began; `offsets_of` if there are none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         with naming(kept.place(_OFFSETS), ANEW):
@@ -120,8 +120,8 @@ def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: N
 def offsets_of(
     setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """The offsets of the detector's joints; None where there is no source. ValueError where a file does not
-    fit.
+    """Offsets of the detector's joints; None without a source. Raises ValueError for an unsuitable
+    file.
     """
     config, rig, fitter = setup.config, setup.rig, setup.fitter
     source = config.offsets.source
