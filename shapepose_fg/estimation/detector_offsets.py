@@ -23,14 +23,15 @@ _MAX_SIGMA_M = 0.03
 
 @dataclass(frozen=True)
 class OffsetConfig(Settings):
-    """Whether, and from what, the difference between the detector's joints and the body's is learnt, and how large
-    the detector's errors are (`noise_law`).
+    """Source of the detector's joint offsets and noise law.
+
+    Offsets are the difference between the detector's joints and the body's.
     """
 
     source: str = "recording"
-    """"recording": learnt from the recording itself; "none": there is none, and errors are the usual ones; else
-    a file that holds offsets: the run.json of another recording by the same detector, from which the errors are
-    taken, too, or what `KeypointOffsets.save` wrote."""
+    """"recording" learns both from the recording itself. "none" uses no offsets, and the shipped noise
+    law. Otherwise it is a file with offsets: the run.json of another recording with the same
+    detector, which also has a noise law, or a file from `KeypointOffsets.save`."""
     frames: Annotated[int, Interval(ge=1, le=10000)] = 30
     """Number of frames, spread over the whole recording, for estimating offsets."""
     replaced: ClassVar[dict[str, str]] = dict.fromkeys(

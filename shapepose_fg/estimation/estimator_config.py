@@ -99,4 +99,4 @@ class EstimatorConfig:
     joints: tuple[str, ...] = BODY_25.joints
     """Names of the detector's joints, for motion, sigmas and limbs."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """How far the detector's joints lie from the true ones, for covariances; weights are `observations`'."""
+    """The detector's noise law, for covariances only. Weights come from `observations`."""

@@ -230,7 +230,7 @@ def linearise(
 
 
 def information_by_view(evidence: ViewEvidence, sigmas: Array, views: Views, config: ObservationConfig) -> Array:
-    """(N, J, V, 3, 3) what each observation says of its joint, robust weight included, 1/m²; zero for others."""
+    """(N, J, V, 3, 3) information of each used observation, times its robust weight, 1/m²; else zero."""
     _, _, slope = views.project(np.nan_to_num(evidence.points))
     used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
     sigma = np.where(used, sigmas, 1.0)

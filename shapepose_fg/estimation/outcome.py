@@ -142,10 +142,11 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
 
 
 def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
-    """Covariances (N, J, 3, 3) with all doubts, as large as the detector's errors make them.
+    """Covariances (N, J, 3, 3) of the joints `X` with all uncertainty, for the detector's noise law.
 
-    `covariance` is that of the graph, errors that last in it; `final` what the views say around the joints `X`.
-    Those of rows that stand alone are no smaller than the graph's.
+    `covariance` is that of the graph, with correlated errors, and `final` the linearised
+    observations at `X`. In rows without temporal factors, the result is not smaller than
+    `covariance`.
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
     config, alone = state.config.observations, np.ones(len(X), dtype=bool)

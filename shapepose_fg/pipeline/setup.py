@@ -55,7 +55,7 @@ class Setup:
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """How far the detector's joints lie from the true ones."""
+    """The detector's noise law."""
     estimator: EstimatorConfig = field(init=False)
     """Settings of stage II, with the motion model itself, which other processes need not know by
     name."""

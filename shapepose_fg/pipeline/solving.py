@@ -44,7 +44,7 @@ class Solver:
     fitter: BodyFitter
     """Fits bodies, with the detector's offsets (`run["keypoint_offsets"]`)."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """How far the detector's joints lie from the true ones (`run["noise_law"]`)."""
+    """The detector's noise law (`run["noise_law"]`)."""
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, run_file: Path = Path("run.json")) -> "Solver":
