@@ -53,8 +53,8 @@ class Relative:
     t: Array
     """(3,) direction of the translation, of length one."""
     score: float
-    """Share of the common sightings that are matched, weighted by their residuals: 1 for all without error, 0
-    for none."""
+    """Share of the common sightings that are matched, weighted by their residuals. It is 1 if all match
+    with zero residual, and 0 if none match."""
     seconds: float
     """Person-seconds that are matched."""
     covariance: Array

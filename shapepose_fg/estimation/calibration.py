@@ -91,9 +91,9 @@ class Calibration:
     """Factor on the feature of this name: probability that two limbs that fit both bodies are
     exchanged."""
     person: float
-    """Covariances are multiplied by the exponential of this times `Clues.person`: for a person of
-    large overall uncertainty, detections are more often another person's, without further
-    evidence."""
+    """Covariances are multiplied by the exponential of this times `Clues.person`. If the overall
+    uncertainty of a person is large, its detections more often belong to another person, and no
+    other feature shows this."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":

@@ -15,7 +15,7 @@ class FactorEvidence:
     """Information about a joint from one user factor."""
 
     name: str
-    """Name of the function that created it."""
+    """Name of the function that created the factor."""
     others: tuple[tuple[int, int, int], ...]
     """Joints that it connects this one to: person, joint and frame of each."""
     information: Array

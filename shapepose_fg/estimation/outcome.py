@@ -124,9 +124,9 @@ def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:
-    """The returned bodies: with user factors, fitted to the solved joints.
+    """The bodies to return. For people with user factors, they are fitted to the solved joints.
 
-    So the bodies follow these factors. Joints and covariances are final and not affected.
+    In this way, the bodies follow these factors. Joints and covariances are final and not affected.
     """
     fit = state.fit
     chosen = [

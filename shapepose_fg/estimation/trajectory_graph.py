@@ -61,8 +61,10 @@ _LEAST = np.diag([1e-6**2] * 3 + [1e-5**2] * 3)
 
 
 def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
-    """Number of correlated errors of a detection that count as one, over joints and over frames
-    `step_s` apart, if poses within `over_s` are known relative to each other better than by people.
+    """Number of correlated detection errors that count as one independent error.
+
+    Errors are correlated between joints, and between frames, which are `step_s` apart. `over_s` is
+    the time within which odometry gives relative poses more accurately than people do.
     """
     lags = np.arange(1, max(int(over_s / step_s), 1) + 1) * step_s
     lasting = sum(share * np.exp(-lags / lasts).sum() for share, lasts in _ERRORS)

@@ -52,9 +52,9 @@ class UserFactor:
 
     factor: gtsam.NonlinearFactor
     keys: tuple[int, ...]
-    """Its variables: states of joints of people in the window, and user variables."""
+    """Variables of the factor: states of joints of people in the window, and user variables."""
     name: str
-    """Name of the function that created it."""
+    """Name of the function that created the factor."""
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Ties:
     people: list["WindowGraph"]
     """The people in this graph."""
     factors: list[UserFactor] = field(default_factory=list)
-    """The user factors on them."""
+    """The user factors that couple these people."""
     start: gtsam.Values = field(default_factory=gtsam.Values)
     """Initial values of user variables."""
     parts: list[frozenset[tuple[int, int]]] = field(default_factory=list)

@@ -55,22 +55,26 @@ def reconstruct(
     extra_factors: ExtraFactors | None = None,
     execution: Execution | None = None,
 ) -> Reconstruction:
-    """Reconstruct the people of a recording over time; with `config.temporal` false, each frame separately.
+    """Reconstruct the people of a recording over time, or each frame separately.
 
-    `frames` picks frames of the recording (all of them by default). `times` are the times of the frames; without
-    it 30 frames a second are assumed, and `run` says so. `cuts` are first frames after cuts: nothing carries over
-    to them, and identities do not either. `shapes` are people known from other recordings. `fitter` replaces the
-    body fitter. `extra_factors`, one function or several, adds factors of your own to every person's window; they
-    may connect people (docs/extending.md), and `run` has their number. Where cameras move, their trajectories are
-    refined first, unless `refine_trajectories` has done so. `Trusted(detections, check_setup(detections,
-    rig).trust)` leaves out cameras that contradict the others. `execution` sets how the work is executed:
+    Frames are separate if `config.temporal` is false.
+
+    `frames` selects frames of the recording (default: all). `times` are the times of the frames.
+    Without it, 30 frames per second are assumed, and `run` says so. `cuts` are the first frames
+    after cuts. No states or identities are carried over a cut. `shapes` are people known from other
+    recordings. `fitter` replaces the body fitter. `extra_factors`, one function or several, adds
+    your own factors to every person's window; they may connect people (docs/extending.md), and
+    `run` has their number. Trajectories of moving cameras are refined first, unless
+    `refine_trajectories` has done so. `Trusted(detections, check_setup(detections, rig).trust)`
+    leaves out cameras that contradict the others. `execution` sets how the work is executed:
     processes, a cluster, chunks, and a callback for progress.
 
-    In the result `person` is an identity over time (in separate frames, the number of a person within the frame).
-    Its `run` has the configuration, versions, seconds per stage (over all processes), numbers of people that were
-    found and dropped, with reasons, and offsets of the detector's joints from the body's. These are estimated from
-    frames spread over the whole recording, whatever `frames` picks; a fitter of your own takes part if it has a
-    `model`. ValueError where an argument does not fit the recording.
+    In the result, `person` is an identity over time. If each frame is reconstructed separately, it
+    is the number of a person within the frame. `run` has the configuration, versions, seconds per
+    stage (over all processes), numbers of people found and dropped, with reasons, and offsets of
+    the detector's joints from the body's. The offsets are estimated from frames spread over the
+    whole recording, whatever `frames` selects; with your own fitter only if it has a `model`.
+    Raises ValueError for an argument that does not fit the recording.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)

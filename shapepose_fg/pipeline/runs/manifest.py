@@ -26,7 +26,8 @@ from shapepose_fg.pipeline.runs.parts import Parts
 PARTS = "parts"
 """Folder of an unfinished run, next to its results."""
 _GONE = ".parts-gone"
-"""Its name during removal; an interrupted removal is then not mistaken for an unfinished run."""
+"""Name of this folder while it is removed, so that an interrupted removal is not mistaken for an
+unfinished run."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
 _LOOKED_AT = 200

@@ -50,9 +50,9 @@ class Part:
     rows: Reconstruction
     """Rows of the window; a person is a track, or in separate frames a number within the frame."""
     notes: Notes
-    """Notes about it."""
+    """Notes about the window."""
     checkpoint: Checkpoint | None = None
-    """State for continuing tracking after it, if known."""
+    """State for continuing tracking after the window, if known."""
 
 
 class Parts:
@@ -130,7 +130,7 @@ class Parts:
         self.kept.drop(_name(n))
 
     def notes(self) -> Notes:
-        """Notes about all of them."""
+        """Notes about all windows."""
         notes = Notes()
         for n in range(len(self)):
             with naming(self.kept.place(_name(n)), ANEW):
