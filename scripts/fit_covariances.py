@@ -9,7 +9,8 @@ one and by none have fixed shares in it, and errors beyond `FAR` have little inf
 outliers without any feature that predicts them do not widen all covariances. Finally, all
 covariances are scaled so that 95 % regions have nominal coverage for people of every association
 uncertainty: the errors have heavier tails than a Gaussian, the more so the more uncertain a person
-is.
+is. The detector's noise law that ships (`estimation/noise_law.py`) is the mean of what is
+learnt from these recordings.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import torch
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import WEIGHTS, Calibration, Clues
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -61,13 +63,27 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="JSON file to be written")
     arguments = parser.parse_args()
     mocap = Mocap.load(arguments.mocap)
-    found = [pair for case in CASES for pair in errors(*case, mocap)]
-    arguments.output.write_text(json.dumps(fitted(found), indent=1) + "\n", encoding="utf-8")
+    laws = list[NoiseLaw]()
+    found = [pair for case in CASES for pair in errors(*case, mocap, laws)]
+    content = fitted(found) | {"noise": mean_law(laws)}
+    arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> Iterator[tuple[Clues, np.ndarray]]:
+def mean_law(laws: list[NoiseLaw]) -> dict:
+    """The mean noise law of recordings: what ships."""
+    weights = np.array([law.count for law in laws]) + 1e-6
+    squared, gross = (
+        np.average(values, axis=0, weights=weights)
+        for values in (np.square([law.times for law in laws]), [law.gross for law in laws])
+    )
+    return NoiseLaw(tuple(np.sqrt(squared).round(2).tolist()), tuple(gross.round(3).tolist())).as_dict()
+
+
+def errors(
+    name: str, split: Split, seed: int, cameras: int, mocap: Mocap, laws: list[NoiseLaw]
+) -> Iterator[tuple[Clues, np.ndarray]]:
     """For each window of a recording, the features of its joints, and their errors (N, J, 3),
-    metres; NaN for false positives.
+    metres; NaN for false positives. Its noise law is appended to `laws`.
     """
     if name == "two":
         scene = built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
@@ -79,7 +95,8 @@ def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> It
     truly = Calibration.covariance
     with patch.object(Calibration, "covariance", lambda self, clues: seen.append(clues) or truly(self, clues)):
         times = FrameTimes.from_fps(FPS, len(detections))
-        reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
+        people = reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
+    laws.append(NoiseLaw.from_dict(people.run["noise_law"]))
     for clues in seen:
         found, true = match_people(clues.frame, clues.joints, scene.keypoints), np.full(clues.joints.shape, np.nan)
         true[found.row] = scene.keypoints[found.frame, found.person]

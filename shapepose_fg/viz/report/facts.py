@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.pipeline.config import PipelineConfig
 
 Run = Mapping[str, Any]
@@ -27,6 +28,7 @@ def told_by(run: Run) -> dict[str, Any]:
         "body": run.get("body"),
         "time": _time(objects(run.get("seconds"))),
         "configured": isinstance(run.get("configuration"), dict),
+        "noise": _noise(objects(run.get("noise_law"))),
         "over_time": bool(objects(run.get("configuration")).get("temporal", True)),
         "changed": _changed_settings(run),
         **{
@@ -68,6 +70,20 @@ def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
     counts = {reason: number(count) for reason, count in reasons.items()}
     told = [(reason, int(count)) for reason, count in counts.items() if count is not None]
     return [(reason, count, _frames_words(frames.get(reason))) for reason, count in told]
+
+
+def _noise(told: Run) -> list[tuple[float, float, float, float, int]]:
+    """Table of the detector's noise law, with a row for each range of scores that had detections.
+
+    Columns are the middle of the range, the standard deviation, mm, that of the shipped law, mm, the
+    share of gross errors, and the number of detections.
+    """
+    try:
+        law, usual = NoiseLaw.from_dict(told).as_dict(), NoiseLaw.shipped().as_dict()
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return []
+    columns = law["score"], law["sigma_mm"], usual["sigma_mm"], law["gross"], law["count"]
+    return [row for row in zip(*columns, strict=True) if row[-1] > 0]
 
 
 def _probabilities(listed: object) -> dict[int, float]:
