@@ -1,8 +1,9 @@
 """GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors, motion,
 contact.
 
-Only GTSAM and NumPy. A builder takes keys, arrays and noise and returns native `gtsam.NonlinearFactor`s for
-a graph of your own. Units: metres in the world, pixels in the image; cameras look along +z, x right, y down.
+Only GTSAM and NumPy. Builders take keys, arrays and noise, and return native
+`gtsam.NonlinearFactor`s for a graph of your own. Units: metres in the world, pixels in the image;
+cameras look along +z, x right, y down.
 """
 
 from factors.body_prior import body_prior_factor, body_prior_factors

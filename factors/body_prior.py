@@ -1,4 +1,4 @@
-"""A body model pulls a joint: a native Gaussian prior on its position, with covariance.
+"""Prior of a body model on a joint: a native Gaussian prior on its position, with covariance.
 
 Residual, in metres in the world (Eq. 3):
 
@@ -21,7 +21,7 @@ def body_prior_factor(
     sigma_m: float | None = None,
     kernel: Kernel | None = None,
 ) -> gtsam.NoiseModelFactor:
-    """The body model expects the joint `key` at `mean` (3,), metres.
+    """Gaussian prior of a body model on the joint `key`, with `mean` (3,), metres in the world.
 
     Give either its `covariance` (3, 3), metres squared, or one `sigma_m` for all axes.
     """
@@ -54,6 +54,6 @@ def body_prior_factors(
         raise ValueError("a mean holds a value that is not finite: give no prior to such a joint")
     check_covariances(matrices)
     make = noiseModel.Gaussian.Covariance
-    # check_covariances did what GTSAM's own smart check would do for each matrix.
+    # GTSAM would check each matrix again; check_covariances has already done it.
     models = [robust(make(matrix), kernel) for matrix in matrices]
     return list(map(gtsam.PriorFactorPoint3, key_list.tolist(), points, models))

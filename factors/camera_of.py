@@ -1,4 +1,6 @@
-"""The camera of a native factor, found from what it projects: GTSAM does not tell it."""
+"""Recovers the camera of a native projection factor from its projections, because GTSAM's Python
+interface does not expose it.
+"""
 
 from collections.abc import Callable
 
@@ -12,15 +14,18 @@ Array = NDArray[np.float64]
 Camera = gtsam.PinholeCameraCal3_S2
 
 _LEAST, _TRIED = 16, 4000
-"""Visible points that the fit needs, and the most points that are tried, ever farther away."""
+"""Minimum number of visible points for the fit, and maximum number of points that are tried, at
+increasing distances."""
 _STEP = 1e-6
 _EXACT_PX = 1e-10
 
 
 def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | None:
-    """The pinhole camera that projects points (3,) as `pixel` does, which gives None for a point behind it.
+    """Estimate the pinhole camera from `pixel`, a function that projects a point (3,) to (2,)
+    pixels, or returns None for a point behind the camera.
 
-    Points around `near` (3,) are looked at. None where no such camera does, to 1e-10 of a picture's size.
+    Points around `near` (3,), metres, are projected. Returns None if no pinhole camera reproduces
+    the pixels to 1e-10 of the picture's size.
     """
     rng, points, pixels = np.random.default_rng(0), list[Array](), list[Array]()
     for count in range(_TRIED):
@@ -47,7 +52,9 @@ def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | N
 
 
 def _linear(X: Array, uv: Array) -> Array:
-    """(3, 4) K [R | t], but for a factor, with what makes u (p3 . X) - p1 . X and the like zero."""
+    """(3, 4) projection matrix K [R | t], up to scale, by the direct linear transform from points
+    `X` (M, 3) and pixels `uv` (M, 2).
+    """
     middle, size = X.mean(axis=0), X.std()
     centre, spread = uv.mean(axis=0), uv.std()
     to_world = np.diag([1 / size] * 3 + [1.0])
@@ -63,7 +70,9 @@ def _linear(X: Array, uv: Array) -> Array:
 
 
 def _of_matrix(P: Array) -> Camera:
-    """Lens and pose: the rows of P[:, :3] = K R, from the last one up."""
+    """Decompose a projection matrix (3, 4) into intrinsics and pose, by an RQ decomposition of P[:,
+    :3] = K R from the last row up.
+    """
     Q, L = np.linalg.qr(P[::-1, :3].T)
     signs = np.where(np.diag(L) < 0, -1.0, 1.0)
     K, R = (L.T * signs)[::-1, ::-1], (Q * signs).T[::-1]
@@ -72,7 +81,9 @@ def _of_matrix(P: Array) -> Camera:
 
 
 def _scales(camera: Camera) -> Array:
-    """(11,) about how large a change of each of K's five numbers, the turn and the place is: px, rad, m."""
+    """(11,) typical magnitude of a change of the five entries of K (px), the rotation (rad) and the
+    position (m).
+    """
     return np.array([camera.calibration().fx()] * 5 + [1.0] * 6)
 
 
@@ -82,7 +93,7 @@ def _moved(camera: Camera, change: Array) -> Camera:
 
 
 def _seen(camera: Camera, X: Array) -> Array:
-    """(M, 2) pixels of points (M, 3)."""
+    """(M, 2) pixels of points (M, 3) projected by the camera."""
     cTw = np.linalg.inv(camera.pose().matrix())
     ends = (X @ cTw[:3, :3].T + cTw[:3, 3]) @ camera.calibration().K().T
     return ends[:, :2] / ends[:, 2:]

@@ -1,11 +1,12 @@
-"""A foot that stands: between successive frames it stays where it is.
+"""A standing foot: its position stays constant between successive frames.
 
 Residual, in metres in the world:
 
     r = x' - x  ~  N(0, q dt I)
 
-with q the density of a walk without a direction, m²/s: a standing foot turns and slides by a little, now this way
-and now that. Native and linear. Beside `factors.motion` it says that the joint's speed has no lasting part.
+with q the density of a random walk, m²/s: a standing foot turns and slides a little, in random
+directions. Native and linear. Used in addition to `factors.motion`, it constrains the mean velocity
+of the joint to zero.
 """
 
 from itertools import repeat
@@ -20,10 +21,11 @@ from factors.noise import isotropic_models
 def standing_factors(
     before_keys: ArrayLike, after_keys: ArrayLike, dt_s: ArrayLike, density: ArrayLike
 ) -> list[gtsam.NoiseModelFactor]:
-    """One factor for each of D steps: from `before_keys` (D,) to `after_keys` (D,), `dt_s` (D,) later.
+    """One factor for each of D steps, from the joint position `before_keys` (D,) to `after_keys`
+    (D,), `dt_s` (D,) seconds later.
 
-    `density` is q (D,), m²/s. ValueError for shapes that disagree, and where a time or a density is not positive
-    and finite.
+    `density` is q (D,), m²/s. ValueError for shapes that disagree, or if a time or a density is not
+    positive and finite.
     """
     before, after = np.asarray(before_keys), np.asarray(after_keys)
     dt, q = (np.asarray(values, dtype=np.float64) for values in (dt_s, density))

@@ -1,7 +1,9 @@
-"""A graph and its values as a file of what they are made of, read back as the same native factors; and drawn.
+"""Saves a graph and its values as JSON records, loads them as the same native factors, and draws
+graphs.
 
-GTSAM's own `serialize` refuses graphs with `TriangulationFactor`, `WnoaMotionFactor` or `WnoaInterpFactor`, and
-its archives are not made for files of others. Here a factor is a record of numbers, in JSON:
+GTSAM's own `serialize` refuses graphs with `TriangulationFactor`, `WnoaMotionFactor` or
+`WnoaInterpFactor`, and its archives are not safe for untrusted files. Here a factor is a record of
+numbers, in JSON:
 
     {"kind": "projection", "keys": [5], "data": [uv, K, wTc], "noise": R, "kernel": ["huber", 1.5]}
 
@@ -31,12 +33,12 @@ FORMAT = "shapepose-fg graph 1"
 _CURE = "give a file that factors.save_graph wrote"
 _ROTATION_TOLERANCE = 1e-6
 _LARGEST = 1e15
-"""No number in a file is larger."""
+"""Maximum absolute value of a number in a file."""
 
 
 def save_graph(file: str | Path, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-    """Write factors and values as `file`, JSON. ValueError, naming the factor or variable, for what is of no kind
-    that is known here: a Python function, a linearised factor on poses, a constraint.
+    """Write the factors and values to `file`, JSON. ValueError, naming the factor or variable, for
+    types that are not supported: Python functions, linearised factors on poses, constraints.
     """
     writer = _Writer(values)
     factors = [writer.record(n, graph.at(n)) for n in range(graph.size()) if graph.at(n) is not None]
@@ -46,8 +48,8 @@ def save_graph(file: str | Path, graph: gtsam.NonlinearFactorGraph, values: gtsa
 
 
 def load_graph(file: str | Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Read what `save_graph` wrote, by anybody: numbers become factors, nothing is executed. ValueError, one
-    sentence, for anything else.
+    """Read a file written by `save_graph`. Files may be untrusted: numbers become factors, and
+    nothing is executed. ValueError, one sentence, for any other content.
     """
     try:
         content = json.loads(Path(file).read_text(encoding="utf-8"), parse_constant=_refuse)
@@ -71,7 +73,9 @@ def load_graph(file: str | Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Valu
 
 
 def draw_graph(graph: gtsam.NonlinearFactorGraph, formatter: Callable[[int], str] = format_key) -> str:
-    """The graph in Graphviz' language, for `dot -Tsvg`: variables are ellipses, factors boxes with their kind."""
+    """The graph in the language of Graphviz, for `dot -Tsvg`: variables are ellipses; factors are
+    boxes, labelled with their kind.
+    """
     lines = ["graph {", "  overlap=false; node [fontsize=10];"]
     lines += [f'  v{key} [label="{_quoted(formatter(key))}"];' for key in sorted(graph.keyVector())]
     for n in range(graph.size()):
@@ -89,18 +93,18 @@ def _quoted(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Kind:
-    """How factors of one class are written and made."""
+    """How the factors of one class are written and constructed."""
 
     of: type
     """The class."""
     keys: int
-    """How many variables."""
+    """Number of variables of a factor."""
     rows: int
-    """How many numbers the residual has."""
+    """Dimension of the residual."""
     data: dict[str, tuple[int, ...]]
-    """Name and shape of each of its arrays."""
+    """Name and shape of each data array."""
     make: Callable[..., gtsam.NonlinearFactor]
-    """A factor of keys, arrays and noise."""
+    """Constructs a factor from keys, arrays and noise model."""
 
 
 def _triangulation(keys: list[int], uv: Array, K: Array, wTc: Array, noise: Any) -> gtsam.NonlinearFactor:
@@ -113,7 +117,7 @@ def _posed(keys: list[int], uv: Array, K: Array, bTc: Array, noise: Any) -> gtsa
 
 
 def _motion(keys: list[int], dt: Array, density: Array, noise: Any) -> gtsam.NonlinearFactor:
-    del noise  # it follows from the others
+    del noise  # noise follows from the other arguments
     if not (dt > 0 and (density > 0).all()):
         raise ValueError("time and densities must be positive")
     x, v, x_after, v_after = keys
@@ -122,7 +126,7 @@ def _motion(keys: list[int], dt: Array, density: Array, noise: Any) -> gtsam.Non
 
 
 def _plain(of: Any) -> Callable[..., gtsam.NonlinearFactor]:
-    """Makes factors of one measurement: a number, a point or a pose."""
+    """Constructor of factors with a single measurement: a number, a point or a pose."""
 
     def make(keys: list[int], measured: Array, noise: Any) -> gtsam.NonlinearFactor:
         value: Any = _pose(measured) if measured.shape == (4, 4) else measured
@@ -147,7 +151,8 @@ _KINDS = {
     )
 }
 _LINEAR = "linear"
-"""A `LinearContainerFactor` on points: `data` are A and b of |A x - b|², as many keys and rows as they have."""
+"""Kind of a `LinearContainerFactor` on points. `data` are A and b of |A x - b|², for any number of
+keys and rows."""
 _VALUES: dict[str, tuple[tuple[int, ...], Callable[[gtsam.Values, int, Array], None]]] = {
     "point": ((3,), lambda values, key, x: values.insert(key, x)),
     "pose": ((4, 4), lambda values, key, T: values.insert(key, _pose(T))),
@@ -155,14 +160,14 @@ _VALUES: dict[str, tuple[tuple[int, ...], Callable[[gtsam.Values, int, Array], N
 
 
 def _name(factor: Any) -> str | None:
-    """Its kind; None of one that has none."""
+    """Kind of the factor; None if it is not supported."""
     if type(factor) is gtsam.LinearContainerFactor:
         return _LINEAR
     return next((name for name, kind in _KINDS.items() if type(factor) is kind.of), None)
 
 
 class _Writer:
-    """Records of the factors of a graph."""
+    """Makes the records of a graph's factors."""
 
     def __init__(self, values: gtsam.Values) -> None:
         self._values, self._cameras = values, list[gtsam.PinholeCameraCal3_S2]()
@@ -190,7 +195,7 @@ class _Writer:
         return found
 
     def values(self) -> dict[str, list[Any]]:
-        """All variables, by their type."""
+        """All variables, grouped by type."""
         found: dict[str, list[Any]] = {name: [] for name in _VALUES}
         for key in self._values.keys():  # noqa: SIM118
             for name, get in (("point", self._values.atPoint3), ("pose", self._values.atPose3)):
@@ -218,7 +223,9 @@ class _Writer:
         return [np.asarray(value.matrix() if isinstance(value, gtsam.Pose3) else value)]
 
     def _camera(self, factor: Any, *, posed: bool) -> gtsam.PinholeCameraCal3_S2:
-        """That of a factor; of a posed one where its carrier is at the origin."""
+        """Camera of a projection factor; for a posed one, relative to the pose variable (as if that
+        were the identity).
+        """
         *pose, key = factor.keys()
         at, uv = gtsam.Values(), factor.measured()
         near = self._values.atPoint3(key)
@@ -230,7 +237,7 @@ class _Writer:
         def pixel(point: Array) -> Array | None:
             at.update(key, point)
             off = np.asarray(factor.unwhitenedError(at))
-            return None if off[0] == off[1] else off + uv  # behind the camera it is (2 fx, 2 fx)
+            return None if off[0] == off[1] else off + uv  # behind the camera the residual is (2 fx, 2 fx)
 
         points = near + np.array([[0.0, 0, 0], [0.3, 0.1, -0.2], [-0.2, 0.4, 0.1], [0.1, -0.3, 0.5]])
         there = [pixel(each) for each in points]
@@ -249,7 +256,7 @@ class _Writer:
 
 
 def _noise_data(model: Any) -> dict[str, Any]:
-    """R and kernel of a noise model."""
+    """R and kernel of a noise model, for its record."""
     kernel, base = None, model
     if isinstance(model, noiseModel.Robust):
         kernel, base = _kernel_data(model.robust()), cast(Any, model.noise())
@@ -259,7 +266,9 @@ def _noise_data(model: Any) -> dict[str, Any]:
 
 
 def _kernel_data(kernel: Any) -> list[Any]:
-    """Name and width; GTSAM tells the width in its own text only, among other numbers."""
+    """Name and width of a robust kernel. GTSAM exposes the width only in its serialised text, among
+    other numbers.
+    """
     for name, made in ESTIMATORS.items():
         if type(kernel) is made:
             for word in kernel.serialize().split():
@@ -271,7 +280,9 @@ def _kernel_data(kernel: Any) -> list[Any]:
 
 
 def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
-    """A linear factor on points, whitened, as it is linearised at zero: there it is the same as anywhere."""
+    """Data of a linear factor on points, whitened. It is linearised at zero: the result is the same
+    at any point.
+    """
     origin, keys = gtsam.Values(), factor.keys()
     for key in keys:
         origin.insert(key, np.zeros(3))
@@ -286,7 +297,7 @@ def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
 
 
 def _factor(record: Any) -> gtsam.NonlinearFactor:
-    """From a record; ValueError and the like where it is none."""
+    """Make a factor from its record; ValueError, KeyError or TypeError if the record is invalid."""
     kind, keys = _KINDS.get(record["kind"]), [_key(key) for key in record["keys"]]
     if record["kind"] == _LINEAR:
         return _linear(keys, *record["data"])

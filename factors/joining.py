@@ -1,8 +1,9 @@
-"""People in a graph of yours, frame by frame: what ISAM2 or a fixed-lag smoother takes in an update.
+"""Adds people to a factor graph of your own, frame by frame, as increments for ISAM2 or a fixed-lag
+smoother.
 
-A joint has a position and a velocity in each frame. Cameras that see it are robust projection factors: of a
-camera that stands still on the joint alone, of one that your graph carries on the joint and a pose of yours.
-Between frames joints move by white noise on acceleration (`factors.motion`).
+A joint has a position and a velocity in each frame. Detections are robust projection factors: on
+the joint only, if the camera is fixed; on the joint and a pose variable of your graph, if that pose
+carries the camera. Between frames joints follow white noise on acceleration (`factors.motion`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,42 +22,43 @@ from factors.projection import posed_projection_factors, projection_factors
 Array = NDArray[np.float64]
 
 _START_M = 1.0
-"""A new joint is so near to where it is said to be: far less is known so than from two cameras. ISAM2 calls a
-joint singular that one camera sees and that is hardly held along the ray: at 10 m it did, at 3 m no more."""
+"""Prior standard deviation of a new joint around its initial position, m. It is much weaker than
+two cameras. It is needed because ISAM2 reports a singular system for a joint that one camera sees
+and that is weakly constrained along the ray: it did with 10 m, and not with 3 m."""
 
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A camera whose pose is a variable of yours."""
+    """A camera on a pose variable of your graph."""
 
     calibration: gtsam.Cal3_S2
-    """Its lens; points are undistorted."""
+    """Intrinsics; image points are undistorted."""
     pose_key: int
-    """`Pose3`, world from camera, or from what carries it."""
+    """Key of a `Pose3`: world from camera, or world from the camera's carrier."""
     body_T_sensor: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
-    """Carrier from camera."""
+    """Pose of the camera on its carrier (carrier from camera)."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What V cameras saw of one person in one frame."""
+    """Detections of one person in one frame, by V cameras."""
 
     person: int
-    """Who."""
+    """Number of the person, for keys."""
     frame: int
-    """Its number, for keys."""
+    """Number of the frame, for keys."""
     time_s: float
-    """When, seconds."""
+    """Time of the frame, seconds."""
     joints: Array
-    """(J, 3) where the joints are about, metres in the world; NaN: leave this one out."""
+    """(J, 3) initial positions of the joints, metres in the world; a joint with NaN is left out."""
     xy: Array
-    """(J, V, 2) where each camera saw them, undistorted pixels; NaN: it did not."""
+    """(J, V, 2) detections, undistorted pixels; NaN if the camera did not detect the joint."""
     sigmas_px: Array
-    """(J, V) standard deviation of these places per axis, pixels."""
+    """(J, V) standard deviation of the detections per axis, pixels."""
     density: Array
-    """(J,) power spectral density of their accelerations, m²/s³."""
+    """(J,) power spectral density of the joints' accelerations, m²/s³."""
     cameras: Sequence[gtsam.PinholeCameraCal3_S2 | PosedCamera]
-    """The V cameras, as they are in this frame."""
+    """The V cameras, as of this frame."""
 
     def __post_init__(self) -> None:
         J, V = len(self.joints), len(self.cameras)
@@ -70,18 +72,18 @@ class Sighting:
 
 @dataclass
 class Increment:
-    """What a frame adds to a graph."""
+    """The factors and variables that one frame adds to a graph."""
 
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     """New factors."""
     values: gtsam.Values = field(default_factory=gtsam.Values)
-    """Start values of the new variables."""
+    """Initial values of the new variables."""
     times_s: dict[int, float] = field(default_factory=dict)
-    """When each new variable is of, seconds: what a fixed-lag smoother asks for."""
+    """Time of each new variable, seconds, by key: required by fixed-lag smoothers."""
 
     @property
     def timestamps(self) -> gtsam.FixedLagSmootherKeyTimestampMap:
-        """`times_s` as GTSAM's smoothers take it."""
+        """`times_s` in the type that GTSAM's fixed-lag smoothers take."""
         stamps = gtsam.FixedLagSmootherKeyTimestampMap()
         for key, time_s in self.times_s.items():
             stamps.insert((key, time_s))
@@ -91,11 +93,13 @@ class Increment:
 def reported_factor(
     key: int, place: Array, covariance: Array, poses: Sequence[tuple[int, gtsam.Pose3, Array]] = ()
 ) -> gtsam.NonlinearFactor:
-    """A joint as it was found by other means than your graph, and how it goes with poses of yours.
+    """Joint position that was estimated outside of your graph, and its dependence on poses of your
+    graph.
 
-    It is at `place` (3,) to `covariance` (3, 3) m² if each pose, by its key, is what it was taken for; with a turn
-    and a way of one along its axes it goes by (3, 6) of that. The factor is linear, and of the poses alone it says
-    nothing. ValueError for more than two poses.
+    The joint is at `place` (3,), metres, with `covariance` (3, 3), m², given the poses with which
+    it was estimated. Each entry of `poses` has a key, that pose, and the (3, 6) derivative of the
+    joint with respect to rotation and translation along the axes of the pose. The factor is linear,
+    and does not constrain the poses alone. ValueError for more than two poses.
     """
     if len(poses) > 2:
         raise ValueError(f"a joint goes with two poses at the most, got {len(poses)}")
@@ -107,17 +111,18 @@ def reported_factor(
     for pose_key, pose, goes in poses:
         here.insert(pose_key, pose)
         terms.append((pose_key, -root @ goes))
-    make: Any = gtsam.JacobianFactor  # its constructors take keys and matrices in turn
+    make: Any = gtsam.JacobianFactor  # its constructors take keys and matrices alternately
     linear = make(*(each for term in terms for each in term), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
     return gtsam.LinearContainerFactor(linear, here)
 
 
 class PeopleInGraph:
-    """Makes increments; keeps of each person when each joint was there last, and nothing else."""
+    """Makes increments. Its only state is the last frame and time of each joint of each person."""
 
     def __init__(self, space: KeySpace, *, kernel: Kernel | None = None, link_s: float = 0.25) -> None:
-        """Keys come from `space`. A joint that was away for longer than `link_s` begins anew: that must be less
-        than the lag of a smoother, which has let go of what is older.
+        """Keys are taken from `space`. If a joint was not seen for longer than `link_s`, seconds,
+        no motion factor connects it with its previous state. `link_s` must be shorter than the lag
+        of a smoother, which has marginalised older states.
         """
         if not (np.isfinite(link_s) and link_s > 0):
             raise ValueError(f"link_s must be positive, got {link_s}")
@@ -125,7 +130,8 @@ class PeopleInGraph:
         self._last: dict[int, tuple[Array, NDArray[np.int64]]] = {}
 
     def add(self, sightings: Iterable[Sighting]) -> Increment:
-        """The factors and start values of a frame: of each person a `Sighting`, later than those before.
+        """The factors and initial values of a frame: one `Sighting` for each person, later than all
+        previous ones.
 
         Joints that no camera saw are left out.
         """

@@ -1,4 +1,6 @@
-"""Keys of people in a graph of yours: its owner says which keys are free, and people take no others."""
+"""Key ranges for people in a graph of yours: you choose which keys people may use, and no others
+are used.
+"""
 
 from dataclasses import dataclass
 
@@ -9,23 +11,24 @@ from numpy.typing import ArrayLike, NDArray
 from factors.keys import JointKey
 
 _PER_SYMBOL = 2**56
-"""Numbers behind a symbol's character."""
+"""Number of indices of a symbol's character."""
 _KINDS = _POSITION, _VELOCITY, _REPORTED = 0, 1, 2
 _NAMES = ("position", "velocity", "reported position")
 
 
 @dataclass(frozen=True)
 class KeySpace:
-    """The keys that people may have: those of a symbol's character, or a range of integers.
+    """Range of keys for people: those of a symbol's character, or a range of integers.
 
         key = first + ((frame * people + person) * joints + joint) * 3 + kind
 
-    with the kind 0 for a position, 1 for a velocity and 2 for a reported position. Identities wrap round at
-    `people`: they are counted up for ever, and no more are there at a time.
+    with the kind 0 for a position, 1 for a velocity and 2 for a reported position. Identities are
+    increasing numbers; keys use them modulo `people`, which must be at least the number of people
+    at one time.
     """
 
     space: str | range
-    """A character, as in `gtsam.symbol("p", 0)`; or integers, with a step of 1."""
+    """A character, as in `gtsam.symbol("p", 0)`; or a range of integers with step 1."""
     people: int = 1000
     """Largest number of identities with distinct keys."""
     joints: int = 200
@@ -47,7 +50,7 @@ class KeySpace:
 
     @property
     def keys(self) -> range:
-        """All keys of the space."""
+        """All keys of the key space."""
         if isinstance(self.space, range):
             return self.space
         first = int(gtsam.symbol(self.space, 0))
@@ -55,12 +58,12 @@ class KeySpace:
 
     @property
     def frames(self) -> int:
-        """How many frames have keys: frame numbers run from 0 to one less."""
+        """Number of frames that have keys: frame numbers are 0 to `frames` - 1."""
         return (self.keys.stop - self.keys.start) // self._per_frame
 
     def positions(self, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
-        """Keys (...) of positions (`Point3`, metres, world); `joints` and `frames` broadcast. ValueError for a
-        number that has none.
+        """Keys (...) of positions (`Point3`, metres, world); `joints` and `frames` broadcast.
+        ValueError for a number out of range.
         """
         return self._pack(_POSITION, person, joints, frames)
 
@@ -69,11 +72,15 @@ class KeySpace:
         return self._pack(_VELOCITY, person, joints, frames)
 
     def reported(self, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
-        """Keys (...) of reported positions (`Point3`, metres, world): see `factors.reported_factor`."""
+        """Keys (...) of reported positions (`Point3`, metres, world), see
+        `factors.reported_factor`.
+        """
         return self._pack(_REPORTED, person, joints, frames)
 
     def split(self, key: int) -> JointKey:
-        """Who, which joint and when; ValueError for a key that is not of this space."""
+        """Decode a key to person, joint, frame and kind; ValueError for a key outside of this key
+        space.
+        """
         rest, _ = divmod(int(key) - self.keys.start, len(_KINDS))
         if key not in self.keys or rest >= self.frames * self.people * self.joints:
             raise ValueError(f"{gtsam.DefaultKeyFormatter(int(key))} is not a key of the space {self.space}")
@@ -82,7 +89,7 @@ class KeySpace:
         return JointKey(person, joint, frame)
 
     def format(self, key: int) -> str:
-        """Readable name of any key; goes where GTSAM takes a key formatter."""
+        """Readable name of any key, for GTSAM's `keyFormatter` arguments."""
         try:
             person, joint, frame = self.split(key)
         except ValueError:

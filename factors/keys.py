@@ -1,6 +1,7 @@
-"""Keys of the variables: who, which joint, when; decimal numbers that GTSAM's own messages show in full.
+"""Keys of the variables: decimal numbers of person, joint and frame, which GTSAM's own messages
+show in full.
 
-A key is a 17-digit number, to be read from left to right:
+A key is a 17-digit number, read from left to right:
 
     kind, 1 digit | person or view, 5 digits | joint, 3 digits | frame, 8 digits
 
@@ -36,7 +37,7 @@ _PER_KIND = (MAX_PERSON + 1) * _PER_PERSON
 
 
 class JointKey(NamedTuple):
-    """What the key of a joint, of its velocity or of its offset says."""
+    """Fields decoded from the key of a joint's position, velocity or offset."""
 
     person: int
     joint: int
@@ -44,15 +45,15 @@ class JointKey(NamedTuple):
 
 
 class CameraKey(NamedTuple):
-    """What the key of a camera says."""
+    """Fields decoded from a camera key."""
 
     view: int
     frame: int
 
 
 def joint_key(person: int, joint: int, frame: int = 0) -> int:
-    """Key of the position (`Point3`, metres, world) of a joint; ValueError beyond the limits above, and for
-    what is not a whole number.
+    """Key of the position (`Point3`, metres, world) of a joint. ValueError if a number exceeds the
+    limits above or is not an integer.
     """
     return int(_pack(_JOINT, person, joint, frame))
 
@@ -63,15 +64,15 @@ def velocity_key(person: int, joint: int, frame: int = 0) -> int:
 
 
 def offset_key(person: int, joint: int, frame: int = 0, source: int = 0) -> int:
-    """Key of the slowly varying error (`Point3`, standard deviations) of what a `source` (0 to 2) says of a
-    joint.
+    """Key of the slowly varying error (`Point3`, in standard deviations) of the measurements of a
+    joint by a `source` (0 to 2).
     """
     return int(_pack(_offset(source), person, joint, frame))
 
 
 def camera_key(view: int, frame: int = 0) -> int:
-    """Key of the pose (`Pose3`, world from camera) of a camera, or of what carries several; frame 0 for one that
-    stands still.
+    """Key of the pose (`Pose3`, world from camera) of a camera, or of a carrier of several cameras;
+    frame 0 if it is fixed.
     """
     return int(_pack(_CAMERA, view, 0, frame))
 
@@ -104,14 +105,15 @@ def offset_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0, source: i
 
 
 def reported_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:
-    """Keys of positions (`Point3`, metres, world) with all of their error, where `joint_keys` are the positions
-    that detections, body and motion agree on; `joints` and `frames` broadcast against each other.
+    """Keys of reported positions (`Point3`, metres, world), which contain all errors. `joint_keys`
+    are the positions of the optimised graph of detections, body priors and motion. `joints` and
+    `frames` broadcast against each other.
     """
     return _pack(_REPORTED, person, joints, frames)
 
 
 def split_key(key: int) -> JointKey:
-    """Person, joint and frame of a key of these kinds; ValueError for a camera's and any other key."""
+    """Person, joint and frame of a joint's key; ValueError for a camera's key or any other key."""
     kind, person, joint, frame = _unpack(key)
     if kind not in _NAMES or kind == _CAMERA:
         raise ValueError(f"{format_key(key)} is not the key of a joint, a velocity or an offset")
@@ -127,7 +129,9 @@ def split_camera_key(key: int) -> CameraKey:
 
 
 def format_key(key: int) -> str:
-    """Readable name of any key; goes where GTSAM takes a key formatter: `graph.print("", format_key)`."""
+    """Readable name of any key, for GTSAM's `keyFormatter` arguments: `graph.print("",
+    format_key)`.
+    """
     kind, first, joint, frame = _unpack(key)
     if kind == _CAMERA:
         return f"camera(view {first}, frame {frame})"

@@ -1,17 +1,18 @@
-"""Knowledge whose error lasts from frame to frame.
+"""Measurements with temporally correlated errors.
 
-Native factors only, all linear. Times may have any steps.
+Native factors only, all linear. Time steps may be of any length.
 
-Who says every frame again where a joint is, and errs the same way every time, has
-said it once. The error of a message "the joint is at m_t, covariance C_t" is split into a share that is new in
-every frame and one that lasts, an Ornstein-Uhlenbeck chain b_t in units of standard deviations. With R_t the
-symmetric square root of the message's information, R_t C_t R_t = I, and w the white share:
+A measurement that is repeated in every frame with the same error adds no information. The error of
+a measurement (m_t, C_t) of a joint is therefore split into a part that is independent in each frame
+and a correlated part: an Ornstein-Uhlenbeck process b_t, in units of standard deviations. With R_t
+the symmetric square root of the information, R_t C_t R_t = I, and w the white (independent) share
+of the variance:
 
     r = R_t (x_t - m_t) - sqrt(1 - w) P_t b_t  ~  N(0, w I)
     r = b' - a b                               ~  N(0, (1 - a²) I),   a = exp(-dt / correlation_s),   b_0 ~ N(0, I)
 
-P_t = R_t R_t^+ projects on what the message knows, the identity but for a ray: along the ray it says nothing of
-the joint, and so nothing of the offset either.
+P_t = R_t R_t^+ projects on the range of R_t. It is the identity, except for a measurement by one
+ray: this constrains neither the joint nor the offset along the ray.
 """
 
 from itertools import pairwise, repeat
@@ -27,7 +28,9 @@ from factors.motion import contained, rise
 def offset_factors(
     offset_keys: ArrayLike, times_s: ArrayLike, correlation_s: float
 ) -> list[gtsam.NonlinearFactor]:
-    """The chain of offsets b_t: a unit prior on the first, then T - 1 links that forget within `correlation_s`."""
+    """Process of offsets b_t: a unit prior on the first, then T - 1 links with the time constant
+    `correlation_s`.
+    """
     times, keys = np.asarray(times_s, dtype=np.float64), np.asarray(offset_keys)
     if keys.shape != times.shape or times.ndim != 1 or not rise(times):
         raise ValueError(
@@ -49,12 +52,14 @@ def offset_factors(
 def lasting_prior_factors(
     keys: ArrayLike, offset_keys: ArrayLike, means: ArrayLike, roots: ArrayLike, white_share: float
 ) -> list[gtsam.NonlinearFactor]:
-    """D messages about joints whose errors last: position `keys` (D,) against `means` (D, 3) and their offsets.
+    """Factors of D measurements with correlated errors: positions `keys` (D,), `means` (D, 3) in
+    metres, and offsets `offset_keys` (D,).
 
-    Several may be about one joint, each with an offset of its own or with one for all.
+    A joint may have several measurements, with a common offset or one for each.
 
-    `roots` (D, 3, 3), 1/m, are the symmetric square roots of the messages' information, of the whole error; they
-    may be singular (a ray). `white_share` of the error's variance, between 0 and 1, is new each time.
+    `roots` (D, 3, 3), 1/m, are the symmetric square roots of the measurements' information (of the
+    whole error); they may be singular (a ray). `white_share`, between 0 and 1, is the share of the
+    error's variance that is independent in each frame.
     """
     points, whiten = np.asarray(means, dtype=np.float64), np.asarray(roots, dtype=np.float64)
     positions, offsets = np.asarray(keys), np.asarray(offset_keys)
@@ -79,7 +84,9 @@ def lasting_prior_factors(
 def lasting_blocks(
     means: NDArray[np.float64], roots: NDArray[np.float64], white_share: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """What `lasting_prior_factors` are, whitened: r = A x + B b - c, with A and B (D, 3, 3) and c (D, 3)."""
+    """Whitened blocks of `lasting_prior_factors`: r = A x + B b - c, with A and B (D, 3, 3) and c
+    (D, 3).
+    """
     scaled = roots / np.sqrt(white_share)
     of_offsets = -np.sqrt((1.0 - white_share) / white_share) * _projectors(roots)
     return scaled, of_offsets, (scaled @ means[..., None])[..., 0]
@@ -93,10 +100,11 @@ def lasting_difference_factors(
     covariances: ArrayLike,
     white_share: float,
 ) -> list[gtsam.NonlinearFactor]:
-    """D positions `keys` (D,) that differ from those of `of_keys` (D,) by `differences` (D, 3), metres, with
-    errors that last: of `covariances` (D, 3, 3), positive definite, m², of which `white_share` is new each time.
+    """D measured differences of positions, `keys` (D,) minus `of_keys` (D,): `differences` (D, 3),
+    metres, with correlated errors. These have `covariances` (D, 3, 3), positive definite, m², of
+    which the share `white_share` is independent in each frame.
 
-    r = R (y - x - d) - sqrt(1 - w) b  ~  N(0, w I), with R the symmetric root of the information.
+        r = R (y - x - d) - sqrt(1 - w) b  ~  N(0, w I), with R the symmetric root of the information.
     """
     away, shape = np.asarray(differences, dtype=np.float64), np.shape(keys)
     values, vectors = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
@@ -118,7 +126,8 @@ def lasting_difference_factors(
 def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has full rank.
 
-    Singular values below 1e-5 of the largest are rounding: the root of information that is zero up to 1e-10.
+    Singular values below 1e-5 of the largest are treated as rounding errors: R is the root of an
+    information matrix with relative errors of 1e-10.
     """
     projectors = np.tile(np.eye(3), (len(matrices), 1, 1))
     # The determinant over the trace cubed is less than the smallest singular value over the largest.

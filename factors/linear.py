@@ -11,13 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 def linear_factor(
     keys: ArrayLike, matrices: Sequence[ArrayLike], measured: ArrayLike = 0.0, sigma: ArrayLike = 1.0
 ) -> gtsam.LinearContainerFactor:
-    """Linear knowledge about K variables: r = sum_k A_k x_k - z  ~  N(0, diag(sigma²)).
+    """Linear factor on K variables: r = sum_k A_k x_k - z  ~  N(0, diag(sigma²)).
 
-    `keys` (K,) are of `Point3` variables, such as positions and velocities of joints, each once. `matrices` are
-    the K matrices A_k, (M, 3) each; a number stands for that number times the identity. `measured` (M,) is z, or
-    one number for all rows; `sigma` (M,), or one number, is in the residual's unit. GTSAM's own JacobianFactor
-    takes three variables from Python, and a linear factor in a nonlinear graph needs a point of linearisation,
-    without which its error is always 0: this has one. ValueError where shapes do not fit or a value is not finite.
+    `keys` (K,) are distinct keys of `Point3` variables, such as positions and velocities of joints.
+    `matrices` are the K matrices A_k, (M, 3) each; a number stands for that number times the
+    identity. `measured` (M,) is z, or one number for all rows; `sigma` (M,), or one number, is in
+    the residual's unit. GTSAM's own JacobianFactor takes at most three variables from Python. In a
+    nonlinear graph, the error of a linear factor without a linearisation point is always 0; this
+    function sets one. ValueError if shapes do not fit or a value is not finite.
     """
     names = np.atleast_1d(np.asarray(keys)).tolist()
     if len(names) == 0 or len(set(names)) < len(names):
@@ -39,7 +40,7 @@ def linear_factor(
     z, deviation = np.broadcast_to(z, rows), np.broadcast_to(deviation, rows)
     whitened = [block / deviation[:, None] for block in blocks]
     terms, unit = list(zip(names, whitened, strict=True)), noiseModel.Unit.Create(rows)
-    # The one constructor of Python's that takes any number of variables.
+    # The only constructor in GTSAM's Python interface that takes any number of variables.
     linear = gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, z / deviation, unit))
     origin = gtsam.Values()
     for key in names:

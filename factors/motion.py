@@ -1,17 +1,18 @@
-"""How joints move: what a motion model is, and the two that ship.
+"""Motion models of joints: the interface, and the two models that are included.
 
-A joint's state s is its position and the first n - 1 derivatives of it, along each axis by itself. A model says
-how it goes on over a step dt, whatever its length:
+A joint's state s is its position and the first n - 1 derivatives of it, independently along each
+axis. A model predicts the state after a time step dt of any length:
 
     s' = F(dt) s + w,   w ~ N(0, q Q(dt))
 
-with q a density of the noise, a number for each joint and step. F and Q are all there is to a model: from them
-come the factors between two states in a graph (`Motion.factors`) and so the covariances, the tracker's prediction,
-the smoother of drafts, and the links between a person's bodies. A model of your own overrides `transition` and
-`noise`, and its name goes into `MOTIONS`.
+with q the noise density, a number for each joint and step. F and Q define a model completely: the
+factors between two states in a graph (`Motion.factors`), hence the covariances, the tracker's
+prediction, the smoother of initial estimates, and the links between a person's bodies all follow
+from them. A model of your own overrides `transition` and `noise`, and is registered by name in
+`MOTIONS`.
 
-`Motion` itself is white noise on the n-th derivative: on acceleration where n is 2 (Barfoot's prior), on jerk
-where it is 3.
+`Motion` itself is white noise on the n-th derivative: on acceleration for n = 2 (Barfoot's prior),
+on jerk for n = 3.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,57 +28,67 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 ORDERS = (2, 3)
-"""Numbers of a state along an axis: position and velocity, or acceleration as well."""
+"""Allowed orders: the state along an axis has 2 numbers (position, velocity) or 3 (and
+acceleration)."""
 MEASURED_S = 2 / 30
-"""Over this time people's accelerations were measured: second differences at 30 frames a second."""
+"""Time scale of the measured accelerations of people, s: second differences at 30 frames a
+second."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """White noise on the derivative of the position of this `order`."""
+    """Motion model with white noise on the derivative of the position of this `order`."""
 
     order: int = 2
-    """n, the numbers of a state along an axis: one of `ORDERS`."""
+    """n, number of state variables along an axis: one of `ORDERS`."""
     start: tuple[float, ...] = (2.0,)
-    """Sigma of each derivative along an axis before anything is known: m/s, m/s²."""
+    """Prior standard deviation of each derivative along an axis: m/s, m/s²."""
 
     def __post_init__(self) -> None:
         if self.order not in ORDERS or len(self.start) != self.order - 1:
             raise ValueError(f"order must be one of {ORDERS} and start that many less one, got {self}")
 
     def transition(self, dt_s: ArrayLike) -> Array:
-        """F (..., n, n) over steps of `dt_s` (...) seconds, positive."""
+        """F (..., n, n) over steps of `dt_s` (...), positive, seconds."""
         h, places = np.asarray(dt_s, dtype=np.float64), range(self.order)
         return matrices([[h ** (j - i) / factorial(j - i) if j >= i else 0 * h for j in places] for i in places])
 
     def noise(self, dt_s: ArrayLike, density: ArrayLike = 1.0) -> Array:
-        """Covariance q Q (..., n, n) over steps of `dt_s` (...) seconds, positive, for densities q (...)."""
+        """Covariance q Q (..., n, n) over steps of `dt_s` (...), positive, seconds, for densities q
+        (...).
+        """
         q, h = np.asarray(density, dtype=np.float64), dt_s if isinstance(dt_s, float) else np.asarray(dt_s)
         left = range(self.order - 1, -1, -1)
-        # The integral over dt of u^i / i! u^j / j!.
+        # The integral over dt of (u^i / i!) (u^j / j!).
         return matrices(
             [[q * h ** (i + j + 1) / ((i + j + 1) * factorial(i) * factorial(j)) for j in left] for i in left]
         )
 
     def density(self, acceleration: ArrayLike, within_s: float = MEASURED_S) -> Array:
-        """The density q that makes positions as uncertain after `within_s` as accelerations of this power spectral
-        density, m²/s³, do: that is what is measured of people, and they have another q on every time scale.
+        """The density q of this model that corresponds to the measured power spectral density of
+        `acceleration`, m²/s³.
+
+        With this q, positions are as uncertain after `within_s` seconds as with white noise on
+        acceleration. A time scale is needed because people's motion corresponds to another q on
+        every time scale.
         """
         white = within_s**3 / 3
         return np.asarray(acceleration, dtype=np.float64) * (white / self.noise(within_s)[0, 0])
 
     def step(self, dt_s: float, density: ArrayLike) -> tuple[Array, Array]:
-        """F (n, n) and q Q (..., n, n) of a step that may be back in time: derivatives of odd order turn round."""
+        """F (n, n) and q Q (..., n, n) of a step that may be backwards in time: then derivatives of
+        odd order change sign.
+        """
         F, Q = self.transition(abs(dt_s)), self.noise(abs(dt_s), density)
         turn = np.sign(dt_s) ** np.arange(self.order) if dt_s != 0 else np.ones(self.order)
         both = np.outer(turn, turn)
         return both * F, both * Q
 
     def factors(self, keys: ArrayLike, times_s: ArrayLike, density: ArrayLike) -> list[gtsam.NonlinearFactor]:
-        """Between the T consecutive states of one joint: T - 1 native factors, all linear.
+        """T - 1 native, linear factors between the T consecutive states of one joint.
 
-        `keys` (T, n) of the states' `Point3`, position first; `times_s` (T,) rising; `density` q: one number or
-        one a step (T - 1,).
+        `keys` (T, n) are the states' `Point3` variables, position first; `times_s` (T,) are
+        increasing; `density` is q, one number or one for each step (T - 1,).
         """
         times, states = np.asarray(times_s, dtype=np.float64), np.asarray(keys)
         if states.shape != (len(times), self.order):
@@ -90,7 +101,7 @@ class Motion:
         return self._factors(states, times, densities)
 
     def _factors(self, states: NDArray[np.int64], times: Array, densities: Array) -> list[gtsam.NonlinearFactor]:
-        """A Gaussian p(s' | s) a step: r = s' - F s, whitened."""
+        """One Gaussian p(s' | s) for each step, with the whitened residual r = s' - F s."""
         eye, unit = np.eye(3), noiseModel.Unit.Create(3 * self.order)
         linear = []
         for before, after, dt, q in zip(
@@ -125,7 +136,7 @@ MOTIONS: dict[str, Motion] = {
     "constant velocity": CONSTANT_VELOCITY,
     "constant acceleration": CONSTANT_ACCELERATION,
 }
-"""Models by the names that settings call them."""
+"""Motion models by the names that the settings use."""
 
 
 def matrices(rows: Sequence[Sequence[Array]]) -> Array:
@@ -154,14 +165,14 @@ def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> Array:
 
 
 def rise(times_s: NDArray[np.float64]) -> bool:
-    """Whether times (T,) are finite and each is after the one before."""
+    """Whether times (T,) are finite and strictly increasing."""
     return bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
 
 
 def contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
     """Linear factors on `Point3` variables `keys` (D,) as factors of a nonlinear graph.
 
-    They must be told that they are linearised at zero: without that their error is always 0.
+    They get the linearisation point zero: without one their error is always 0.
     """
     zeros, origin = gtsam.Values(), np.zeros(3)
     for key in np.unique(keys).tolist():

@@ -1,7 +1,9 @@
-"""Noise: from confidence and distance to pixels, and robust kernels by name.
+"""Noise models: standard deviations in pixels from confidence and distance, and robust kernels by
+name.
 
-Every factor here keeps its residual raw (pixels, metres) and its weight in the noise model. GTSAM applies a
-robust kernel to the *whitened* residual, so a kernel's width counts standard deviations, whatever the unit.
+Every factor here keeps its residual raw (pixels, metres) and its weight in the noise model. GTSAM
+applies a robust kernel to the *whitened* residual, so a kernel's width is in standard deviations,
+whatever the unit of the residual.
 """
 
 from itertools import repeat
@@ -15,7 +17,8 @@ KernelName = Literal["huber", "cauchy", "geman_mcclure", "tukey"]
 """Robust kernels. The weight falls as 1/r (huber), 1/r² (cauchy), 1/r⁴ (geman_mcclure), or to 0 (tukey)."""
 
 Kernel = noiseModel.mEstimator.Base
-"""What the builders take as `kernel`: any of GTSAM's M-estimators (one object may serve many factors)."""
+"""Type of the argument `kernel`: any of GTSAM's M-estimators. One object may be shared by many
+factors."""
 
 ESTIMATORS = {
     "huber": noiseModel.mEstimator.Huber,
@@ -30,15 +33,17 @@ DEFAULT_WIDTH_SIGMA: dict[str, float] = {
     "geman_mcclure": 4.10,
     "tukey": 5.12,
 }
-"""Width of each kernel, in standard deviations, that keeps 95 % of the efficiency of least squares on a pixel
-residual (two dimensions) that is Gaussian after all; the usual tables are for one dimension."""
+"""Width of each kernel, in standard deviations, that keeps 95 % of the efficiency of least
+squares if the pixel residual (two dimensions) is in fact Gaussian; the usual tables are for one
+dimension."""
 
 
 def robust_kernel(name: KernelName | None, width_sigma: float | None = None) -> Kernel | None:
     """Make the robust kernel called `name`, or None for plain least squares.
 
-    `width_sigma` is the whitened residual norm, in standard deviations, at which the kernel takes over;
-    None means `DEFAULT_WIDTH_SIGMA`. Huber is convex; the others need a start near the solution.
+    `width_sigma` is the whitened residual norm, in standard deviations, above which residuals are
+    downweighted (the kernel's parameter); None means `DEFAULT_WIDTH_SIGMA`. Huber is convex; the
+    others need a start near the solution.
     """
     if name is None:
         return None
@@ -53,14 +58,15 @@ def robust_kernel(name: KernelName | None, width_sigma: float | None = None) -> 
 def kernel_weight(
     name: KernelName | None, whitened_norm: ArrayLike, width_sigma: float | None = None
 ) -> NDArray[np.float64]:
-    """Weight (...,) that the kernel gives residuals whose whitened norm is `whitened_norm` (...,): 1 at 0.
+    """Weight (...,) of the kernel for residuals with the whitened norm `whitened_norm` (...,); 1 at
+    0.
 
-    What GTSAM multiplies the squared residual with when it linearises a robust factor, for whole arrays.
+    This is the weight of the squared residual when GTSAM linearises a robust factor, for arrays.
     """
     r = np.asarray(whitened_norm, dtype=np.float64)
     if name is None:
         return np.ones_like(r)
-    robust_kernel(name, width_sigma)  # refuses an unknown name and a width that is not positive
+    robust_kernel(name, width_sigma)  # raises ValueError for an unknown name or a width that is not positive
     width = DEFAULT_WIDTH_SIGMA[name] if width_sigma is None else float(width_sigma)
     ratio = (r / width) ** 2
     if name == "huber":
@@ -84,10 +90,11 @@ def sigma_px(
 
     sigma = sqrt(floor_px² + (sigma_m · focal_px / depth_m)²) / sqrt(confidence)
 
-    A detector places a joint on a body to within `sigma_m` metres, so its pixels scale with the size of the
-    person in the image; `floor_px` is what the detector's grid costs at any size. The confidence multiplies
-    the squared error, as w_ij does in Eq. 1 of the paper. The arrays broadcast against each other.
-    ValueError where a confidence, depth or focal length is not positive: gate such observations out first.
+    A detector places a joint on a body to within `sigma_m` metres, so the error in pixels scales
+    with the size of the person in the image; `floor_px` is the error that the detector's grid adds
+    at any size. The confidence multiplies the squared error, as w_ij does in Eq. 1 of the paper.
+    The arrays broadcast against each other. ValueError if a confidence, depth or focal length is
+    not positive: gate such observations out first.
     """
     w, depth, focal = (np.asarray(value, dtype=np.float64) for value in (confidence, depth_m, focal_px))
     for name, value in (("confidence", w), ("depth_m", depth), ("focal_px", focal)):
@@ -114,7 +121,7 @@ def diagonal(sigmas: ArrayLike, kernel: Kernel | None = None) -> noiseModel.Base
 def gaussian(covariance: ArrayLike, kernel: Kernel | None = None) -> noiseModel.Base:
     """Noise with a full covariance (N, N), in the residual's unit squared.
 
-    ValueError if it is not symmetric positive definite: GTSAM would go on with NaN.
+    ValueError if it is not symmetric positive definite: GTSAM would continue with NaN.
     """
     matrix = np.asarray(covariance, dtype=np.float64)
     check_covariances(matrix[None])
@@ -122,7 +129,7 @@ def gaussian(covariance: ArrayLike, kernel: Kernel | None = None) -> noiseModel.
 
 
 def robust(base: noiseModel.Base, kernel: Kernel | None) -> noiseModel.Base:
-    """Put `kernel` around a Gaussian noise model; with None the model itself."""
+    """Wrap a Gaussian noise model in the robust `kernel`; None returns the model itself."""
     return base if kernel is None else noiseModel.Robust.Create(kernel, base)
 
 
@@ -143,7 +150,7 @@ def check_covariances(covariances: NDArray[np.float64]) -> None:
         raise ValueError("a covariance holds a value that is not finite")
     scale = np.abs(covariances).max(axis=(1, 2), initial=0.0)
     skew = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-    # Symmetric up to the rounding of whoever computed it; Cholesky looks at one triangle only.
+    # Symmetry is tested up to rounding errors; the Cholesky factorisation reads only one triangle.
     if np.any(skew > 1e-9 * scale):
         raise ValueError(f"covariance {np.argmax(skew > 1e-9 * scale)} is not symmetric: give (C + Cᵀ) / 2")
     try:

@@ -1,4 +1,6 @@
-"""Odometry: how far what carries a camera has gone from frame to frame, by wheels, inertia or its own pictures."""
+"""Odometry: relative motion of a camera's carrier from frame to frame, by wheels, inertial sensors
+or visual odometry.
+"""
 
 import gtsam
 import numpy as np
@@ -9,11 +11,13 @@ from factors.noise import check_covariances
 
 
 def odometry_factors(keys: ArrayLike, wTb: ArrayLike, covariances: ArrayLike) -> list[gtsam.NonlinearFactor]:
-    """T - 1 steps between the poses `keys` (T,), `Pose3`, world from carrier, as `wTb` (T, 4, 4) takes them.
+    """T - 1 factors between consecutive poses `keys` (T,), `Pose3`, world from carrier, from the
+    odometry `wTb` (T, 4, 4).
 
-    r = Log(measured step^-1 (pose_t^-1 pose_t+1)), turn then way, rad and m along the carrier's own axes, known to
-    `covariances` (T - 1, 6, 6). Where the world is in which `wTb` was measured does not matter. ValueError for
-    shapes that disagree and covariances that are none.
+    r = Log(step^-1 (pose_t^-1 pose_t+1)), with `step` the measured relative pose; rotation first,
+    then translation, rad and m along the carrier's own axes, with `covariances` (T - 1, 6, 6). The
+    world frame of `wTb` may be any. ValueError for shapes that disagree and for invalid
+    covariances.
     """
     key, poses = np.asarray(keys), np.asarray(wTb, dtype=np.float64)
     covariance = np.asarray(covariances, dtype=np.float64)

@@ -1,4 +1,5 @@
-"""The pinhole projection and its derivative, for arrays: the one that the package uses outside GTSAM.
+"""The pinhole projection and its derivative, for arrays: the implementation that the package uses
+outside GTSAM.
 
 Undistorted pixels, x right, y down; cameras look along +z. NumPy only.
 """

@@ -1,11 +1,13 @@
-"""A camera sees a joint: native projection factors for cameras that stand still, stand posed or move.
+"""Native projection factors: a joint detected by a camera with a fixed, an unknown or a moving
+pose.
 
 Residual of every factor here, in pixels (x right, y down, image points undistorted):
 
     r = project(camera, joint) - uv
 
-GTSAM does not complain about a point behind the camera: residual (2 fx, 2 fx), Jacobian 0, so the factor
-pulls at nothing and keeps its error. Gate on depth (`in_front`) before adding one.
+GTSAM does not raise an error for a point behind the camera: the residual is (2 fx, 2 fx) and the
+Jacobian 0, so the factor constrains nothing and its error stays. Gate on depth (`in_front`) before
+adding one.
 """
 
 from collections.abc import Sequence
@@ -22,7 +24,7 @@ from factors.noise import Kernel, KernelName, isotropic, isotropic_models, kerne
 def make_camera(K: ArrayLike, wTc: ArrayLike) -> gtsam.PinholeCameraCal3_S2:
     """Make GTSAM's camera from `K` (3, 3) in pixels and the world-from-camera pose `wTc` (4, 4) in metres.
 
-    OpenCV's convention: x right, y down, z forward. Make it once per view; factors share it.
+    OpenCV's convention: x right, y down, z forward. Make it once per view; factors can share it.
     """
     pose = np.asarray(wTc, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -45,7 +47,9 @@ def projection_factor(
     key: int,
     kernel: Kernel | None = None,
 ) -> gtsam.NoiseModelFactor:
-    """A camera that stands still sees the joint `key` at `uv` (2,): one variable, a `Point3`."""
+    """Detection of the joint `key` at `uv` (2,) by a camera with a fixed pose: one variable, a
+    `Point3`.
+    """
     return gtsam.TriangulationFactorCal3_S2(camera, _pixel(uv), isotropic(2, sigma_px, kernel), key)
 
 
@@ -59,10 +63,10 @@ def projection_factors(
 ) -> list[gtsam.NoiseModelFactor]:
     """One projection factor for each of D observations: `projection_factor` for arrays (Eq. 1).
 
-    Observation d: `cameras[view[d]]` sees the joint `keys[d]` at `xy[d]` (D, 2) to within `sigmas_px[d]`.
-    A factor is immutable and may sit in several graphs: when only the gates change between two solves,
-    select from this list again instead of building it again. ValueError for shapes that disagree or pixels
-    that are not finite.
+    Observation d: `cameras[view[d]]` detected the joint `keys[d]` at `xy[d]` (D, 2) with the
+    standard deviation `sigmas_px[d]`, pixels. A factor is immutable and may sit in several graphs:
+    if only the gates change between two solves, select from this list instead of building the
+    factors again. ValueError for shapes that disagree or pixels that are not finite.
     """
     points = np.asarray(xy, dtype=np.float64)
     views, key_list = np.asarray(view), np.asarray(keys)
@@ -92,11 +96,14 @@ def moving_projection_factors(
     kernel: KernelName | None = None,
     width: float = 1.0,
 ) -> list[gtsam.NonlinearFactor]:
-    """D observations of joints that move, `lead_s` (D,) seconds after their states: linear, one factor a state.
+    """D detections of moving joints, exposed `lead_s` (D,) seconds after the time of their states;
+    linear factors.
 
-    The joint `keys` (D,) is at x + lead v then, with the velocity `velocity_keys` (D,). It was linearised at
-    `points` (D, 3), metres in the world, where its pixel has the derivative `slopes` (D, 2, 3) and is `residuals`
-    (D, 2) from what was seen. A robust kernel, its `width` in standard deviations, weighs once, there.
+    At the exposure, the joint is at x + lead v, with position x (`keys` (D,)) and velocity v
+    (`velocity_keys` (D,)). The projection is linearised at `points` (D, 3), metres in the world,
+    with the derivative of the pixel `slopes` (D, 2, 3), pixels per metre, and the residual
+    `residuals` (D, 2), pixels. The weight of a robust kernel, with its `width` in standard
+    deviations, is computed once, at this point.
     """
     position, velocity = np.asarray(keys), np.asarray(velocity_keys)
     at, slope, off = (np.asarray(each, dtype=np.float64) for each in (points, slopes, residuals))
@@ -132,10 +139,12 @@ def posed_projection_factor(
     kernel: Kernel | None = None,
     body_T_sensor: gtsam.Pose3 | None = None,
 ) -> gtsam.NoiseModelFactor:
-    """A camera whose pose is unknown, or moves, sees the joint `key` at `uv` (2,): two variables.
+    """Detection of the joint `key` at `uv` (2,) by a camera with an unknown or moving pose: two
+    variables.
 
-    `pose_key` is a `Pose3`, world from camera; or, with `body_T_sensor`, world from the robot that carries
-    the camera there. The world is free to move as a whole: anchor a pose with a prior.
+    `pose_key` is a `Pose3`, world from camera; or, with `body_T_sensor` (robot from camera), world
+    from the robot that carries the camera. The world frame as a whole is not determined: fix a pose
+    with a prior.
     """
     model: noiseModel.Base = isotropic(2, sigma_px, kernel)
     if body_T_sensor is None:
@@ -155,8 +164,9 @@ def posed_projection_factors(
 ) -> list[gtsam.NoiseModelFactor]:
     """`posed_projection_factor` for arrays of D observations.
 
-    Observation d: the camera `sensors[d]`, carrier from camera, on the carrier `pose_keys[d]`, with the lens
-    `calibrations[view[d]]`, sees the joint `keys[d]` at `xy[d]` (D, 2) to within `sigmas_px[d]`.
+    Observation d: the camera `sensors[d]`, carrier from camera, on the carrier `pose_keys[d]`, with
+    the lens `calibrations[view[d]]`, detected the joint `keys[d]` at `xy[d]` (D, 2) with the
+    standard deviation `sigmas_px[d]`, pixels.
     """
     points, chosen = np.asarray(xy, dtype=np.float64), np.asarray(view)
     poses, joints, count = np.asarray(pose_keys), np.asarray(keys), len(points)
@@ -171,7 +181,7 @@ def posed_projection_factors(
 
 
 def in_front(depth_m: ArrayLike, min_depth_m: float = 0.1) -> NDArray[np.bool_]:
-    """Which depths (...,) along the optical axis are at least `min_depth_m`; NaN is not."""
+    """Which depths (...,) along the optical axis are at least `min_depth_m`, metres; NaN is not."""
     return np.asarray(depth_m, dtype=np.float64) >= min_depth_m
 
 

@@ -1,7 +1,9 @@
-"""Is a joint determined? Asked before the solver: Levenberg-Marquardt returns silently on one that is not.
+"""Tests whether joints are determined, before solving: Levenberg-Marquardt returns without an error
+if one is not.
 
-A joint that one camera sees can slide along its ray, and one on the line through two cameras between them.
-The information of a joint is J^T W J, summed over its observations and priors, (3, 3) in 1/m².
+A joint that only one camera sees is not determined along its ray; a joint on the line through two
+cameras is not determined along this line. The information of a joint is J^T W J, summed over its
+observations and priors, (3, 3) in 1/m².
 """
 
 import numpy as np
@@ -19,12 +21,12 @@ def joint_information(
     cTw: ArrayLike,
     prior_information: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Information (J, 3, 3), in 1/m², that D observations and the priors give about J joints.
+    """Information matrices (J, 3, 3), in 1/m², of J joints from D observations and the priors.
 
-    Observation d is of `joint[d]` (D,) in `view[d]` (D,) to within `sigmas_px[d]` (D,); `points_world` (J, 3)
-    is where the joints are thought to be; `K` (V, 3, 3) and `cTw` (V, 3, 4) are the cameras;
-    `prior_information` is (J, 3, 3), zero where a joint has no prior. Observations from behind a camera
-    count nothing. ValueError where a sigma is not positive and finite.
+    Observation d is of `joint[d]` (D,) in `view[d]` (D,) with standard deviation `sigmas_px[d]`
+    (D,); `points_world` (J, 3), metres, are the estimated positions; `K` (V, 3, 3) and `cTw` (V, 3,
+    4) are the cameras; `prior_information` is (J, 3, 3), zero where a joint has no prior. Joints
+    behind a camera are ignored in that view. ValueError if a sigma is not positive and finite.
     """
     points = np.asarray(points_world, dtype=np.float64)
     joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
@@ -41,11 +43,13 @@ def joint_information(
 def determined(
     information: ArrayLike, *, max_sigma_m: float = 1.0, max_condition: float = 1e10
 ) -> NDArray[np.bool_]:
-    """Which of J joints their `information` (J, 3, 3), in 1/m², pins down in all three directions.
+    """Which of J joints are determined in all three directions by their `information` (J, 3, 3), in
+    1/m².
 
-    Rank 3 in numbers: the standard deviation along the weakest direction is at most `max_sigma_m`, and the
-    ratio of the largest to the smallest eigenvalue at most `max_condition`, so that the solver's Cholesky
-    factorisation keeps digits. A joint without observations, or with NaN, is not determined.
+    Rank 3 in numbers: the standard deviation along the weakest direction is at most `max_sigma_m`,
+    and the ratio of the largest to the smallest eigenvalue at most `max_condition`, so that the
+    solver's Cholesky factorisation is accurate. A joint without observations, or with NaN, is not
+    determined.
     """
     matrices = np.asarray(information, dtype=np.float64)
     unknown = ~np.isfinite(matrices).all(axis=(1, 2), keepdims=True)

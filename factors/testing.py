@@ -1,6 +1,6 @@
 """Checks for a factor's test: its Jacobian against a numeric one, and zero error at the truth.
 
-They work for native factors and for `gtsam.CustomFactor`, with Gaussian or robust noise: yours too.
+They work for native factors and for `gtsam.CustomFactor`, with Gaussian or robust noise.
 """
 
 import gtsam
@@ -9,7 +9,7 @@ from gtsam import noiseModel
 from numpy.typing import NDArray
 
 Factor = gtsam.NoiseModelFactor | gtsam.LinearContainerFactor
-"""What can be checked."""
+"""Types of factors that can be checked."""
 
 
 def assert_jacobian(
@@ -37,8 +37,8 @@ def assert_jacobian(
 
 
 def assert_zero_at_truth(factor: Factor, values: gtsam.Values, *, atol: float = 1e-9) -> None:
-    """AssertionError unless the factor's raw residual at `values` is zero to `atol`, in its own unit; of a
-    `LinearContainerFactor`, which has no noise of its own, in standard deviations.
+    """AssertionError unless the factor's raw residual at `values` is zero to `atol`, in its own
+    unit; in standard deviations for a `LinearContainerFactor`, which has no noise model.
     """
     linear = isinstance(factor, gtsam.LinearContainerFactor)
     residual = _of_linear(factor, values) if linear else np.asarray(factor.unwhitenedError(values))
@@ -47,14 +47,16 @@ def assert_zero_at_truth(factor: Factor, values: gtsam.Values, *, atol: float = 
 
 
 def analytic_jacobian(factor: Factor, values: gtsam.Values) -> NDArray[np.float64]:
-    """The factor's own Jacobian (residual, tangent), over its Gaussian noise, in the order of its keys."""
+    """The analytic Jacobian (residual, tangent) of the factor, whitened by its Gaussian noise, in
+    the order of its keys.
+    """
     jacobian, right_hand_side = factor.linearize(values).jacobian()
     if isinstance(factor, gtsam.LinearContainerFactor):
         return np.asarray(jacobian)
     model = factor.noiseModel()
     if not isinstance(model, noiseModel.Robust):
         return np.asarray(jacobian)
-    # A robust kernel scales Jacobian and residual by the same square root of a weight: undo it.
+    # A robust kernel scales Jacobian and residual by the square root of the same weight: undo it.
     whitened = np.linalg.norm(_whitened(factor, values))
     scale = np.linalg.norm(right_hand_side) / whitened if whitened > 0 else 1.0
     if scale == 0.0:
@@ -63,7 +65,9 @@ def analytic_jacobian(factor: Factor, values: gtsam.Values) -> NDArray[np.float6
 
 
 def numeric_jacobian(factor: Factor, values: gtsam.Values, step: float = 1e-5) -> NDArray[np.float64]:
-    """Central differences of the residual over its Gaussian noise, in the order of the factor's keys."""
+    """Central differences of the residual whitened by its Gaussian noise, in the order of the
+    factor's keys.
+    """
     columns = []
     keys = list(factor.keys())
     for key in keys:
@@ -78,7 +82,7 @@ def numeric_jacobian(factor: Factor, values: gtsam.Values, step: float = 1e-5) -
 
 
 def _whitened(factor: Factor, values: gtsam.Values) -> NDArray[np.float64]:
-    """Residual over its Gaussian noise, without any robust kernel."""
+    """Residual whitened by the Gaussian noise, without any robust kernel."""
     if isinstance(factor, gtsam.LinearContainerFactor):
         return _of_linear(factor, values)
     residual = np.asarray(factor.unwhitenedError(values))
@@ -89,7 +93,9 @@ def _whitened(factor: Factor, values: gtsam.Values) -> NDArray[np.float64]:
 
 
 def _of_linear(factor: gtsam.LinearContainerFactor, values: gtsam.Values) -> NDArray[np.float64]:
-    """Residual of a linear factor over its noise; AssertionError where its error is not that of it."""
+    """Whitened residual of a linear factor; AssertionError if it does not agree with the factor's
+    error.
+    """
     residual = -np.asarray(factor.linearize(values).jacobian()[1])
     if not np.isclose(factor.error(values), residual @ residual / 2, rtol=1e-9, atol=1e-12):
         raise AssertionError(

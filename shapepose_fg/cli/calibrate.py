@@ -1,4 +1,4 @@
-"""The command `calibrate`: poses of cameras from walking people."""
+"""The command `calibrate`: estimates camera poses from walking people."""
 
 import json
 import tempfile
@@ -31,37 +31,38 @@ if TYPE_CHECKING:
     from shapepose_fg.calibration.from_people import Calibrated
     from shapepose_fg.core.camera import Rig
 
-_CAMERAS = "What is known"
+_CAMERAS = "Prior knowledge"
 _FILE_OFF, _GUESS_OFF = 0.02, 0.2
-"""Prior standard deviations of focal lengths from a calibration, and from a field of view, as shares of them."""
+"""Relative prior standard deviations of focal lengths from a calibration, and from a field of view."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensOptions:
-    """2D detections, and the lenses of the cameras."""
+    """Options: 2D detections, and the lenses of the cameras."""
 
-    detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
+    detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
-        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
     )
-    calibration: Path | None = option(INPUT, "File of the lenses; its poses, if any, are not used.")
+    calibration: Path | None = option(INPUT, "Calibration with the intrinsics; poses in it are ignored.")
     field_of_view: list[str] | None = option(
         INPUT,
-        "Without one: degrees from left to right, or a photo with EXIF; of one camera CAMERA=...",
+        "Instead of a calibration: horizontal field of view in degrees, or a photo with EXIF; of one camera:"
+        " CAMERA=...",
         metavar="DEG",
     )
-    image_size: str | None = option(INPUT, "Size of pictures where no file says it.", metavar="WxH")
-    cameras: str | None = option(INPUT, "Only these cameras.", metavar="A,B")
-    without: str | None = option(INPUT, "All cameras but these.", metavar="A,B")
+    image_size: str | None = option(INPUT, "Picture size, if no file contains it.", metavar="WxH")
+    cameras: str | None = option(INPUT, "Use only these cameras.", metavar="A,B")
+    without: str | None = option(INPUT, "Leave out these cameras.", metavar="A,B")
 
     def rig(self) -> "Rig":
-        """The cameras without poses; InputError where their lenses are unknown."""
+        """The cameras without poses; InputError if their lenses are unknown."""
         from shapepose_fg.core.camera import choose
         from shapepose_fg.io.calibration import read_rig
         from shapepose_fg.io.lenses import lenses_of
 
         if (self.calibration is None) == (self.field_of_view is None):
-            raise InputError("--calibration or --field-of-view: one of them must say how wide the cameras see")
+            raise InputError("--calibration, --field-of-view: the focal lengths are needed; give one of them")
         size = picture_size(self.image_size)
         if self.calibration is not None:
             rig = read_rig(self.calibration, up="z", unit="m", image_size=size)
@@ -80,27 +81,25 @@ def calibrate(
     seen: LensOptions,
     rate: RateOptions,
     focal: bool = option(
-        _CAMERAS, "Refine focal lengths: by 2 % of a calibration, 20 % of a field of view.", False
+        _CAMERAS, "Refine focal lengths; prior sigma 2 % from a calibration, 20 % from a field of view.", False
     ),
-    stature: float | None = option(
-        _CAMERAS, "People's median stature in metres; without it that of adults, 1.70."
-    ),
+    stature: float | None = option(_CAMERAS, "Median stature of the people, metres; by default 1.70, of adults."),
     distance: list[str] | None = option(
-        _CAMERAS, "Metres between the lenses of two cameras, which then say the scale.", metavar="CAM,CAM=M"
+        _CAMERAS, "Distance between two cameras in metres; it determines the scale.", metavar="CAM,CAM=M"
     ),
-    output: Path = option(RESULT, "File for the cameras, our own JSON.", REQUIRED),
+    output: Path = option(RESULT, "Rig file (JSON) for the cameras.", REQUIRED),
     times: Path | None = option(
-        TIME, "Cameras were started by hand: find when, too, and write the times of all frames here."
+        TIME, "File for the times of all frames; estimate the start times of unsynchronised cameras, too."
     ),
-    most: float = option(TIME, "With --times: seconds by which they were started apart, at most.", MOST_S),
+    most: float = option(TIME, "Largest offset between cameras for --times, seconds.", MOST_S),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
-    """Find where cameras stand by the people whom they see; lenses must be known, or guessed.
+    """Estimate camera poses from the people in the recording; lenses must be known or guessed.
 
-    Film a minute: cameras still, each sharing part of its picture with another; two or more people who walk
-    through all views, near and far, arms raised at times, not on one line. Exit code 1 where that does not
-    determine the cameras; nothing is written then.
+    Film for a minute with fixed cameras whose views overlap. Two or more people walk through all
+    views, near and far, not along one line, and move their arms. Exit code 1 if this does not
+    determine the cameras; then nothing is written.
     """
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
     from shapepose_fg.calibration.levelling import Measured
@@ -114,7 +113,7 @@ def calibrate(
         raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
     check_most(most)
     if times is not None and rate.timestamps is not None:
-        raise InputError("--times and --timestamps: when frames were taken is sought, or known; give one of them")
+        raise InputError("--times and --timestamps: times are either estimated or given; give one of them")
     off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
     rig = seen.rig()
     measured = Measured(stature, _distances(distance or [], rig.names))
@@ -145,7 +144,7 @@ def calibrate(
             rig=found.rig,
             points=people.points,
             frame=people.frame,
-            # Moments of one clock that was found begin at 0.
+            # Frame sets of an estimated clock start at time 0.
             time_s=known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps,
             skeleton=recording.skeleton,
             heads=heads,
@@ -155,7 +154,7 @@ def calibrate(
             remarks=found.notes,
         )
         page.write(report)
-        note(f"{report}: the cameras in 3D and the people, to be opened in a browser")
+        note(f"{report}: cameras and people in 3D, to open in a browser")
     if as_json:
         told = found.as_dict() | ({} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]})
         print(json.dumps(told, indent=2, allow_nan=False))
@@ -167,20 +166,20 @@ def calibrate(
             show_clocks(clocks, rig)
             print(f"{times}: times of {len(recording)} frames")
             given = {"--timestamps": times}
-        print(f"{output}: our own rig file")
+        print(f"{output}: rig file")
         options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
         print(next_reconstruct(options | given | {"--output": "results"}))
 
 
 _CAPTION = (
-    "± is one sigma, the rig's place and size aside; shared: of its people, seen by another camera too;"
-    " halves: how far apart the two halves of the recording place it"
+    "±: one sigma, relative to the rig; shared: share of its people seen by another camera, too; halves:"
+    " difference between its poses from the first and the second half of the recording"
 )
 
 
 def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """The cameras with standard deviations: headings, and each camera's figures."""
-    heads = ["people", "shared", "x y z, m", "turn ± °", "place ± mm", "halves, °"] + ["focal, px"] * focal
+    """The cameras with standard deviations: headings, and the values of each camera."""
+    heads = ["people", "shared", "x y z, m", "rotation ± °", "position ± mm", "halves, °"] + ["focal, px"] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
         place = " ".join(f"{value:.2f}" for value in each["centre_m"])
@@ -192,19 +191,20 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
-    """Scale, up and fit, a line each."""
+    """Scale, up axis and fit, one line each."""
     world = found.world
     if distances:
-        whose = f"{' '.join(distances)}, people are {world.stature_m:.2f} m tall in the median"
+        whose = f"{' '.join(distances)}; the median stature of the people is {world.stature_m:.2f} m"
     else:
-        whose = f"people of {stature:g} m" if stature is not None else "adults of 1.70 m in the median"
-        whose += f", {world.persons} at once"
-    better = "" if distances else "; --distance between two cameras says it better"
-    level = "from feet on the floor" if world.floor is not None else "from bodies alone, no level floor was found"
+        whose = f"median stature {stature:g} m" if stature is not None else "assumed median stature 1.70 m"
+        whose += f", {world.persons} people at once"
+    better = "" if distances else "; give --distance for a better one"
+    level = "from feet on the floor" if world.floor is not None else "from bodies, because no level floor was"
+    " found"
     return [
         f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma{better}",
         f"up: z, {level}; the floor is at 0",
-        f"a joint as against the other cameras, on frames that were not used: {found.held_out_px:.2f} px",
+        f"error of a joint against the other cameras, on frames that were not used: {found.held_out_px:.2f} px",
     ]
 
 

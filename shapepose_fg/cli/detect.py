@@ -1,4 +1,6 @@
-"""The command `detect`: 2D detections in videos or pictures of cameras, calibrated or not."""
+"""The command `detect`: computes 2D detections in videos or pictures of calibrated or uncalibrated
+cameras.
+"""
 
 import shlex
 import time
@@ -35,35 +37,47 @@ _NETWORK = "Network"
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
-    """The network that detects, and how it is executed."""
+    """Options: the detection network, and how it is executed."""
 
-    network: str | None = option(_NETWORK, "ONNX file, TOML file of a network, or a name.", metavar="FILE|NAME")
-    download: str | None = option(_NETWORK, "The same by name, fetched once: rtmpose-s -m -x.", metavar="NAME")
-    boxes: str | None = option(_NETWORK, "What finds people for RTMPose: a YOLOX.", metavar="FILE|NAME")
-    layout: str | None = option(_NETWORK, "OpenPose's: tf-pose, openpose-coco, openpose-body25.", metavar="NAME")
-    long_side: int | None = option(_NETWORK, "OpenPose's: pixels that it is shown along the longer side (656).")
-    backend: str | None = option(RUN, "OpenPose's: opencv (what is taken) or onnxruntime.", metavar="NAME")
-    device: str = option(RUN, "Where onnxruntime runs: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
+    network: str | None = option(
+        _NETWORK, "ONNX file, TOML file of a network, or name of a downloaded network.", metavar="FILE|NAME"
+    )
+    download: str | None = option(
+        _NETWORK, "Download a network by name, once: rtmpose-s, rtmpose-m or rtmpose-x.", metavar="NAME"
+    )
+    boxes: str | None = option(_NETWORK, "Person detector for RTMPose: a YOLOX network.", metavar="FILE|NAME")
+    layout: str | None = option(
+        _NETWORK,
+        "Keypoint layout of an OpenPose network: tf-pose, openpose-coco, openpose-body25.",
+        metavar="NAME",
+    )
+    long_side: int | None = option(_NETWORK, "Longer side of the input of an OpenPose network, pixels (656).")
+    backend: str | None = option(
+        RUN, "Backend of an OpenPose network: opencv (default) or onnxruntime.", metavar="NAME"
+    )
+    device: str = option(RUN, "Device of onnxruntime: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
 
     def load(self) -> "Network":
-        """The network, downloaded if requested; InputError where options contradict each other."""
+        """The network, downloaded if requested; InputError if options contradict each other."""
         from shapepose_fg.detection2d.download import named_file
         from shapepose_fg.detection2d.opening import open_network
 
         if self.network is None and self.download is None:
-            raise InputError("say what detects: --download rtmpose-m the first time, or --network FILE")
+            raise InputError(
+                "--network, --download: missing; give --download rtmpose-m the first time, or --network FILE"
+            )
         if self.network is not None and self.download not in (None, self.network, self.boxes):
             raise InputError(
-                f"--download {self.download}: neither --network nor --boxes is called so; leave it out"
+                f"--download {self.download}: this is neither the name of --network nor of --boxes; leave it out"
             )
         if self.backend not in (None, "opencv", "onnxruntime"):
             raise InputError(f"--backend {self.backend}: must be opencv or onnxruntime")
         if self.backend == "opencv" and self.device != "cpu":
-            raise InputError(f"--device {self.device}: opencv runs on the cpu; leave --backend out")
+            raise InputError(f"--device {self.device}: opencv runs on the CPU only; leave out --backend")
         if self.long_side is not None and not 128 <= self.long_side <= 4096:
             raise InputError(f"--long-side {self.long_side}: must be 128 to 4096 pixels")
         openpose = {"layout": self.layout, "long_side": self.long_side, "backend": self.backend}
-        with progress("fetching the network", "bytes") as fetched:
+        with progress("downloading the network", "bytes") as fetched:
             found = partial(named_file, fetch=self.download is not None, say=note, progress=fetched)
             network = self.network or self.download or ""
             return open_network(network, self.boxes, found, self.device, **openpose)
@@ -71,10 +85,12 @@ class NetworkOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockOptions:
-    """Times of the pictures."""
+    """Options: times of the pictures."""
 
-    fps: list[str] | None = option(TIME, "Frames a second, where files do not say.", metavar="RATE|CAMERA=RATE")
-    start: list[str] | None = option(TIME, "When its first frame was taken: 0.2s, or 12f.", metavar="CAMERA=TIME")
+    fps: list[str] | None = option(
+        TIME, "Frame rate, Hz, if the files do not contain it.", metavar="RATE|CAMERA=RATE"
+    )
+    start: list[str] | None = option(TIME, "Time of a camera's first frame: 0.2s, or 12f.", metavar="CAMERA=TIME")
     frames: str | None = frames_option()
 
 
@@ -84,13 +100,16 @@ def detect(
     pictures: PictureOptions,
     network: NetworkOptions,
     clock: ClockOptions,
-    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras and videos; detections go into pose/."),
-    output: Path | None = option(RESULT, "Folder for the detections; made if it is not there."),
+    project: Path | None = option(
+        INPUT, "Pose2Sim project: use its cameras and videos, write detections into pose/."
+    ),
+    output: Path | None = option(RESULT, "Folder for the detections; created if missing."),
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: by RTMPose, or another network in ONNX.
 
-    Pictures of rolled cameras are turned upright first; the calibration knows how. Without one the cameras are
-    called as their videos, for `calibrate`. A run that is stopped goes on where it was when it is started again.
+    With a calibration, pictures of rolled cameras are rotated upright first. Without one, cameras
+    are named after their videos, for `calibrate`. An interrupted run continues when the same
+    command is started again.
     """
     if project is not None:
         from shapepose_fg.io.pose2sim_project import footage_of
@@ -99,8 +118,8 @@ def detect(
         cameras = replace(cameras, calibration=cameras.calibration or calibration)
         pictures, output = replace(pictures, videos=pictures.videos or [str(videos)]), output or pose
     if pictures.videos is None or output is None:
-        missing = "--videos, the cameras' videos or pictures" if pictures.videos is None else "--output, a folder"
-        raise InputError(f"what to read or where to write is missing; give {missing}")
+        missing = "--videos" if pictures.videos is None else "--output"
+        raise InputError(f"{missing}: missing; give it, or --project with the folder of a Pose2Sim project")
     from shapepose_fg.core.moments import align, own_frames
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
@@ -115,7 +134,8 @@ def detect(
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     note(*concluded)
     clocks = clocks_of(footage, clock.fps or [], clock.start or [], rig.names)
-    # Pictures of one number belong together; when videos began is known only where somebody says it.
+    # Pictures with the same number belong together. Start times of videos are known only if the
+    # user gives them.
     timed = clock.start is not None or all(each.path.is_dir() for each in footage)
     moments = align(*clocks) if timed else own_frames(*clocks)
     span = frame_range(clock.frames, len(moments))
@@ -132,16 +152,16 @@ def detect(
         try:
             joints, unreadable = run_detection(run, done)
         except Stopped as stop:
-            raise Stopped(stop.number, "the same command goes on from here") from None
+            raise Stopped(stop.number, "run the same command again to continue") from None
     for name, failed in zip(rig.names, unreadable, strict=True):
         if failed > 0:
-            note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; nothing is detected there")
+            note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; they have no detections")
     show(_summary(run, joints, unreadable, time.perf_counter() - begin))
     print(_next_command(run, cameras, project, loaded))
 
 
 def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "RenderableType":
-    """Number of detections in each camera's pictures, and time that it took."""
+    """Number of detections in each camera's pictures, and the time taken."""
     rows = []
     for view, each in enumerate(run.cameras):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - unreadable[view]
@@ -152,15 +172,15 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
     frames, views = run.moments.picture.shape
     speed = f"{1e3 * seconds / max(frames * views, 1):.0f} ms a picture"
     caption = f"{frames} frames of {views} cameras in {seconds:.1f} s, {speed}"
-    return table("camera pictures size turned shown joints".split(), rows, caption=caption)
+    return table("camera pictures size rotated input joints".split(), rows, caption=caption)
 
 
 def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network") -> str:
-    """The next command, as a line to copy into any shell."""
+    """The next command, as a line that can be copied into any shell."""
     output = run.output
     if cameras.calibration is None:
         folder, sizes = output.resolve(), {each.camera.name: each.footage.size for each in run.cameras}
-        # A phone sees 65 degrees along the longer side of a video.
+        # A phone has a field of view of 65 degrees along the longer side of a video.
         wide = {name: "65" if width >= height else "40" for name, (width, height) in sizes.items()}
         fields = list(wide.values())[:1] if len(set(wide.values())) == 1 else [f"{n}={d}" for n, d in wide.items()]
         words = ["shapepose-fg", "calibrate", "--detections", folder, "--focal"]

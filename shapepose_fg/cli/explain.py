@@ -1,4 +1,4 @@
-"""The command `explain`: explains why a joint of a result is where it is."""
+"""The command `explain`: explains which measurements determine a joint of a result."""
 
 import json
 from pathlib import Path
@@ -20,14 +20,18 @@ def explain(
     person: int = argument("PERSON", "Number of the person: `shapepose-fg tracks RESULTS` lists them."),
     joint: str = argument("JOINT", "Name of the joint, such as RWrist."),
     frame: int | None = option(TIME, "Frame number."),
-    time: float | None = option(TIME, "Time, seconds: the person's frame nearest to it is explained."),
-    detections: Path | None = option(INPUT, "Folder that was reconstructed: names refused detections, too."),
+    time: float | None = option(TIME, "Time, seconds; the nearest frame of the person is used."),
+    detections: Path | None = option(
+        INPUT, "Folder of detections that was reconstructed: lists rejected detections, too."
+    ),
     skeleton: str | None = option(
-        INPUT, "The detector's joints, as in the reconstruction: a layout or a TOML file.", metavar="NAME"
+        INPUT, "Keypoint layout of the detector, as in the reconstruction: a name or a TOML file.", metavar="NAME"
     ),
     as_json: bool = json_option(),
 ) -> None:
-    """Say why a joint is where it is: what each camera, the body and motion say, and what is the matter."""
+    """Explain why a joint is where it is: the shares of cameras, body and motion, and any problems
+    found.
+    """
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.core.result_files import results_folder
     from shapepose_fg.io.detections.reading import read_detections
@@ -35,7 +39,7 @@ def explain(
     from shapepose_fg.pipeline.explaining import explain
 
     if (frame is None) == (time is None):
-        raise InputError("--frame, --time: give one of them")
+        raise InputError("--frame and --time: give one of them")
     folder = results_folder(results)
     rig, people = cameras_of(folder), Reconstruction.load(folder)
     seen = None if detections is None else read_detections(detections, rig, skeleton)
@@ -47,11 +51,11 @@ def explain(
 
 
 def _screen(found: "Explanation") -> "RenderableType":
-    """Sentences, and a line per camera."""
+    """Sentences, and a table with a line per camera."""
     from rich.console import Group
     from rich.text import Text
 
-    heads = "camera detection score theirs off sigmas weight used".split()
+    heads = "camera detection score probability off sigmas weight gate".split()
     rows = [
         (
             view.camera,
@@ -65,7 +69,7 @@ def _screen(found: "Explanation") -> "RenderableType":
         for view in found.views
     ]
     caption = (
-        "theirs: probability that it is this person's; off: from where all else has the joint;"
-        " weight: share of what is known"
+        "probability: of belonging to this person; off: distance from where all other measurements place the"
+        " joint; weight: share of the joint's information"
     )
     return Group(*map(Text, found.words), Text(), table(heads, rows, caption=caption))

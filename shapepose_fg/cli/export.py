@@ -12,12 +12,20 @@ from shapepose_fg.core.storage.files import inside
 @grouped
 def export(
     take: TakeOptions,
-    formats: list[str] = argument("FORMAT...", "Some of amass trc c3d bvh glb csv parquet mcap rrd, or all."),
-    output: Path | None = option(RESULT, "Folder for the files; by default `export` in RESULTS."),
-    markers: str = option(RESULT, "Of trc, c3d: opensim (Pose2Sim's), joints (ours), body (SMPL's).", "opensim"),
-    fill_gaps: float = option(RESULT, "Holes up to this are filled in amass and bvh.", 0.2, metavar="SECONDS"),
+    formats: list[str] = argument("FORMAT...", "Formats: amass trc c3d bvh glb csv parquet mcap rrd, or all."),
+    output: Path | None = option(RESULT, "Folder for the files; by default RESULTS/export."),
+    markers: str = option(
+        RESULT,
+        "Marker set of trc and c3d: opensim (as Pose2Sim), joints (of the result), body (of SMPL).",
+        "opensim",
+    ),
+    fill_gaps: float = option(
+        RESULT, "Longest gap that is filled in amass and bvh, seconds.", 0.2, metavar="SECONDS"
+    ),
 ) -> None:
-    """Write a result for others: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet mcap rrd."""
+    """Write a result in formats of other programs: shapepose-fg export RESULTS amass trc c3d bvh
+    glb csv parquet mcap rrd.
+    """
     from shapepose_fg.io.export.markers import MarkerSet
     from shapepose_fg.io.export.registry import FORMATS, chosen, export_result
 
@@ -25,7 +33,7 @@ def export(
         raise InputError(f"--markers {markers}: must be one of {' '.join(MarkerSet)}")
     how = take.how()
     if not 0 <= fill_gaps <= 3600:
-        raise InputError(f"--fill-gaps {fill_gaps:g}: must be seconds, 0 or more")
+        raise InputError(f"--fill-gaps {fill_gaps:g}: must be 0 to 3600 seconds")
     wanted = list(FORMATS.values()) if "all" in formats else chosen(formats)
     output = inside(results_folder(take.results), "export") if output is None else output
     more = {"markers": MarkerSet(markers), "fill_gaps_s": fill_gaps, "body": take.body}

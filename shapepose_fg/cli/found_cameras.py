@@ -1,4 +1,6 @@
-"""Options and output that `calibrate`, `refine-calibration` and `synchronise` share: estimated time offsets."""
+"""Options and output shared by `calibrate`, `refine-calibration` and `synchronise`: estimated time
+offsets.
+"""
 
 import math
 import tempfile
@@ -16,12 +18,12 @@ if TYPE_CHECKING:
     from shapepose_fg.io.detections.people import DeclaredJoints
 
 MOST_S = 60.0
-"""Largest offset between cameras that were started by hand, where the user gives none, s."""
+"""Default maximum offset between cameras that were started by hand, s."""
 
 
 def report_option() -> Any:
-    """The option for a page with pictures."""
-    return option(RESULT, "Page with the cameras in 3D and people over them, for the browser: FILE.html.")
+    """The option for an HTML report with drawings."""
+    return option(RESULT, "Page for the browser with cameras and people in 3D: FILE.html.")
 
 
 def found_clocks(
@@ -32,10 +34,11 @@ def found_clocks(
     most: float,
     frames: str | None = None,
 ) -> "tuple[Synchronised, Array]":
-    """Offsets of cameras with known poses, up to `most` seconds apart, and (T, V) times of the frames, seconds on
-    a common clock; NaN for frames that a camera lacks.
+    """Offsets of cameras with known poses, up to `most` seconds apart, and (T, V) times of the
+    frames, seconds on a common clock; NaN for missing frames.
 
-    Their rate is `fps`, without it that of times.csv beside; InputError where there is none.
+    Their rate is `fps`, by default that of times.csv beside the detections; InputError if there is
+    none.
     """
     from shapepose_fg.calibration.synchronisation import synchronise
     from shapepose_fg.core.frame_times import rate_of
@@ -45,7 +48,7 @@ def found_clocks(
         recording, times = read_recording(detections, rig, skeleton, Path(folder), fps, own_frames=True)
         note(*recording.notes)
         if times is None or len(times) < 2:
-            raise InputError("--fps: missing; say how many frames a second the cameras took")
+            raise InputError("--fps: missing; give the frame rate of the cameras")
         span = frame_range(frames, len(recording), recording.first)
         with progress("comparing", "pairs") as done:
             found = synchronise(recording, rig, fps or rate_of(times.frame_s), span, most, progress=done)
@@ -53,7 +56,7 @@ def found_clocks(
 
 
 def check_most(most: float) -> None:
-    """Refuse an invalid largest offset."""
+    """InputError for an invalid maximum offset."""
     if not 0 < most <= 600:
         raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
 
@@ -64,5 +67,6 @@ def show_clocks(found: "Synchronised", rig: "Rig") -> None:
     for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
         known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"
         rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
-    caption = "began: its frame 0, on the first camera's clock; stands out: the offset of all others"
-    show(table(("camera", "began, s", "± ms", "stands out"), rows, caption=caption))
+    caption = "start: time of the camera's frame 0 on the first camera's clock; distinct: how clearly the best"
+    " offset differs from all others"
+    show(table(("camera", "start, s", "± ms", "distinct"), rows, caption=caption))

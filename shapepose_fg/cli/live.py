@@ -1,4 +1,4 @@
-"""The command `live`: online reconstruction from detections as they come in."""
+"""The command `live`: online reconstruction from detections as they arrive."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -14,22 +14,27 @@ if TYPE_CHECKING:
 @grouped
 def live(
     cameras: CameraOptions,
-    detections: str | None = option(INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; standard input."),
+    detections: str | None = option(
+        INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; by default standard input."
+    ),
     skeleton: str | None = option(
-        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
     ),
-    lag: float = option(TIME, "How much later refined people follow, seconds.", 0.3),
+    lag: float = option(TIME, "Delay of the refined people, seconds.", 0.3),
     output: list[str] | None = option(
-        RESULT, "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun to look; standard output; may be repeated."
+        RESULT,
+        "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun for the viewer; by default standard"
+        " output; may be repeated.",
     ),
-    workers: int = option(RUN, "Processes that refine; 1: none but this one.", 2),
+    workers: int = option(RUN, "Number of processes, with this one.", 2),
 ) -> None:
-    """Follow people while a detector runs: a line per camera and picture in, lines of people out.
+    """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines of people.
 
-    In: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people". Out: "now" after each
-    frame, "settled" when its people are refined. Ends with the input; a line that cannot be used is left out with
-    a note. A socket listens on this machine only, unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2
-    messages. `rerun` starts that viewer, rerun+http://HOST:9876/proxy is one that runs.
+    Input: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people".
+    Output: "now" after each frame, and "settled" when its people have been refined. The command
+    ends with the input; invalid lines are skipped with a note. A socket accepts connections from
+    this machine only, unless an address is given (tcp://0.0.0.0:PORT). An .mcap file has ROS 2
+    messages. `rerun` starts the viewer; rerun+http://HOST:9876/proxy connects to a running one.
     """
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.io.skeleton_file import find_skeleton
@@ -60,7 +65,7 @@ def live(
                 publish("settled", people.settled())
             if report.jumps > jumps:
                 jumps = report.jumps
-                of_cameras(f"all cameras jumped to {view[2]:.2f} s")
+                of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
             said = _say(people, said, of_cameras)
 
         try:
@@ -70,12 +75,14 @@ def live(
             raise
         publish("settled", people.finish())
         report = people.report()
-    out = f"{report.dropped} came too late, twice or at another time"
+    out = f"{report.dropped} measurements were dropped (late, repeated, or at the wrong time)"
     note(f"{report.frames} frames, {report.late} of them late; {out}")
 
 
 def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]) -> "Said | None":
-    """Print changes of cameras' statuses since the `last` printed one; returns the last one now."""
+    """Print changes of the cameras' statuses since `last`, the last printed ones; returns the
+    current ones.
+    """
     events = people.said()
     if len(events) == 0 or events[-1] is last:
         return last

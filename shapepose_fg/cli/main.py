@@ -43,16 +43,17 @@ from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.storage.output_folder import prepare_output
 
-# Everything else is imported inside the commands: `--help` must not wait for GTSAM and Numba.
+# All other modules are imported inside the commands, so that `--help` does not wait for GTSAM and
+# Numba.
 
 app = typer.Typer(
     name="shapepose-fg",
-    help="Every person in the room in 3D, with a body, from several calibrated cameras.",
+    help="Reconstruct several people in 3D, with bodies, from several calibrated cameras.",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
-_RECORDING, _RESULT, _TRY = "From a recording to a result", "With a result", "To try, and to compare"
+_RECORDING, _RESULT, _TRY = "Reconstruct a recording", "Use a result", "Try and evaluate"
 for _panel, _commands in {
     _RECORDING: (detect, calibrate, check_calibration, refine_calibration, synchronise, reconstruct, live, batch),
     _RESULT: (report, overlay, view, explain, export),
@@ -67,7 +68,7 @@ app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 _MOVED = {"--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
 """Removed options, and their replacements."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
-"""The exception of typer for a wrong command line; versions keep the class in different places."""
+"""typer's exception for an invalid command line; its place differs between versions."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -84,17 +85,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; {cure}")
     except InputError as error:
         code = _fail(str(error))
-    except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
-        # Or Python would complain at exit that it cannot flush.
+    except BrokenPipeError:  # the reader of our output, such as `head`, has ended
+        # Otherwise Python reports at exit that it cannot flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     except (OSError, MemoryError, RuntimeError) as error:
         if (what := failure(error)) is None:
             raise
         is_file = isinstance(error, OSError)
-        code = _fail(f"{what}; {'check path, permissions and space left' if is_file else 'start it again'}")
+        code = _fail(
+            f"{what}; {'check the path, permissions and free disk space' if is_file else 'start it again'}"
+        )
     except Stopped as stop:
-        say("stopped", stop.message or "nothing is left half written", "bold yellow")
+        say("stopped", stop.message or "no incomplete files are left", "bold yellow")
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
@@ -105,10 +108,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 @grouped
 def evaluate_shelf_command(
     results: Path = argument("RESULTS", "Folder of a reconstruction."),
-    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, as text.", REQUIRED),
+    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, a text file.", REQUIRED),
     as_json: bool = json_option(),
 ) -> None:
-    """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
+    """Compute PCP per limb and actor, MPJPE and recall on the Shelf recording."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.evaluation.shelf import evaluate_shelf
     from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
@@ -130,7 +133,7 @@ it saw the people are reconstructed, over time."""
 @grouped
 def demo(
     output: Path = option(RESULT, "Folder for the result.", Path("demo")),
-    report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report"),
+    report: bool = option(RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"),
 ) -> None:
     """Reconstruct a built-in scene of four people and compare it with the truth."""
     prepare_output(output)
@@ -159,7 +162,7 @@ def config(preset: Preset = preset_option(Preset.ACCURATE)) -> None:
 
 @app.command(rich_help_panel=_TRY)
 def version() -> None:
-    """Print the versions of this program and of what it stands on."""
+    """Print the versions of this program and of the packages that it uses."""
     from shapepose_fg.core.provenance import versions
 
     for name, number in versions().items():

@@ -1,4 +1,4 @@
-"""Options that several commands share, in groups, and the parsing of ranges of frames and sizes."""
+"""Options that several commands share, in groups; parses ranges of frames, and sizes."""
 
 import inspect
 import re
@@ -24,14 +24,16 @@ if TYPE_CHECKING:
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
-INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "What is drawn"
+INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "Drawing"
 """Headings under which `--help` lists options."""
 REQUIRED: Any = MISSING
 """Placeholder for the default of a required option."""
 
 
 def option(group: str, text: str, default: Any = None, *names: str, **more: Any) -> Any:
-    """An option under a heading, with its help: the default of a `grouped` command's parameter, or of a field."""
+    """Declare an option under the heading `group`, with its help text: used as the default of a
+    parameter of a `grouped` command, or of a field.
+    """
     shown = isinstance(default, str | int | float | Path) and not isinstance(default, bool)
     how: dict[str, Any] = {"show_default": shown, "help": text, "rich_help_panel": group}
     return field(default=default, metadata={"typer": typer.Option(*names, **how | more)})
@@ -43,7 +45,7 @@ def argument(metavar: str, text: str) -> Any:
 
 
 class Preset(StrEnum):
-    """Named sets of settings."""
+    """Named sets of settings (presets)."""
 
     ACCURATE = "accurate"
     FAST = "fast"
@@ -62,16 +64,16 @@ class Preset(StrEnum):
 
 
 def preset_option(default: Preset | None) -> Any:
-    """The option for a preset."""
+    """The option `--preset`."""
     return option(
         RESULT,
-        "accurate (default); fast: in every third frame or so, and motion between; paper: as the paper has it.",
+        "Settings: accurate (default); fast (solves about every third frame); paper (the method as published).",
         default,
     )
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`command` for typer: each field of a dataclass among its parameters becomes an option."""
+    """Convert `command` for typer: each field of a parameter that is a dataclass becomes an option."""
     hints, parameters = get_type_hints(command), list[inspect.Parameter]()
     taken: dict[str, list[str]] = {}
 
@@ -103,13 +105,13 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def frames_option() -> Any:
-    """The option for frames of a recording, or of a result."""
-    return option(TIME, "Frames A to B-1; either may be left out.", metavar="A:B")
+    """The option for frames of a recording or of a result."""
+    return option(TIME, "Range of frames, A to B-1; either may be left out.", metavar="A:B")
 
 
 def workers_option() -> Any:
     """The option for the number of processes."""
-    return option(RUN, "Processes of this machine; by default as many as pay. They change no byte.")
+    return option(RUN, "Number of processes; by default as many as are useful. Results do not depend on it.")
 
 
 def json_option() -> Any:
@@ -122,39 +124,45 @@ class RunOptions:
     """Options of execution, and of interrupted runs."""
 
     workers: int | None = workers_option()
-    cluster: str | None = option(RUN, "Dask scheduler (tcp://host:8786) to solve, or `local`.", metavar="ADDRESS")
-    resume: bool = option(RUN, "Go on with what was stopped in --output.", False, "--resume")
-    restart: bool = option(RUN, "Begin anew, whatever was stopped in --output.", False, "--restart")
+    cluster: str | None = option(
+        RUN, "Dask scheduler for the solving (tcp://host:8786), or `local`.", metavar="ADDRESS"
+    )
+    resume: bool = option(RUN, "Continue the interrupted run in --output.", False, "--resume")
+    restart: bool = option(RUN, "Start again, and delete the interrupted run in --output.", False, "--restart")
 
     def check(self) -> None:
-        """Refuse options that contradict each other."""
+        """InputError if options contradict each other."""
         check_workers(self.workers)
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
-                f"--workers and --cluster {self.cluster}: these are processes of this machine, or of the cluster;"
-                " give one"
+                f"--workers and --cluster {self.cluster}: processes are either of this machine or of the"
+                " cluster; give one of them"
             )
         if self.resume and self.restart:
-            raise InputError("--resume and --restart: this goes on or begins anew; give one of them")
+            raise InputError(
+                "--resume and --restart: a run is either continued or started again; give one of them"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
     """The cameras of a recording."""
 
-    calibration: Path | None = option(INPUT, "Cameras: a file, or a folder, of one of the formats known.")
-    up: str | None = option(INPUT, "World axis that points up: x -x y -y z -z.", metavar="AXIS")
+    calibration: Path | None = option(INPUT, "Calibration of the cameras: a file or folder in a known format.")
+    up: str | None = option(INPUT, "World axis that points up: x, -x, y, -y, z or -z.", metavar="AXIS")
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
-    image_size: str | None = option(INPUT, "Size of calibrated pictures where the file has none.", metavar="WxH")
-    cameras: str | None = option(INPUT, "Only these of the calibration's cameras.", metavar="A,B")
-    without: str | None = option(INPUT, "All of its cameras but these.", metavar="A,B")
+    image_size: str | None = option(
+        INPUT, "Size of the calibrated pictures, if the file does not contain it.", metavar="WxH"
+    )
+    cameras: str | None = option(INPUT, "Use only these cameras.", metavar="A,B")
+    without: str | None = option(INPUT, "Leave out these cameras.", metavar="A,B")
 
     def rig(self) -> "Rig":
-        """The cameras; InputError where they cannot be used."""
+        """The cameras; InputError if they cannot be used."""
         from shapepose_fg.io.calibration import read_rig
 
         if self.calibration is None:
-            raise InputError("--calibration: missing; give the file, or the folder, of the cameras")
+            raise InputError("--calibration: missing; give the calibration file or folder")
         size = picture_size(self.image_size)
         up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
         chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
@@ -163,14 +171,14 @@ class CameraOptions:
         return found
 
     def chosen(self, names: Sequence[str]) -> list[str]:
-        """The wanted cameras among those of videos, which no calibration names."""
+        """The camera names that the user wants, among those of videos (without a calibration)."""
         from shapepose_fg.core.camera import choose
 
         with naming("--cameras, --without"):
             return choose(names, names_of(self.cameras), names_of(self.without) or ())
 
     def said(self) -> dict[str, object]:
-        """The options about the calibration, for the next command."""
+        """The options about the calibration, to be repeated in the next command."""
         names = ("up", "unit", "image_size", "cameras", "without")
         return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
 
@@ -179,48 +187,52 @@ class CameraOptions:
 class DetectionOptions(CameraOptions):
     """Cameras, and their 2D detections."""
 
-    detections: Path = option(INPUT, "Folder with what a 2D detector wrote of every camera.", REQUIRED)
+    detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
-        INPUT, "The detector's joints: a layout such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
     )
 
     def rig(self) -> "Rig":
-        """The cameras; InputError where they cannot be used, or are fewer than two."""
+        """The cameras; InputError if they cannot be used, or if there are fewer than two."""
         found = super().rig()
         if len(found) < 2:
-            raise InputError(f"{self.calibration}: at least 2 cameras are needed to see depth, got {len(found)}")
+            raise InputError(f"{self.calibration}: at least 2 cameras are needed, got {len(found)}")
         return found
 
     def still_rig(self, what: str) -> "Rig":
-        """The cameras, for `what` requires fixed cameras; InputError where one moves."""
+        """The cameras, which must be fixed; InputError if one moves. `what` names the command or
+        step that requires it.
+        """
         found = self.rig()
         moving = next((camera.name for camera in found.cameras if camera.carrier), None)
         if moving is not None:
-            cure = "leave it out of the calibration; reconstruct refines trajectories by itself"
-            raise InputError(f"{self.calibration}: camera {moving} moves, and {what} is for fixed cameras; {cure}")
+            cure = "leave it out with --without; reconstruct refines trajectories itself"
+            raise InputError(f"{self.calibration}: camera {moving} moves, and {what} needs fixed cameras; {cure}")
         return found
 
 
 @dataclass(frozen=True, kw_only=True)
 class Located(DetectionOptions):
-    """Cameras and detections whose paths are known."""
+    """Cameras and detections with known paths."""
 
     source: "Pose2SimProject | None" = None
-    """The project that they belong to; None where there is none."""
+    """The project to which they belong; None if there is none."""
 
     @property
     def joints(self) -> "str | DeclaredJoints | None":
-        """The detector's joints as the user states, else as the project does."""
+        """The detector's joints as given by the user, otherwise by the project."""
         return self.skeleton or (None if self.source is None else self.source.joints)
 
     def rate(self, given: "RateOptions") -> "RateOptions":
-        """Times of frames as the user states, else as the project does."""
+        """Times of frames as given by the user, otherwise by the project."""
         if self.source is None or given.fps is not None or given.timestamps is not None:
             return given
         return replace(given, fps=self.source.fps)
 
     def given(self) -> dict[str, object]:
-        """Options of the next command for the same detections and joints, the calibration left out."""
+        """Options to be repeated in the next command for the same detections and joints, without
+        the calibration.
+        """
         if self.source is None:
             return {"--detections": self.detections, "--skeleton": self.skeleton}
         return {"--project": self.source.folder, "--skeleton": self.skeleton}
@@ -230,11 +242,13 @@ class Located(DetectionOptions):
 class ProjectOptions(DetectionOptions):
     """Cameras and their 2D detections, each given or from a Pose2Sim project."""
 
-    detections: Path | None = option(INPUT, "Folder with what a 2D detector wrote of every camera.")
-    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections and rate.")
+    detections: Path | None = option(INPUT, "Folder with the 2D detections of all cameras.")
+    project: Path | None = option(INPUT, "Pose2Sim project: use its cameras, detections and frame rate.")
 
     def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
-        """The options with the paths of a project, and the project; `tell` receives its notes."""
+        """The options with the missing paths filled in from the project, and the project; `tell`
+        receives its notes.
+        """
         if self.project is None:
             return self, None
         from shapepose_fg.io.pose2sim_project import read_pose2sim_project
@@ -245,7 +259,7 @@ class ProjectOptions(DetectionOptions):
         return replace(self, calibration=calibration, detections=detections), source
 
     def located(self) -> Located:
-        """The options with known paths; InputError where one is missing."""
+        """The options with known paths; InputError if one is missing."""
         whole, source = self.completed()
         refuse_missing({"--calibration": whole.calibration, "--detections": whole.detections})
         given = {each.name: getattr(whole, each.name) for each in fields(DetectionOptions)}
@@ -256,8 +270,10 @@ class ProjectOptions(DetectionOptions):
 class TimeOptions:
     """Options about the times of frames."""
 
-    fps: float | None = option(TIME, "Frames a second; 30 where neither this nor times.csv says it.")
-    timestamps: Path | None = option(TIME, "Time of every frame, seconds; times.csv beside the detections.")
+    fps: float | None = option(TIME, "Frame rate, Hz; by default that of times.csv, else 30.")
+    timestamps: Path | None = option(
+        TIME, "File with the time of every frame, seconds; by default times.csv beside the detections."
+    )
 
     def read(
         self,
@@ -267,7 +283,7 @@ class TimeOptions:
         kept: Path,
         own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes | None]":
-        """The recording, and the times of its frames where they are known (`read_recording`); notes are
+        """The recording, and the times of its frames, None if unknown (`read_recording`); notes are
         printed.
         """
         from shapepose_fg.io.recording import read_recording
@@ -294,7 +310,7 @@ class RateOptions(TimeOptions):
         kept: Path,
         own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes, range]":
-        """The recording, its times, 30 frames a second where they are unknown, and the frames to use."""
+        """The recording, its times (30 frames a second if unknown), and the frames to use."""
         from shapepose_fg.core.frame_times import FrameTimes
 
         recording, times = self.read(detections, skeleton, rig, kept, own_frames)
@@ -303,47 +319,47 @@ class RateOptions(TimeOptions):
         return recording, FrameTimes.assumed(count) if times is None else times, span
 
     def given(self) -> dict[str, object]:
-        """Options of the next command for the same times and frames."""
+        """Options to be repeated in the next command for the same times and frames."""
         return {"--fps": self.fps, "--timestamps": self.timestamps, "--frames": self.frames}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
-    """A saved result, and how it is read."""
+    """Options: a saved result, and how it is read."""
 
     results: Path = argument("RESULTS", "Folder of a reconstruction.")
-    fps: float | None = option(TIME, "Frames a second, in place of the result's own times.")
-    up: str | None = option(INPUT, "Axis that points up, where cameras.json is not there.", metavar="AXIS")
-    body: Path | None = option(INPUT, "The body model of the result, where its file has moved.")
+    fps: float | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
+    up: str | None = option(INPUT, "World axis that points up, if cameras.json is missing.", metavar="AXIS")
+    body: Path | None = option(INPUT, "Body model of the result, if its file has moved.")
 
     def how(self) -> dict[str, Any]:
-        """Arguments of the functions that read it."""
+        """Keyword arguments of the functions that read it."""
         check_fps(self.fps)
         return {"fps": self.fps, "up": self.up}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TakeOptions(ResultOptions):
-    """A part of a saved result."""
+    """Options: a part of a saved result."""
 
     frames: str | None = frames_option()
-    person: list[int] | None = option(RESULT, "Only this person; may be given several times.")
-    seen_only: bool = option(RESULT, "Leave out joints that no view saw in that frame.", False, "--seen-only")
+    person: list[int] | None = option(RESULT, "Use only this person; may be repeated.")
+    seen_only: bool = option(RESULT, "Leave out joints without a detection in that frame.", False, "--seen-only")
 
     def how(self) -> dict[str, Any]:
-        """Arguments of the functions that read it."""
+        """Keyword arguments of the functions that read it."""
         persons, frames = tuple(self.person) if self.person else None, result_frames(self.frames)
         return super().how() | {"seen_only": self.seen_only, "frames": frames, "persons": persons}
 
 
 def next_reconstruct(options: Mapping[str, object]) -> str:
-    """A line to copy: `reconstruct` with the options that have values."""
+    """A command line to copy: `reconstruct` with those `options` that have values."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 
 
 def refuse_missing(places: Mapping[str, Path | None]) -> None:
-    """InputError where one of the options, by their names, has no value, and no project has it."""
+    """InputError if one of the options, by name, has no value from the user or from a project."""
     missing = [name for name, place in places.items() if place is None]
     if missing:
         listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
@@ -351,12 +367,12 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
 
 
 def names_of(text: str | None) -> list[str] | None:
-    """Names of cameras, separated by commas; None where no text is given."""
+    """Names of cameras, separated by commas; None if no text is given."""
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def picture_size(text: str | None) -> tuple[int, int] | None:
-    """Width and height of `WIDTHxHEIGHT`; None where it is left out."""
+    """Width and height of `WIDTHxHEIGHT`; None if no text is given."""
     if text is None:
         return None
     match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", text)
@@ -366,19 +382,19 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 
 
 def check_fps(fps: float | None) -> None:
-    """Refuse an invalid frame rate."""
+    """InputError for an invalid frame rate."""
     if fps is not None and not 0.01 <= fps <= 1e5:
-        raise InputError(f"--fps {fps:g}: must be a number of frames a second, such as 25")
+        raise InputError(f"--fps {fps:g}: must be 0.01 to 100000 Hz, such as 25")
 
 
 def check_workers(workers: int | None) -> None:
-    """Refuse an invalid number of processes."""
+    """InputError for an invalid number of processes."""
     if workers is not None and not 1 <= workers <= 64:
-        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out for as many as pay")
+        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out to use as many as are useful")
 
 
 def result_frames(text: str | None) -> range | None:
-    """Frames that `A:B` selects of a saved result, whose last is not known yet; None for all."""
+    """Frames selected by `A:B` from a saved result with an unknown last frame; None for all."""
     if text is None:
         return None
     start, stop = ends(text)
@@ -389,8 +405,8 @@ def result_frames(text: str | None) -> range | None:
 
 
 def frame_range(text: str | None, count: int, first: int = 0) -> range:
-    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional; all from the
-    `first` on where it is None.
+    """Frames selected by `A:B` from a recording of `count` frames: half-open, either end may be
+    left out. For None, all frames from `first` on.
     """
     start, stop = (first, count) if text is None else ends(text)
     found = range(start, count if stop is None else stop)
@@ -402,8 +418,8 @@ def frame_range(text: str | None, count: int, first: int = 0) -> range:
 
 
 def ends(text: str) -> tuple[int, int | None]:
-    """Both ends of `A:B`; the second is None where it is left out."""
+    """Both ends of `A:B`; the second is None if it is left out."""
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
     if match is None:
-        raise InputError(f"--frames {text}: must be A:B, two frame numbers with a colon between, such as 0:100")
+        raise InputError(f"--frames {text}: must be A:B with two frame numbers, such as 0:100")
     return int(match[1] or 0), int(match[2]) if match[2] else None

@@ -1,4 +1,4 @@
-"""The command `overlay`: draws a result over the videos or pictures that it was made from."""
+"""The command `overlay`: draws a result over its videos or pictures."""
 
 import re
 from collections.abc import Mapping
@@ -31,12 +31,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn:
-    """What is drawn, and its size."""
+    """Options: what is drawn, and its size."""
 
-    cameras: str | None = option(DRAW, "Only these cameras.", metavar="A,B")
-    without: str | None = option(DRAW, "All cameras but these.", metavar="A,B")
-    stills: str | None = option(DRAW, "Still pictures of these frames instead of a video.", metavar="A,B")
-    each: bool = option(DRAW, "A file for each camera at its own size, or all in one.", False, "--each/--grid")
+    cameras: str | None = option(DRAW, "Use only these cameras.", metavar="A,B")
+    without: str | None = option(DRAW, "Leave out these cameras.", metavar="A,B")
+    stills: str | None = option(DRAW, "Draw still pictures of these frames instead of a video.", metavar="A,B")
+    each: bool = option(
+        DRAW, "Write a file per camera at its own size, or all cameras in one.", False, "--each/--grid"
+    )
     bodies: bool = option(DRAW, "Draw the bodies' surfaces.", False, "--bodies/--no-bodies")
     skeletons: bool = option(DRAW, "Draw joints and bones.", True, "--skeletons/--no-skeletons")
     points: bool = option(DRAW, "Draw the 2D detections; red crosses were not used.", True, "--points/--no-points")
@@ -48,20 +50,22 @@ def overlay(
     pictures: PictureOptions,
     drawn: Drawn,
     results: Path = argument("RESULTS", "Folder of a reconstruction."),
-    detections: Path | None = option(INPUT, "Folder that `detect` wrote, which knows the pictures."),
+    detections: Path | None = option(
+        INPUT, "Folder written by `detect`, which contains the paths of the pictures."
+    ),
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay."),
 ) -> None:
-    """Draw a result over the videos or pictures that it was made from: mp4, or still pictures.
+    """Draw a result over the videos or pictures from which it was made: as mp4, or still pictures.
 
-    Everybody has a colour. Dots are joints that were seen, dark rings joints that were inferred; squares are 2D
-    detections that were used, red crosses those that were not. Without --videos, those are drawn on that were
-    detected in.
+    Each person has a colour. Dots are joints that were detected, dark rings joints that were
+    inferred; squares are 2D detections that were used, red crosses those that were not. By default,
+    the videos are those in which `detect` ran.
     """
     if not 160 <= drawn.width <= 7680:
         raise InputError(f"--width {drawn.width}: must be 160 to 7680 pixels")
     if drawn.stills is not None and frames is not None:
-        raise InputError("--stills and --frames: both say which frames; give one of them")
+        raise InputError("--stills and --frames: both select frames; give one of them")
     from shapepose_fg.core.camera import choose
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.solved_setup import cameras_of
@@ -75,7 +79,7 @@ def overlay(
             names = choose(names, without=names_of(drawn.without) or ())
         shown = pictures.of_result(folder, run, rig, names, detections)
         if drawn.points and not people.observed:
-            note(f"{folder}: there is no observations.npz, so no detections are drawn")
+            note(f"{folder}: observations.npz is missing, so no detections are drawn")
         model, file = None, run.get("body")
         if drawn.bodies:
             from shapepose_fg.body.model.body_model import BodyModel
@@ -98,24 +102,24 @@ def overlay(
 
 
 def _cameras(text: str, rig: "Rig") -> list[str]:
-    """The wanted cameras."""
+    """Names of the wanted cameras."""
     names = names_of(text) or []
     for name in names:
         if name not in rig.names:
             raise InputError(f"--cameras {text}: there is no camera {name!r}; there are {' '.join(rig.names)}")
     if len(names) == 0 or len(set(names)) < len(names):
-        raise InputError(f"--cameras {text}: must be names of cameras, each once, such as {rig.names[0]}")
+        raise InputError(f"--cameras {text}: must be camera names without repetition, such as {rig.names[0]}")
     return names
 
 
 def _fps(run: Mapping[str, Any]) -> float:
     """Frame rate of the new video, Hz."""
-    rate = run.get("time", {}).get("fps")  # a number where it is said (`check_run`)
+    rate = run.get("time", {}).get("fps")  # it is a number if present (`check_run`)
     return float(rate) if rate is not None and 0.1 <= rate <= 1000 else ASSUMED_FPS
 
 
 def _stills(text: str, length: int) -> list[int]:
-    """The frames of which still pictures are wanted."""
+    """Numbers of the frames for still pictures."""
     words = re.split(r"[,\s]+", text.strip())
     if not all(re.fullmatch(r"\d{1,9}", word) and int(word) < length for word in words):
         raise InputError(f"--stills {text}: must be frames 0 to {length - 1}, such as 0,50")

@@ -1,4 +1,4 @@
-"""The command `refine-calibration`: better cameras from the people of a recording."""
+"""The command `refine-calibration`: refines cameras by the people of a recording."""
 
 import json
 import tempfile
@@ -24,20 +24,24 @@ if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
     from shapepose_fg.io.calibration import Unit
 
-_CAMERAS = "What may change"
+_CAMERAS = "Prior uncertainty"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FreedomOptions:
-    """Prior standard deviations of the cameras from the values in the file."""
+    """Options: prior standard deviations of the cameras around the given calibration."""
 
-    off_degrees: float = option(_CAMERAS, "How far cameras may be turned, about, in degrees.", 1.0)
-    off_cm: float = option(_CAMERAS, "How far they may be moved, about, in centimetres.", 2.0)
-    focal: bool = option(_CAMERAS, "Refine focal lengths too, which may be off by 2 %.", False, "--focal")
-    centre: bool = option(_CAMERAS, "Refine principal points too (10 pixels).", False, "--principal-point")
-    lens: bool = option(_CAMERAS, "Refine k1 k2 p1 p2 too (0.02).", False, "--distortion")
-    reference: str | None = option(_CAMERAS, "This camera stays; else the rig as a whole.", metavar="CAMERA")
-    stature: float | None = option(_CAMERAS, "People's mean stature in metres: it, not the rig, says the scale.")
+    off_degrees: float = option(_CAMERAS, "Prior sigma of rotations, degrees.", 1.0)
+    off_cm: float = option(_CAMERAS, "Prior sigma of positions, centimetres.", 2.0)
+    focal: bool = option(_CAMERAS, "Refine focal lengths, too (prior sigma 2 %).", False, "--focal")
+    centre: bool = option(
+        _CAMERAS, "Refine principal points, too (prior sigma 10 pixels).", False, "--principal-point"
+    )
+    lens: bool = option(_CAMERAS, "Refine k1 k2 p1 p2, too (prior sigma 0.02).", False, "--distortion")
+    reference: str | None = option(
+        _CAMERAS, "Camera whose pose stays; by default the rig as a whole stays.", metavar="CAMERA"
+    )
+    stature: float | None = option(_CAMERAS, "Mean stature of the people, metres; it then determines the scale.")
 
 
 @grouped
@@ -46,21 +50,22 @@ def refine_calibration(
     rate: RateOptions,
     may: FreedomOptions,
     output: Path = option(
-        RESULT, "File, or folder, for the refined cameras: in the format they came in, or .json.", REQUIRED
+        RESULT, "File or folder for the refined cameras: in their own format, or .json.", REQUIRED
     ),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
-    """Refine where cameras stand and look, and their lenses if asked, by the people of a recording.
+    """Refine camera poses, and lenses if requested, from the people in a recording.
 
-    The rig is tried on frames that it was not refined by; where it does not fit them better it is left as it was.
+    The refined rig is tested on held-out frames. If it does not fit them better, the given rig is
+    written.
     """
     from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.refinement import refine
     from shapepose_fg.io.calibration import check_target, write_like
 
     if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
-        raise InputError("--off-degrees must be above 0, up to 20, and --off-cm above 0, up to 200")
+        raise InputError("--off-degrees, --off-cm: must be above 0 and at most 20 degrees and 200 cm")
     if may.stature is not None and not 0.5 <= may.stature <= 2.5:
         raise InputError(f"--stature {may.stature:g}: must be 0.5 to 2.5 metres")
     seen = given.located()
@@ -68,11 +73,13 @@ def refine_calibration(
     rig = seen.still_rig("refine-calibration")
     check_target(source, output)
     if may.reference is not None and may.reference not in rig.names:
-        raise InputError(f"--reference {may.reference}: no such camera; give one of {' '.join(rig.names)}")
+        raise InputError(
+            f"--reference {may.reference}: there is no such camera; give one of {' '.join(rig.names)}"
+        )
     bent = [camera.name for camera in rig.cameras if camera.lens == "fisheye" or camera.distortion[4:].any()]
     if may.lens and bent:
         raise InputError(
-            f"camera {bent[0]}: only lenses with k1 k2 p1 p2 alone can be refined; leave --distortion out"
+            f"camera {bent[0]}: only distortions of k1 k2 p1 p2 can be refined; leave out --distortion"
         )
     freedom = Freedom(
         may.off_degrees,
@@ -108,23 +115,23 @@ def refine_calibration(
             remarks=found.notes,
         )
         page.write(report)
-        note(f"{report}: the cameras in 3D and the people, to be opened in a browser")
+        note(f"{report}: cameras and people in 3D, to open in a browser")
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=lines[0]))
         print("\n".join(lines[1:]))
         print(f"{output}: {form}")
-        # Our own file says axis, unit and size itself.
+        # Our own rig file defines axis, unit and picture sizes itself.
         options = {"--calibration": output} | seen.given()
-        options |= {} if form == "our own rig file" else seen.said()
+        options |= {} if form == "rig file" else seen.said()
         print(next_reconstruct(options | rate.given() | ({} if seen.source else {"--output": "results"})))
 
 
 def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """Changes by camera: headings, and each camera's figures."""
+    """Changes by camera: headings, and the values of each camera."""
     change, sigma = found.change(), found.sigma()
-    parts = {"turn": "turn, °", "move": "move, mm"} | ({"focal": "focal, %"} if may.focal else {})
+    parts = {"turn": "rotation, °", "move": "position, mm"} | ({"focal": "focal, %"} if may.focal else {})
     parts |= {"centre": "centre, px"} if may.centre else {}
     rows = []
     for view, name in enumerate(found.given.names):
@@ -135,17 +142,22 @@ def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[
 
 
 def _words(found: "Refinement", may: FreedomOptions) -> list[str]:
-    """The table's caption, and whether cameras are better."""
+    """The table's caption, and whether the refined cameras are better."""
     scale = (
-        "the cameras' distances as they were" if may.stature is None else f"people's stature, {may.stature:g} m"
+        "the distances between the cameras are kept"
+        if may.stature is None
+        else f"from the mean stature, {may.stature:g} m"
     )
     stays = "the rig as a whole" if may.reference is None else f"camera {may.reference}"
     figures = f"{found.before_px:.1f} px before, {found.after_px:.1f} px after"
-    why = "the people do not fit better"
+    why = "the error did not decrease"
     if found.after_px < found.before_px:
-        why = f"a detector's lasting bias explains it as well ({found.probability:.2f} that cameras are off)"
+        why = (
+            "a bias of the detector explains the errors as well"
+            f" (probability of wrong cameras: {found.probability:.2f})"
+        )
     return [
-        f"± is one sigma, as against {stays}; scale: {scale}",
-        f"a joint as against the other cameras, on frames that were not used: {figures}",
-        *([f"{why}: the cameras are left as they were"] if not found.better else []),
+        f"±: one sigma, relative to {stays}; scale: {scale}",
+        f"error of a joint against the other cameras, on frames that were not used: {figures}",
+        *([f"the cameras were not changed: {why}"] if not found.better else []),
     ]

@@ -1,4 +1,4 @@
-"""The command `simulate`: a recording with known truth, as files."""
+"""The command `simulate`: writes a simulated recording with known truth."""
 
 import re
 import time
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 class SceneOptions:
     """Options of the simulated scene."""
 
-    name: str = argument("NAME", "demo, or an interaction sequence: salsa, crossing or crowd.")
-    split: str = option(INPUT, "Takes of a sequence: tune, to choose settings by; report.", "tune")
-    cameras: int = option(INPUT, "Cameras around the room, 2 to 12.", 6)
-    people: int | None = option(INPUT, "People in demo, 0 to 12; a sequence has its own.")
-    seed: int = option(INPUT, "Fixes the detector's errors, and the people of demo.", 0)
-    mocap: Path | None = option(INPUT, "Recorded motions (.npz) that sequences are made of.")
+    name: str = argument("NAME", "Scene: demo, or an interaction sequence (salsa, crossing or crowd).")
+    split: str = option(INPUT, "Part of a sequence: tune (for choosing settings) or report (for results).", "tune")
+    cameras: int = option(INPUT, "Number of cameras around the room, 2 to 12.", 6)
+    people: int | None = option(INPUT, "Number of people in demo, 0 to 12.")
+    seed: int = option(INPUT, "Random seed of the detector's errors, and of the people of demo.", 0)
+    mocap: Path | None = option(INPUT, "File of the recorded motions (.npz) for the sequences.")
 
 
 @grouped
@@ -43,10 +43,14 @@ def simulate(
     scene: SceneOptions,
     output: Path = option(RESULT, "Folder for cameras, detections and truth.", REQUIRED),
     frames: str | None = frames_option(),
-    format: str = option(RESULT, "Detections as association (4D Association) or openpose.", "association"),
+    format: str = option(
+        RESULT, "Format of the detections: association (4D Association) or openpose.", "association"
+    ),
     workers: int | None = workers_option(),
 ) -> None:
-    """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
+    """Simulate a recording with known truth: cameras, 2D detections, and the true people as
+    people.npz.
+    """
     if format not in ("association", "openpose"):
         raise InputError(f"--format {format}: must be association or openpose")
     if scene.seed < 0:
@@ -81,7 +85,7 @@ def simulate(
     about |= {"detector": DetectorConfig().as_dict()} | ({} if scene.name == "demo" else {"split": scene.split})
     written = write_simulated(part, detections, output, cast("Format", format), **about)
     print(
-        f"{len(span)} frames of {made.people} people before {scene.cameras} cameras,"
+        f"{len(span)} frames of {made.people} people, {scene.cameras} cameras,"
         f" {1e3 * seconds / len(span):.0f} ms a frame"
     )
     for what, path in written.items():

@@ -1,4 +1,4 @@
-"""The command `synchronise`: start times of cameras from people, and synchronised detections."""
+"""The command `synchronise`: estimates start times of cameras from people."""
 
 import json
 import shlex
@@ -24,15 +24,15 @@ from shapepose_fg.cli.terminal import note
 @grouped
 def synchronise(
     given: ProjectOptions,
-    fps: float | None = option(TIME, "Frames a second of all cameras; needed where no times.csv says it."),
-    most: float = option(TIME, "Largest offset that is looked for, seconds.", MOST_S),
+    fps: float | None = option(TIME, "Frame rate of all cameras, Hz; needed without times.csv."),
+    most: float = option(TIME, "Largest offset that is searched, seconds.", MOST_S),
     frames: str | None = frames_option(),
-    output: Path | None = option(RESULT, "File for the times of all frames, as --timestamps takes it."),
+    output: Path | None = option(RESULT, "File for the times of all frames, for --timestamps."),
     as_json: bool = json_option(),
 ) -> None:
-    """Find when cameras of known poses were started, from the people whom they see; any offset, to milliseconds.
+    """Estimate start times of cameras with known poses from the people in the recording, to milliseconds.
 
-    Exit code 1 where motion does not determine a camera's offset; nothing is written then.
+    Exit code 1 if motion does not determine a camera's offset; then nothing is written.
     """
     from shapepose_fg.io.timestamps import write_timestamps
 
@@ -56,9 +56,7 @@ def synchronise(
         first = found.offset_s.min()
         starts = zip(rig.names, found.offset_s - first, strict=True)
         words = [word for name, start in starts for word in ("--start", f"{name}={start:.4f}s")]
-        print(
-            f"of videos: shapepose-fg detect {shlex.join(words)}, and --fps, --calibration and the rest as before"
-        )
+        print(f"for videos: shapepose-fg detect {shlex.join(words)} and the other options as before")
         if output is not None:
             options = seen.given() | seen.said() | {"--timestamps": output}
             calibration = {"--calibration": seen.calibration, "--output": "results"}

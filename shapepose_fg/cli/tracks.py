@@ -33,10 +33,10 @@ def people_over_time(
     context: typer.Context,
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
 ) -> None:
-    """List the people of a result over time, or correct who is who: shapepose-fg tracks RESULTS merge 3 9.
+    """List the people of a result over time, or correct identities: shapepose-fg tracks RESULTS merge 3 9.
 
-    Without a command everybody is listed. The result as it was before the first correction stays in
-    RESULTS/uncorrected, and `undo` takes corrections back one by one.
+    Without a command, all people are listed. The original result stays in RESULTS/uncorrected, and
+    `undo` takes corrections back one by one.
     """
     context.obj = results
     if context.invoked_subcommand is None:
@@ -45,9 +45,10 @@ def people_over_time(
 
 @tracks.command("list")
 def list_people(
-    context: typer.Context, as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
-    """Everybody: frames, gaps, stature, how often seen, how far they walked."""
+    """List all people: frames, gaps, stature, share of frames seen, distance walked."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.tracking.listing import list_saved_tracks
 
@@ -62,51 +63,51 @@ def list_people(
 
 @tracks.command("merge")
 def merge_people(context: typer.Context, person: Person, other: Other) -> None:
-    """B is A: B's rows become A's."""
+    """Merge B into A: B's rows become A's."""
     _correct(context, "merge", person, other=other)
 
 
-New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free one.")]
+New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free number.")]
 
 
 @tracks.command("split")
 def split_person(context: typer.Context, person: Person, frame: From, new: New = None) -> None:
-    """From FRAME on A is somebody else: a new person."""
+    """Split A at FRAME: from this frame on, A is a new person."""
     _correct(context, "split", person, other=new, frame=frame)
 
 
 @tracks.command("rename")
 def rename_person(context: typer.Context, person: Person, other: Other) -> None:
-    """A gets the number B, which must be free."""
+    """Rename A to B, which must be a free number."""
     _correct(context, "rename", person, other=other)
 
 
 @tracks.command("drop")
 def drop_person(context: typer.Context, person: Person) -> None:
-    """A is a false positive: A's rows are taken out."""
+    """Drop A, a false positive: its rows are removed."""
     _correct(context, "drop", person)
 
 
 @tracks.command("swap")
 def swap_people(context: typer.Context, person: Person, other: Other, frame: From) -> None:
-    """From FRAME on A is B and B is A."""
+    """Swap A and B from FRAME on."""
     _correct(context, "swap", person, other=other, frame=frame)
 
 
 @tracks.command("undo")
 def undo_correction(context: typer.Context) -> None:
-    """Take the last correction back."""
+    """Undo the last correction."""
     from shapepose_fg.io.corrections import take_back
 
     folder = results_folder(context.obj)
     edit, _ = take_back(folder, _solver(folder))
-    print(f"taken back: {edit}")
+    print(f"undone: {edit}")
     show(_tracks_table(context.obj))
     _renew_report(folder)
 
 
 def _tracks_table(results: Path) -> "RenderableType":
-    """All people of a result, and the corrections."""
+    """Table of all people of a result, and the corrections."""
     from rich.console import Group
     from rich.padding import Padding
 
@@ -120,7 +121,7 @@ def _tracks_table(results: Path) -> "RenderableType":
         listed = list_saved_tracks(opened, _body_of(run))
 
     def or_dash(value: float, text: str) -> str:
-        return "-" if value != value else text.format(value)  # NaN
+        return "-" if value != value else text.format(value)  # NaN is shown as "-"
 
     people = table(
         "person frames rows gaps stature seen confidence walked".split(),
@@ -141,7 +142,7 @@ def _tracks_table(results: Path) -> "RenderableType":
     )
     lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
     if not run.get("configuration", {}).get("temporal", True):
-        lines.append("every frame was solved by itself: a number is no identity")
+        lines.append("every frame was solved separately: numbers are not identities")
     edits = read_corrections(results_folder(results))
     if len(edits) > 0:
         lines.append(f"corrected: {'; '.join(map(str, edits))}")
@@ -149,7 +150,7 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
-    """The body model of a result; None where its file is missing."""
+    """The body model of a result; None if its file is missing."""
     from shapepose_fg.io.solved_setup import body_of
 
     try:
@@ -159,7 +160,7 @@ def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
 
 
 def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
-    """Make one correction, and print its effect."""
+    """Apply one correction, and print its effect."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.corrections import correct
     from shapepose_fg.tracking.edits import Action, Edit, free_number
@@ -171,18 +172,18 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
     edit = Edit(Action(action), person, **more)
     solve = _solver(folder)
     edited = correct(folder, edit, solve)
-    words = "; joints and bodies stay as they were solved"
+    words = "; joints and bodies were not solved again"
     if solve is not None:
-        words = f"; solved anew: {' '.join(map(str, sorted(edited.changed)))}"
+        words = f"; solved again: {' '.join(map(str, sorted(edited.changed)))}"
     print(f"done: {edit}{words if len(edited.changed) > 0 else ''}")
     show(_tracks_table(context.obj))
-    print(f"take it back: shapepose-fg tracks {context.obj} undo")
+    print(f"to undo it: shapepose-fg tracks {context.obj} undo")
     _renew_report(folder)
 
 
 def _renew_report(folder: Path) -> None:
-    """Write the page of a corrected result again, if there is one, and set its exports aside, which are out of
-    date.
+    """Write the report of a corrected result again, if there is one, and rename its exports, which
+    are out of date.
     """
     from shapepose_fg.viz.report.writing import REPORT, report_of
 
@@ -198,7 +199,8 @@ def _renew_report(folder: Path) -> None:
 
 
 def _solver(folder: Path) -> "Solve | None":
-    """Function that solves rows of the result in `folder` again; None where the result lacks what it needs.
+    """Function that solves rows of the result in `folder` again; None if required files are
+    missing.
 
     Without identities every row is solved separately.
     """
@@ -212,7 +214,9 @@ def _solver(folder: Path) -> "Solve | None":
             return None
         if functions := opened.run.get("extra_factors"):
             names = ", ".join(map(str, functions))
-            note(f"who is solved anew is so without the factors of {names}, which only Python has")
+            note(
+                f"corrected people are solved again without the factors of {names}, which are known in Python only"
+            )
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
         from shapepose_fg.pipeline.solving import Solver, solve_rows

@@ -1,4 +1,4 @@
-"""The command `train-fitter`: weights of the learned fitter for the user's own body model."""
+"""The command `train-fitter`: trains the learned fitter for the user's body model."""
 
 import time
 from pathlib import Path
@@ -9,23 +9,29 @@ from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.output_folder import prepare_output
 
 _DRAWN = 30_000
-"""Number of random poses where no recorded ones are given."""
+"""Number of random poses if no recorded ones are given."""
 _WORSE = 1.1
-"""Ratio of the error to the plain optimiser's above which weights, which take half its time, are useless."""
+"""Ratio of the error to that of the plain optimiser above which weights are rejected (the learned
+fitter takes half the time)."""
 
 
 @grouped
 def train_fitter(
     body: Path = option(INPUT, "Body model in SMPL's file format.", REQUIRED),
-    motions: Path | None = option(INPUT, "Recorded motions, a folder of AMASS's; without, poses are drawn."),
-    output: Path | None = option(RESULT, "File for the weights (body.weights); by default the user's cache."),
-    iterations: int = option(RUN, "Batches; 0 only says how sure fits may be.", 500, min=0),
-    batch: int = option(RUN, "People in each.", 256, min=16),
-    seed: int = option(RUN, "Of everything that is drawn.", 0),
+    motions: Path | None = option(
+        INPUT, "Folder of recorded motions in AMASS's format; without it, poses are drawn at random."
+    ),
+    output: Path | None = option(
+        RESULT, "File for the weights (setting body.weights); by default in the user's cache."
+    ),
+    iterations: int = option(RUN, "Number of batches; 0 only calibrates the uncertainty of the fits.", 500, min=0),
+    batch: int = option(RUN, "Number of people in a batch.", 256, min=16),
+    seed: int = option(RUN, "Random seed.", 0),
 ) -> None:
-    """Train the body fitter for a body model of yours; whatever has this --body then uses it.
+    """Train the body fitter for your own body model; all commands with this --body then use it.
 
-    It begins with the weights that ship with the package, and is compared with the plain optimiser at the end.
+    Training starts from the built-in weights. At the end, the result is compared with the plain
+    optimiser.
     """
     torch = optional("torch", "train")
     from shapepose_fg.body.fitting.weights import FitterWeights, adapted_file, fingerprint
@@ -36,7 +42,7 @@ def train_fitter(
 
     model = BodyModel.load(body)
     if output is None and fingerprint(model) == FitterWeights.default().body:
-        raise InputError(f"{body}: this body has weights, it ships with the package; give --output for others")
+        raise InputError(f"{body}: this body model has weights in the package; give --output to train others")
     file = adapted_file(model) if output is None else output
     prepare_output(file.parent, [file.name])
     if motions is None:
@@ -45,7 +51,7 @@ def train_fitter(
         learnt, unseen = (load_motions(motions).of(split) for split in ("train", "validation"))
     for split, part in (("train", learnt), ("validation", unseen)):
         if len(part) == 0:
-            raise InputError(f"{motions}: no {split} subjects in it; add motions of more people")
+            raise InputError(f"{motions}: there are no {split} subjects; add motions of more people")
     config = TrainingConfig(iterations=iterations, batch=batch, seed=seed)
     card = {"data": "poses drawn from the prior" if motions is None else f"{len(learnt)} frames of {motions.name}"}
     start = time.perf_counter()
@@ -54,10 +60,13 @@ def train_fitter(
         weights, scores = adapted(model, learnt, unseen, config, card, shown)
     rows = [(name, f"{score.joints_mm:.1f}", f"{score.ms:.1f}") for name, score in scores.items()]
     minutes = (time.perf_counter() - start) / 60
-    caption = f"unseen poses, some joints missing; {minutes:.0f} minutes in all"
-    show(table(["fitter", "error, mm", "ms a fit"], rows, caption=caption))
+    caption = f"on unseen poses with some joints missing; training took {minutes:.0f} minutes"
+    show(table(["fitter", "error, mm", "ms per fit"], rows, caption=caption))
     if output is None and scores[TRAINED].joints_mm > _WORSE * scores[PLAIN].joints_mm:
-        warn(f"the plain optimiser is nearer on {body}: these weights are not kept; give more --iterations")
+        warn(
+            f"the plain optimiser is more accurate on {body}, so these weights are not stored; give more"
+            " --iterations"
+        )
         return
     weights.save(file)
-    note(f"{file}: {file.stat().st_size / 1e6:.1f} MB" + ("" if output else f", for whatever has --body {body}"))
+    note(f"{file}: {file.stat().st_size / 1e6:.1f} MB" + ("" if output else f", used with --body {body}"))

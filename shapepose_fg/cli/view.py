@@ -18,18 +18,20 @@ if TYPE_CHECKING:
 def view(
     part: TakeOptions,
     pictures: PictureOptions,
-    save: Path | None = option(RESULT, "Write it into this .rrd instead, for `rerun FILE`.", metavar="FILE"),
-    connect: str | None = option(RUN, "A viewer that runs already: rerun+http://HOST:9876/proxy.", metavar="URL"),
-    statistics: bool = option(RUN, "Leave rerun's statistics of use as they are set.", False, "--statistics"),
+    save: Path | None = option(RESULT, "Write a file (.rrd) for `rerun FILE` instead.", metavar="FILE"),
+    connect: str | None = option(RUN, "Address of a running viewer: rerun+http://HOST:9876/proxy.", metavar="URL"),
+    statistics: bool = option(RUN, "Keep rerun's setting of usage statistics.", False, "--statistics"),
 ) -> None:
-    """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
+    """Show a result in the rerun viewer: people, cameras, and used and unused detections, on a
+    timeline.
+    """
     from shapepose_fg.io.export import rerun_app
     from shapepose_fg.io.export.registry import Job, read_take
     from shapepose_fg.io.export.rerun_log import log_pictures, log_take
 
     take = read_take(part.results, identities=False, **part.how())
     if save is not None and connect is not None:
-        raise InputError("--save and --connect: this is written or shown; give one of them")
+        raise InputError("--save and --connect: the result is either written or shown; give one of them")
     pairs = _pictures(part.results, take, pictures) if pictures.videos else []
     if connect is None and save is None and not statistics:
         note(*rerun_app.quiet_viewer())
@@ -46,7 +48,7 @@ def view(
 
 
 def _pictures(results: Path, take: "Take", pictures: PictureOptions) -> "list[tuple[CameraFootage, Footage]]":
-    """The cameras' videos or pictures: of all, or of those that are given one by one."""
+    """The cameras' videos or pictures: of all cameras, or of those that are given individually."""
     if take.rig is None:
-        raise InputError("--videos: there is no cameras.json beside the result, so no picture has a place")
+        raise InputError("--videos: cameras.json is missing beside the result, and pictures need it")
     return pictures.of_result(results, take.people.run, take.rig, pictures.named(take.rig))

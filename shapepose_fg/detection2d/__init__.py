@@ -1,1 +1,3 @@
-"""Detects people's joints in pictures: networks, and their outputs as candidates with part affinities."""
+"""Detects people's joints in pictures: networks, and conversion of their outputs to candidates with
+part affinities.
+"""

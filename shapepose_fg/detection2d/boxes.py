@@ -18,7 +18,7 @@ Side = Annotated[int, Field(ge=16, le=4096)]
 _Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 _GREY = 114
-"""Grey value beside pictures of another shape than the network's."""
+"""Grey value of the padding if a picture has another aspect ratio than the network's input."""
 _STRIDES = (8, 16, 32)
 """Pixels per cell of the grids on which boxes are proposed."""
 _PERSON = 0
@@ -28,7 +28,8 @@ _MOST_PEOPLE = 200
 _FARTHEST = 1e6
 """Largest coordinate of a box, pixels of the input."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
-"""Minimum scores of a box, as in rtmlib; the second where suppression is in the network."""
+"""Minimum scores of a box, as in rtmlib; the second if the network contains the non-maximum
+suppression."""
 
 
 class BoxForm(BaseModel, extra="forbid"):
@@ -37,16 +38,16 @@ class BoxForm(BaseModel, extra="forbid"):
     network: str = ""
     """ONNX file of the box network."""
     size: tuple[Side, Side] = (640, 640)
-    """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
+    """Width and height of the network's input, pixels, if the ONNX file does not fix them."""
     min_score: _Share | None = None
-    """Minimum score of a box; None for rtmlib's own."""
+    """Minimum score of a box; None for rtmlib's default."""
     max_overlap: _Share = 0.45
     """Intersection over union of two boxes above which the one with the lower score is removed."""
 
 
 @dataclass(frozen=True)
 class BoxNetwork:
-    """YOLOX, with non-maximum suppression inside of the network or without."""
+    """YOLOX, with non-maximum suppression inside or outside of the network."""
 
     network: OnnxNetwork
     """The network that proposes boxes."""
@@ -54,7 +55,9 @@ class BoxNetwork:
     """Description of the network."""
 
     def find(self, picture: NDArray[np.uint8]) -> Real:
-        """(P, 4) left, top, right, bottom in pixels of a `picture` (H, W, 3), the surest first."""
+        """(P, 4) left, top, right, bottom in pixels of a `picture` (H, W, 3), the highest score
+        first.
+        """
         size = np.array(self.form.size)
         scale = float((size / picture.shape[1::-1]).min())
         width, height = (max(int(side * scale), 1) for side in picture.shape[1::-1])
@@ -62,13 +65,13 @@ class BoxNetwork:
         shown[:height, :width] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR)
         outputs = self.network.run(np.ascontiguousarray(shown.transpose(2, 0, 1)[None], dtype=np.float32))
         boxes, score, least = self._proposed(outputs)
-        # What is no number is not less than this either.
+        # Written so that NaN counts as below the minimum.
         sound = (np.abs(boxes) < _FARTHEST).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
         there = there[np.argsort(-score[there], kind="stable")]
         boxes, score = boxes[there] / scale, score[there]
         if least == _LEAST:
-            # Sides that count their last pixel too.
+            # Widths and heights include the last pixel.
             rectangles = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2] + 1])
             kept = cv2.dnn.NMSBoxes(rectangles.tolist(), score.tolist(), 0.0, self.form.max_overlap)
             boxes = boxes[np.asarray(kept, dtype=np.intp)].astype(np.float64)
@@ -76,7 +79,7 @@ class BoxNetwork:
 
     def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
         """(N, 4) boxes in pixels of the input, (N,) their scores for people, and the minimum score."""
-        # Column and row of all cells of the grids, one grid after the other.
+        # Column and row of all cells of the grids, grid by grid.
         grids = [np.indices((self.form.size[1] // step, self.form.size[0] // step))[::-1] for step in _STRIDES]
         cells = np.concatenate([grid.reshape(2, -1).T for grid in grids])
         stride = np.repeat(_STRIDES, [grid[0].size for grid in grids])[:, None]
@@ -92,7 +95,7 @@ class BoxNetwork:
             labels = outputs[1].reshape(-1) if len(outputs) > 1 and outputs[1].size == len(found) else None
             score = found[:, 4] if labels is None else np.where(labels == _PERSON, found[:, 4], 0.0)
             return found[:, :4], score, _LEAST_SUPPRESSED
-        # In single precision, as the network computes: crops of the same boxes have the same pixels.
+        # In single precision, as in the network: the crops of equal boxes then have equal pixels.
         centre = ((found[:, :2] + cells) * stride).astype(np.float32)
         sides = (np.exp(np.minimum(found[:, 2:4], 50)) * stride).astype(np.float32)
         boxes = np.hstack([centre - sides / 2, centre + sides / 2])

@@ -33,11 +33,12 @@ class Candidates:
     score: Array
     """(D,) height of the peak, 0 to 1."""
     pairs: Index
-    """(E, 2) candidates that a limb joins, the limb's first joint first."""
+    """(E, 2) candidates connected by a limb; the candidate of the limb's first joint first."""
     limb: Index
-    """(E,) the limb that joins each pair."""
+    """(E,) limb of each pair."""
     affinity: Array
-    """(E,) mean of the field's component along the limb, 0 to 1; pairs without support are not listed."""
+    """(E,) mean component of the field along the limb, 0 to 1; pairs without support are not
+    listed."""
 
     def __len__(self) -> int:
         return len(self.joint)
@@ -53,8 +54,9 @@ class Candidates:
 def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
-    The output has a map for each of the `skeleton`'s J joints, one of the background, and two (x, y) for each
-    limb. Positions are in cells; (0, 0) is the centre of the first. Values that are not finite count as 0.
+    The output has one map for each of the `skeleton`'s J joints, one for the background, and two
+    (x, y) for each limb. Positions are in cells; (0, 0) is the centre of the first cell. Values
+    that are not finite count as 0.
     """
     output = np.nan_to_num(output, nan=0.0, posinf=0.0, neginf=0.0)
     joint, xy, score = peaks(output[: len(skeleton.joints)])
@@ -71,15 +73,15 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
 def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
     """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H, W).
 
-    A maximum is no lower than its eight neighbours. Its position and height between cells are those of a Gaussian
-    through it and its neighbours, along each axis.
+    A local maximum is at least as high as its eight neighbours. Its position and height between
+    cells are those of a Gaussian through it and its neighbours, along each axis.
     """
     padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     rows, columns = heat.shape[1:]
     is_peak = heat >= min_score
     for down, right in np.ndindex(3, 3):
         other = padded[:, down : down + rows, right : right + columns]
-        # Of a plateau of equal cells only the first is kept.
+        # Only the first cell of a plateau of equal values is kept.
         is_peak &= heat > other if (down, right) < (1, 1) else heat >= other
     joint, row, column = np.nonzero(is_peak)
     xy, height = between_cells(padded, joint, row + 1, column + 1)
@@ -87,7 +89,9 @@ def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Ind
 
 
 def between_cells(maps: Real, which: Index, row: Index, column: Index) -> tuple[Array, Array]:
-    """Places (N, 2) and heights (N,) of maxima of `maps` (M, H, W), none of which lies at an edge."""
+    """Sub-cell positions (N, 2) and heights (N,) of maxima of `maps` (M, H, W) at the cells
+    `which`, `row`, `column` (N,). None of these cells is at an edge.
+    """
     centre = maps[which, row, column].astype(np.float64)
     x, rise_x = _vertex(maps[which, row, column - 1], centre, maps[which, row, column + 1])
     y, rise_y = _vertex(maps[which, row - 1, column], centre, maps[which, row + 1, column])
@@ -95,12 +99,10 @@ def between_cells(maps: Real, which: Index, row: Index, column: Index) -> tuple[
 
 
 def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
-    """Position of the maximum of a Gaussian through three neighbours, -0.5 to 0.5 cells, and the logarithm of its
-    rise.
-
-    0 and 0 at the edge of the map.
+    """Sub-cell position of the maximum of a Gaussian through three neighbours, -0.5 to 0.5 cells,
+    and the increase of the logarithm there. Both are 0 at the edge of the map.
     """
-    floor = 1e-3  # logarithms of what is near 0 or below would bend the curve
+    floor = 1e-3  # logarithms of values near 0 or below would distort the fit
     low, mid, high = (np.log(np.maximum(each.astype(np.float64), floor)) for each in (before, centre, after))
     bend = low - 2 * mid + high
     safe = np.where(bend < -1e-9, bend, -np.inf)
@@ -112,7 +114,7 @@ def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
 def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: Index) -> Array:
     """(E,) mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
-    `limb` (E,) is the field of each line. 0 where too few points along the line support it.
+    `limb` (E,) is the field of each line. 0 if too few points along the line support the limb.
     """
     height, width = fields.shape[1:]
     along = end - start

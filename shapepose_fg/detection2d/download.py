@@ -23,7 +23,8 @@ BASES = (
     "https://download.openmmlab.com/mmpose/v1/projects/rtmposev1/onnx_sdk",
     "https://huggingface.co/Tau-J/RTMPose/resolve/main/rtmposev1/onnx_sdk",
 )
-"""Addresses of the folders with the named networks, as rtmlib publishes them: OpenMMLab's, its mirror."""
+"""Addresses of the folders with the named networks, as rtmlib publishes them: OpenMMLab's, and its
+mirror."""
 
 _TIMEOUT_S = 30.0
 _INSIDE = "end2end.onnx"
@@ -33,19 +34,21 @@ _BROKEN = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 @dataclass(frozen=True)
 class NamedNetwork:
-    """A network with a name."""
+    """A downloadable network that can be selected by name."""
 
     file: str
     """Archive of the network, at each of `BASES`."""
     size: tuple[int, int]
     """Width and height of the network's input, pixels."""
     boxes: str | None = None
-    """The name of the network that finds people for it; None for a network that finds people."""
+    """Name of the YOLOX network that detects people for it; None if this is such a network."""
 
 
 @lru_cache(maxsize=1)
 def named_networks() -> dict[str, NamedNetwork]:
-    """All of them by name: RTMPose of HALPE-26, and the YOLOX that rtmlib gives each."""
+    """Downloadable networks by name: RTMPose (HALPE-26), with the YOLOX that rtmlib pairs with
+    each.
+    """
     table = json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
     return {name: NamedNetwork(**(entry | {"size": tuple(entry["size"])})) for name, entry in table.items()}
 
@@ -57,9 +60,10 @@ def named_file(
     say: Callable[[str], object] = print,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Path:
-    """The file of the named network `name`, downloaded first where it is missing and `fetch` is set.
+    """The file of the named network `name`, downloaded first if it is missing and `fetch` is set.
 
-    The SHA-256 of the ONNX file is passed to `say` and pinned at first use. InputError where it differs later.
+    The SHA-256 of the ONNX file is passed to `say` and pinned at first use. InputError if it
+    differs later.
     """
     kept, pin = (user_cache("networks") / f"{name}.{ending}" for ending in ("onnx", "sha256"))
     there = kept.is_file()
@@ -91,13 +95,14 @@ class _OnlyHttps(urllib.request.HTTPRedirectHandler):
 
 
 def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
-    """The network in an archive, from the first address that has it."""
+    """The network from its archive, downloaded from the first address that has it."""
     problems, opener = list[str](), urllib.request.build_opener(_OnlyHttps)
     for base in BASES:
         try:
             with opener.open(f"{base}/{file}", timeout=_TIMEOUT_S) as answer, tempfile.TemporaryFile() as archive:
                 total, done = int(answer.headers.get("Content-Length") or 0), 0
-                # No more is read than a network has: an address that never ends fills no disk.
+                # The number of bytes read is bounded, so that an endless response cannot fill the
+                # disk.
                 while done <= MOST_BYTES and (part := answer.read(1 << 16)):
                     archive.write(part)
                     done += len(part)
@@ -115,7 +120,7 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
 
 
 def _inside(archive: IO[bytes]) -> bytes:
-    """The one network in an archive. Paths in the archive are ignored."""
+    """The network in an archive with exactly one. Paths in the archive are ignored."""
     with zipfile.ZipFile(archive) as opened:
         found = [each for each in opened.infolist() if PurePosixPath(each.filename).name == _INSIDE]
         if len(found) != 1:

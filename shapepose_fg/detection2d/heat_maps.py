@@ -1,4 +1,4 @@
-"""Networks of OpenPose's kind: heat maps and part affinity fields of a whole picture."""
+"""OpenPose-like networks: heat maps and part affinity fields of a whole picture."""
 
 import json
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkel
 from shapepose_fg.io.write_detections import association_lines
 
 _STRIDE, _MULTIPLE = 8, 16
-"""Pixels of the input per cell of the output, along each axis; and the multiple of which both sides of the
-input are."""
+"""Pixels of the input per cell of the output, along each axis; and number by which both sides of
+the input are divisible."""
 _TRIAL = (64, 64)
 """Width and height of the empty picture that a new network is tried on, pixels."""
 _LONG_SIDE = 656
@@ -27,7 +27,9 @@ _LONG_SIDE = 656
 
 @dataclass(frozen=True)
 class NetworkLayout:
-    """Input of a network, and the joints and limbs of its output, one after the other (`decode`)."""
+    """Normalisation of a network's input, and order of the joints and limbs in its output
+    (`decode`).
+    """
 
     name: str
     """Name of the layout."""
@@ -38,7 +40,7 @@ class NetworkLayout:
     offset: float
     """Offset of the input; see `scale`."""
     sha256: str = ""
-    """Checksum of a known network with this layout; empty for none."""
+    """Checksum of a known network with this layout; empty if unknown."""
 
     @property
     def channels(self) -> int:
@@ -57,8 +59,8 @@ def layouts() -> dict[str, NetworkLayout]:
 
 @dataclass(frozen=True)
 class HeatMapNetwork:
-    """A network that gives heat maps and part affinity fields of a picture; candidates are grouped to people
-    later, in 3D.
+    """A network that computes heat maps and part affinity fields of a picture; candidates are
+    grouped to people later, in 3D.
     """
 
     network: OnnxNetwork
@@ -66,7 +68,7 @@ class HeatMapNetwork:
     layout: NetworkLayout
     """The layout of its output."""
     long_side: int = _LONG_SIDE
-    """Longer side of its input, pixels: a larger one finds smaller people, and takes longer."""
+    """Longer side of its input, pixels: a larger input detects smaller people, and takes longer."""
     suffix, tail = ".txt", ""
 
     @classmethod
@@ -81,8 +83,8 @@ class HeatMapNetwork:
         """Load the network in the ONNX `file`. `layout` names one of `layouts()`; without it the file must
         identify it.
 
-        OpenCV runs it on the CPU, at any size, unless `backend` is another. InputError where the file is missing,
-        is no ONNX network, or does not fit the layout.
+        OpenCV runs it on the CPU, at any size, unless `backend` is another. InputError if the file
+        is missing, is no ONNX network, or does not fit the layout.
         """
         every = layouts()
         if layout not in (None, *every):
@@ -105,7 +107,7 @@ class HeatMapNetwork:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything that its detections depend on."""
+        """All settings that affect its detections."""
         network = {"sha256": self.network.sha256, "layout": self.layout.name}
         return {"network": network, "detection": {"long_side": self.long_side}}
 
@@ -114,8 +116,8 @@ class HeatMapNetwork:
         return f"{self.layout.text.number} {frames}\n"
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """A frame of the text: `Candidates` in a picture of the calibrated `size`, None where there was no
-        picture.
+        """A frame of the text: `Candidates` in a picture of the calibrated `size`, None if there
+        was no picture.
         """
         if found is None:
             return "0\n" * len(self.layout.text.joints)
@@ -126,7 +128,7 @@ class HeatMapNetwork:
         return "".join(f"{line}\n" for line in lines)
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
-        """The input for pictures with such a region and roll."""
+        """The input for pictures with the given region and roll."""
         return UprightView.of(region, roll_deg, self.long_side, _MULTIPLE, self.network.size)
 
     def run(self, picture: NDArray[np.uint8]) -> Blob:

@@ -1,7 +1,8 @@
-"""Reads an ONNX file that holds all of its weights itself.
+"""Reads an ONNX file that contains all of its weights.
 
-Runtimes open the files that a tensor names, relative to where this program runs. Every tensor of the file is
-therefore visited, by the wire format of protobuf and the messages of onnx.proto, before a library gets the bytes.
+ONNX runtimes open external files that a tensor names, relative to the working directory. Every
+tensor of the file is therefore checked, by the wire format of protobuf and the messages of
+onnx.proto, before the bytes are passed to a library.
 """
 
 from pathlib import Path
@@ -18,7 +19,7 @@ _MOST_FIELDS = 2**20
 _LONGEST = 2**31
 """Size of a field, bytes, exclusive; protobuf's own limit."""
 _FIXED_BYTES = {1: 8, 5: 4}
-"""Lengths of the wire types that have a fixed one."""
+"""Lengths, bytes, of protobuf's wire types with a fixed length."""
 
 _MESSAGES: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
@@ -36,14 +37,15 @@ _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
 
 
 class _Broken(Exception):
-    """The bytes are no message that a writer of protobuf makes."""
+    """The bytes are not a valid protobuf message."""
 
 
 def read_onnx(file: Path) -> bytes:
     """Content of the ONNX file at `file`, at most `MOST_BYTES`, in which no tensor names another file.
 
-    InputError where the file cannot be read, is no ONNX network, or has weights in other files. Encodings on which
-    two parsers may disagree (tags of more bytes than needed, groups) are refused: no program writes them.
+    InputError if the file cannot be read, is no ONNX network, or has weights in other files.
+    Encodings that two parsers may read differently (tags of more bytes than needed, groups) are
+    refused: no program writes them.
     """
     content = read_bytes(file, MOST_BYTES)
     try:

@@ -22,7 +22,7 @@ Backend = Literal["opencv", "onnxruntime"]
 Blob = NDArray[np.float32]
 """Inputs and outputs of a network."""
 PROVIDERS = {"cpu": "CPU", "cuda": "CUDA", "rocm": "ROCM", "coreml": "CoreML", "directml": "Dml"}
-"""onnxruntime's names of devices."""
+"""Devices, and onnxruntime's names of their execution providers."""
 _TRY = """
 import sys, cv2, numpy
 cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), dtype=numpy.uint8))
@@ -40,15 +40,15 @@ class OnnxNetwork:
     file: Path
     """Path of the file, for messages."""
     sha256: str
-    """Checksum of its file."""
+    """SHA-256 of the file."""
     forward: Callable[[Blob], list[Blob]]
     """Function from pictures (B, 3, height, width) to all outputs."""
     size: tuple[int, int] | None = None
-    """Width and height that the file fixes; None where any size is possible."""
+    """Width and height that the file fixes; None if any size is possible."""
     inputs: tuple[str, ...] = ()
-    """The inputs' names, where they are known."""
+    """Names of the inputs, if known."""
     outputs: tuple[str, ...] = ()
-    """The outputs' names, where they are known."""
+    """Names of the outputs, if known."""
     at_once: int = 1
     """Maximum number of pictures in a batch."""
 
@@ -56,8 +56,9 @@ class OnnxNetwork:
     def open(cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu") -> "OnnxNetwork":
         """The network in `file`; `device` is one of `PROVIDERS`, "cuda:1" its second.
 
-        InputError where the file is missing, no network or too large, where the device is not there, and where
-        weights lie in other files: their paths are looked up wherever this program runs, and may lead anywhere.
+        InputError if the file is missing, no network or too large, if the device is not available,
+        or if weights are in other files: their paths are relative to the working directory, and may
+        point to any file.
         """
         file = Path(file)
         content = read_onnx(file)
@@ -65,7 +66,9 @@ class OnnxNetwork:
         return cls(file, hashlib.sha256(content).hexdigest(), *run_by(file, content, device))
 
     def run(self, pictures: Blob) -> list[Blob]:
-        """All outputs for pictures (B, 3, height, width); InputError where it cannot be run on such."""
+        """All outputs for pictures (B, 3, height, width); InputError if the network cannot process
+        them.
+        """
         try:
             return self.forward(pictures)
         except Exception as error:
@@ -76,7 +79,7 @@ class OnnxNetwork:
 
 
 def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
-    """`forward` of the network run by OpenCV's dnn, on the CPU, which takes pictures of any size."""
+    """`forward` of the network run by OpenCV's dnn module, on the CPU, for pictures of any size."""
     _try_elsewhere(file, content)
     try:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
@@ -94,12 +97,12 @@ def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
 
 
 def _try_elsewhere(file: Path, content: bytes) -> None:
-    """InputError where OpenCV, in another process, crashes or hangs with a network, as it may with damaged
-    files.
+    """InputError if OpenCV, run in another process, crashes or hangs with a network, as it may with
+    damaged files.
     """
     if not sys.executable:
         return
-    command = [sys.executable, "-P", "-c", _TRY]  # -P: nothing is imported from the present folder
+    command = [sys.executable, "-P", "-c", _TRY]  # -P: nothing is imported from the working directory
     try:
         done = subprocess.run(
             command,
@@ -117,8 +120,8 @@ def _try_elsewhere(file: Path, content: bytes) -> None:
 
 
 def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
-    """`forward` and the fields after it in `OnnxNetwork`, with onnxruntime; on the CPU with as many threads as
-    OpenCV has.
+    """`forward` and the following fields of `OnnxNetwork`, by onnxruntime; on the CPU with as many
+    threads as OpenCV has.
     """
     try:
         onnxruntime: Any = import_module("onnxruntime")
@@ -136,7 +139,7 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
     options: Any = onnxruntime.SessionOptions()
     options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
     options.log_severity_level = 4
-    options.add_session_config_entry("session.load_model_format", "ONNX")  # what `read_onnx` has looked through
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # as checked by `read_onnx`
     try:
         providers = [(provider, {"device_id": number} if number else {})]
         session: Any = onnxruntime.InferenceSession(
@@ -144,7 +147,7 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
         )
     except Exception as error:
         raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({_first_line(error)})") from None
-    if provider not in session.get_providers():  # it goes on with the CPU in silence
+    if provider not in session.get_providers():  # it fell back to the CPU
         raise InputError(f"--device {device}: the device cannot be used; check its driver, or leave --device out")
     takes = session.get_inputs()
     if len(takes) != 1:
@@ -161,10 +164,10 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
 
 
 def words(shape: Sequence[int]) -> str:
-    """An array's shape in words."""
+    """Text of an array's shape."""
     return " x ".join(map(str, shape))
 
 
 def _first_line(error: BaseException) -> str:
-    """The first line of a library's message, short."""
+    """The first line of a library's message, shortened."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:160]

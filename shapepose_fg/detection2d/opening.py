@@ -18,18 +18,20 @@ from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.io.validation import validated
 
 Network = HeatMapNetwork | TopDownNetwork
-"""A network that finds joints in upright pictures. Each has its input (`view`), detections (`detect`), their
-format (`suffix`, `head`, `text`, `tail`), and everything that they depend on (`settings`)."""
+"""A network that finds joints in upright pictures. Each has its input (`view`), detections
+(`detect`), their file format (`suffix`, `head`, `text`, `tail`), and all settings that affect them
+(`settings`)."""
 
 
 def open_network(
     network: str, boxes: str | None, named_file: Callable[[str], Path], device: str = "cpu", **openpose: Any
 ) -> Network:
-    """The network of an ONNX file, a network's TOML file, or a name that `named_file` finds.
+    """Open the network of an ONNX file, of a network's TOML file, or of a name that `named_file`
+    resolves to a file.
 
-    `boxes` is an ONNX file or a name of a network that finds people, in place of the network's own; an ONNX file
-    without is of OpenPose's kind, and `openpose` has further arguments of `HeatMapNetwork.load`. InputError, one
-    sentence.
+    `boxes` is an ONNX file or a name of a network that detects people, and replaces the network's
+    own. An ONNX file without `boxes` is OpenPose-like; `openpose` are further arguments of
+    `HeatMapNetwork.load`. InputError, one sentence, if it cannot be opened.
     """
     named = _named("--network", network)
     if network.endswith(".toml"):
@@ -62,7 +64,7 @@ def open_network(
 
 
 def _named(option: str, name: str) -> NamedNetwork | None:
-    """The network of a name; None where it is a file, InputError where it is neither."""
+    """The named network; None if `name` is a file, InputError if it is neither."""
     named = named_networks()
     if Path(name).is_file():
         return None
@@ -73,7 +75,7 @@ def _named(option: str, name: str) -> NamedNetwork | None:
 
 
 def read_form(path: Path) -> KeypointForm:
-    """Content of a network's TOML file, with paths relative to its folder.
+    """Content of a network's TOML file, with paths relative to the folder of the file.
 
     InputError, one sentence that names the file, the key and the cure.
     """
@@ -88,7 +90,7 @@ def read_form(path: Path) -> KeypointForm:
 
 
 def _beside(path: Path, key: str, name: str) -> str:
-    """A file in the folder of the TOML file, or below it."""
+    """Path of a file in the folder of the TOML file, or below it."""
     if not (name and is_inside(path.parent, name)):
         cure = "put it there and name it"
         raise InputError(f"{path}: {key} {name[:80]!r} must be a file in the same folder; {cure}")

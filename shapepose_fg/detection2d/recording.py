@@ -1,4 +1,6 @@
-"""Runs the detector on all pictures of a recording, in blocks that are kept, so that a run can be resumed."""
+"""Runs the detector on all pictures of a recording, in blocks that are saved, so that a run can be
+resumed.
+"""
 
 import json
 import shutil
@@ -24,7 +26,7 @@ from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement,
 from shapepose_fg.io.timestamps import nameable, write_timestamps
 
 BLOCK = 16
-"""Number of frame sets in a block, which an interrupted run loses at most."""
+"""Number of frame sets in a block. An interrupted run loses at most one block."""
 _UNFINISHED = "unfinished"
 _SETTINGS = "settings.json"
 
@@ -38,7 +40,7 @@ class CameraDetector:
     footage: Footage
     """Pictures of the camera."""
     placement: Placement
-    """Place of calibrated pixels in them."""
+    """Mapping from calibrated pixels to the pixels of the pictures."""
     network: Network
     """The network."""
     view: UprightView
@@ -51,19 +53,21 @@ class CameraDetector:
         return cls(camera, footage, placement, network, view)
 
     def detect(self, picture: NDArray[np.uint8]) -> Candidates | People:
-        """Detections in a `picture` (H, W, 3), blue green red, in calibrated pixels, with distortion."""
+        """Detections in a `picture` (H, W, 3), blue green red; in calibrated pixels, not
+        undistorted.
+        """
         found = self.network.detect(self.view.input_of(picture))
         xy = self.view.picture_from_input(found.xy)
-        # In the corners beside a turned picture there is nothing to see.
+        # Detections in the empty corners of a rotated picture are left out.
         return found.moved(self.placement.to_calibrated(xy), self.view.inside(xy))
 
 
 @dataclass(frozen=True)
 class DetectionRun:
-    """The work of a detection run."""
+    """A detection run over all cameras."""
 
     cameras: Sequence[CameraDetector]
-    """(V,) detector of each camera, with one network."""
+    """(V,) detector of each camera; all with the same network."""
     moments: Moments
     """Synchronised frame sets."""
     output: Path
@@ -71,7 +75,7 @@ class DetectionRun:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything that the detections depend on: equal for a resumed run."""
+        """All settings that affect the detections; equal in a resumed run."""
         cameras = [
             {
                 "name": each.camera.name,
@@ -89,9 +93,9 @@ class DetectionRun:
 def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> tuple[list[int], list[int]]:
     """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json into the output.
 
-    Returns (V,) the number of joints in each camera's pictures, and (V,) the number of unreadable pictures. Blocks
-    that an earlier run of the same settings left are reused; the files are the same. InputError where the folder
-    holds detections, or a run of other settings.
+    Returns (V,) the number of joints in each camera's pictures, and (V,) the number of unreadable
+    pictures. Blocks of an interrupted run with the same settings are reused, with the same
+    resulting files. InputError if the folder has other detections, or a run with other settings.
     """
     unfinished = inside(run.output, _UNFINISHED)
     _refuse_others(run, unfinished)
@@ -127,7 +131,8 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
 
 
 def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progress) -> None:
-    """Detect in the pictures of some frame sets, camera after camera of each set, and store the results.
+    """Detect in the pictures of some frame sets, camera by camera of each set, and save the
+    results.
 
     For each camera these are its text, the number of joints, and the number of unreadable pictures.
     """
@@ -146,17 +151,19 @@ def _write_block(run: DetectionRun, moments: range, file: Path, progress: Progre
 
 
 def _read_block(file: Path, views: int, name: str) -> list[Any]:
-    """(V,) an entry of what `_write_block` wrote; InputError on anything else."""
+    """(V,) the entry `name` of a block file written by `_write_block`; InputError for any other
+    content.
+    """
     block = read_json(file)
     values = block.get(name) if isinstance(block, dict) else None
     kind = str if name == "text" else int
     if not isinstance(values, list) or len(values) != views or {*map(type, values)} != {kind}:
-        raise InputError(f"{file}: not a block of this version; delete the folder that it is in")
+        raise InputError(f"{file}: this is not a block of this version; delete its folder")
     return values
 
 
 def _write_times(run: DetectionRun) -> None:
-    """Write times.csv: the times of the frames, for each camera where they are asynchronous."""
+    """Write times.csv: the times of the frames; one column per camera if they are asynchronous."""
     time_s = run.moments.time_s
     file = run.output / "times.csv"
     if time_s is None:
@@ -168,27 +175,34 @@ def _write_times(run: DetectionRun) -> None:
 
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
-    """InputError where the output folder holds other detections, or an unfinished run of other settings."""
+    """InputError where the output folder has other detections, or an unfinished run with other
+    settings.
+    """
     names = [each.camera.name for each in run.cameras]
     if Path(FOOTAGE).stem in names:
-        raise InputError(f"camera {Path(FOOTAGE).stem!r}: {FOOTAGE} is another file; rename it in the calibration")
+        raise InputError(
+            f"camera {Path(FOOTAGE).stem!r}: this name would conflict with {FOOTAGE}; rename the"
+            " camera in the calibration"
+        )
     places = [run.output / f"{name}{suffix}" for name in names for suffix in (".txt", ".json")]
     if (unfinished / _SETTINGS).is_file():
         before, now = read_json(unfinished / _SETTINGS), run.settings
         if before != now:
             differ = [key for key in now if not isinstance(before, dict) or before.get(key) != now[key]]
             raise InputError(
-                f"{unfinished}: a run that differs in its {' and '.join(differ)} was stopped here; start it as it"
-                " was to go on, or delete this folder"
+                f"{unfinished}: there is an interrupted run with different {' and '.join(differ)}; start it with"
+                " the same options to continue, or delete this folder"
             )
     elif unfinished.exists() and any(unfinished.iterdir()):
-        raise InputError(f"{unfinished}: not a run of this program; delete the folder, or give another --output")
+        raise InputError(
+            f"{unfinished}: this is not a run of this program; delete the folder, or give another --output"
+        )
     elif there := [place for place in places if place.exists()]:
         raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
 
 
 def _state(path: Path) -> list[int]:
-    """Size and modification time of a video, or of a folder's pictures, by which changes are noticed."""
+    """Size and modification time of a video, or of a folder's pictures, for detecting changes."""
     files = [path] if path.is_file() else sorted(each for each in path.iterdir() if each.is_file())
     states = [each.stat() for each in files]
     return [sum(each.st_size for each in states), max((each.st_mtime_ns for each in states), default=0)]

@@ -1,6 +1,7 @@
 """Top-down networks such as RTMPose: boxes around people, and the joints of the person in each.
 
-Boxes and joints are those of `rtmlib` to a hundredth of a pixel (tests/detection2d/test_against_rtmlib.py).
+Boxes and joints agree with those of `rtmlib` to a hundredth of a pixel
+(tests/detection2d/test_against_rtmlib.py).
 """
 
 import json
@@ -23,32 +24,34 @@ from shapepose_fg.detection2d.upright import UprightView
 _Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 _Above0 = Annotated[FiniteFloat, Field(gt=0)]
 _AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
-"""Numbers of axes of the outputs of each decoding."""
+"""Number of axes of each output, for each decoding."""
 
 
 class KeypointForm(BaseModel, extra="forbid"):
-    """Description of a network of keypoints: a TOML file; defaults are those of RTMPose."""
+    """Description of a keypoint network (TOML file); the defaults are those of RTMPose."""
 
     network: str = ""
     """ONNX file of the network."""
     skeleton: str | None = None
-    """One of `SKELETONS`, or a skeleton's TOML file; None where the number of joints determines it."""
+    """One of `SKELETONS`, or a skeleton's TOML file; None if the number of joints determines it."""
     joints: list[str] | None = None
     """Name of each joint of the network in the skeleton, "" for none; None for its keypoints in order."""
     decoding: Literal["simcc", "heat map", "coordinates"] = "simcc"
-    """Output of the network: for each joint two curves, along x and along y; a map; or x, y and score."""
+    """Output of the network: for each joint two 1D distributions along x and y (SimCC), a heat map,
+    or x, y and score."""
     input: str | None = None
     """Name of its input; None for the only one."""
     outputs: list[str] | None = None
     """Names of its outputs: x and y of SimCC, otherwise one; None for the first ones."""
     size: tuple[Side, Side] = (192, 256)
-    """Width and height of the network's input, pixels, where the ONNX file does not fix them."""
+    """Width and height of the network's input, pixels, if the ONNX file does not fix them."""
     colours: Literal["bgr", "rgb"] = "bgr"
-    """Order of the colours. RTMPose was trained on the other; rtmlib and others run it with this one."""
+    """Order of the colour channels of the input. RTMPose was trained on RGB; rtmlib and others run
+    it with BGR."""
     mean: _Three = (123.675, 116.28, 103.53)
-    """Subtracted from colours from 0 to 255, in their order."""
+    """Mean that is subtracted from the colours (0 to 255), in their order."""
     std: tuple[_Above0, _Above0, _Above0] = (58.395, 57.12, 57.375)
-    """Divisors of the colours after that."""
+    """Standard deviation by which the colours are divided after that."""
     cells: Literal["corners", "edges"] = "corners"
     """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill the input."""
     scale: tuple[FiniteFloat, FiniteFloat] = (1.0, 1.0)
@@ -56,17 +59,17 @@ class KeypointForm(BaseModel, extra="forbid"):
     padding: Annotated[FiniteFloat, Field(ge=1, le=4)] = 1.25
     """Ratio of the size of the network's input to that of the box."""
     boxes: BoxForm | None = None
-    """Network that finds people; None where the input is the whole picture."""
+    """Network that detects people; None if the input is the whole picture."""
 
 
 @dataclass(frozen=True)
 class People:
-    """People of one picture, whose joints the network grouped."""
+    """People of one picture, with their joints grouped by the network."""
 
     xy: Array
     """(P, K, 2) positions, in the order of the skeleton's keypoints."""
     score: Array
-    """(P, K) scores of the network; 0 or less is a joint that was not seen."""
+    """(P, K) scores of the network; 0 or less for a joint that was not detected."""
 
     def __len__(self) -> int:
         return int((self.score > 0).sum())
@@ -78,7 +81,9 @@ class People:
 
 @dataclass(frozen=True)
 class TopDownNetwork:
-    """Boxes, and a network that finds the joints of the person in each."""
+    """A box network that detects people, and a network that finds the joints of the person in each
+    box.
+    """
 
     network: OnnxNetwork
     """The network that finds joints."""
@@ -87,16 +92,18 @@ class TopDownNetwork:
     skeleton: Skeleton
     """Skeleton of its joints."""
     place: Index
-    """(N,) which of the skeleton's K keypoints each joint of the network is, -1 for none."""
+    """(N,) index of each of the network's joints among the skeleton's K keypoints, -1 for none."""
     boxes: BoxNetwork | None
-    """Network that finds people; None where the input is the whole picture."""
+    """Network that detects people; None if the input is the whole picture."""
     suffix, tail = ".json", "\n]}\n"
 
     @classmethod
     def of(
         cls, network: OnnxNetwork, form: KeypointForm, skeleton: Skeleton | None, boxes: BoxNetwork | None
     ) -> "TopDownNetwork":
-        """Load the network and run it on an empty picture: InputError where it does not fit its description."""
+        """Load the network and run it on an empty picture: InputError if it does not fit its
+        description.
+        """
         count = _decoded(network, form, np.zeros((1, 3, *form.size[::-1]), dtype=np.float32))[1].shape[1]
         skeleton = skeleton or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
         if skeleton is None:
@@ -121,7 +128,7 @@ class TopDownNetwork:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything that the detections depend on."""
+        """All settings that affect the detections."""
         said = [
             part
             and {"sha256": part.network.sha256, **part.form.model_dump(mode="json", exclude={"network", "boxes"})}
@@ -130,15 +137,17 @@ class TopDownNetwork:
         return {"network": said[0], "detection": {"boxes": said[1]}}
 
     def head(self, frames: int) -> str:
-        """The beginning of MMPose's JSON of a video, with the joints' layout unless it was guessed."""
+        """The beginning of MMPose's JSON of a video, with the layout of the joints unless it was
+        guessed.
+        """
         alike = [each for each in SKELETONS.values() if each.keypoint_count == self.skeleton.keypoint_count]
         named = self.form.skeleton in SKELETONS or alike == [self.skeleton]
         meta = {"dataset_name": self.skeleton.name} if named else {}
         return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """Frame `number` of the JSON: `People`, None where there was no picture. Joints that were not seen are
-        0 0 0.
+        """Frame `number` of the JSON: `People`, or None if there was no picture. Joints that were
+        not detected are 0 0 0.
         """
         people = []
         for xy, score in zip(found.xy, found.score, strict=True) if found else ():
@@ -148,7 +157,7 @@ class TopDownNetwork:
         return f"{',' if number else ''}\n{json.dumps({'frame_id': number, 'instances': people}, allow_nan=False)}"
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
-        """The input for pictures with such a region and roll, at full resolution."""
+        """The input for pictures with the given region and roll, at full resolution."""
         return UprightView.of(region, roll_deg)
 
     def detect(self, picture: NDArray[np.uint8]) -> People:
@@ -166,7 +175,7 @@ class TopDownNetwork:
             middle, sides = centre[n : n + step], extent[n : n + step]
             crops = [_crop(picture, *each, size) for each in zip(middle, sides, strict=True)]
             xy, score = self._joints(np.stack(crops))
-            # A network of whole pictures may find several people in each.
+            # A network that gets whole pictures may find several people in each.
             middle, sides = (np.repeat(each, len(xy) // len(crops), axis=0)[:, None] for each in (middle, sides))
             positions.append((xy / size - 0.5) * sides + middle)
             scores.append(score)
@@ -175,8 +184,8 @@ class TopDownNetwork:
     def _joints(self, crops: NDArray[np.uint8]) -> tuple[Array, Array]:
         """Positions (P, K, 2) in pixels of `crops` (B, H, W, 3), and scores (P, K).
 
-        P is B, or a multiple where the network finds several people in each. Missing joints, and values that are
-        not finite, have a score of 0.
+        P is B, or a multiple of B if the network finds several people in each. Missing joints, and
+        values that are not finite, have a score of 0.
         """
         ordered = crops if self.form.colours == "bgr" else crops[..., ::-1]
         blob = ((ordered - np.array(self.form.mean)) / np.array(self.form.std)).transpose(0, 3, 1, 2)
@@ -189,11 +198,11 @@ class TopDownNetwork:
 
 
 def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array) -> NDArray[np.uint8]:
-    """The part of a frame around `centre` (2,) with the sides `extent` (2,), at the `size` (2,) of the network.
-
-    It is black outside of the picture.
+    """Cut the part of a picture around `centre` (2,) with the sides `extent` (2,), resized to the
+    network's input `size` (2,). Outside of the picture it is black.
     """
-    # By the three points that rtmlib takes, rounded as there: others would make other pixels here and there.
+    # The affine map of rtmlib, from the same three points with the same rounding: others would
+    # change some pixels.
     points = np.array([[centre, centre], [size / 2, size / 2]])
     points[:, 1, 1] -= extent[0] / 2, size[0] / 2
     points = points.astype(np.float32)
@@ -209,7 +218,7 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
     if form.outputs is not None:
         outputs = [outputs[network.outputs.index(name)] for name in form.outputs]
     read = [each.astype(np.float64) for each in outputs[: len(axes)]]
-    if form.decoding == "coordinates" and read[0].ndim == 4:  # several people of each picture
+    if form.decoding == "coordinates" and read[0].ndim == 4:  # several people in each picture
         read = [read[0].reshape(-1, *read[0].shape[2:])]
     shapes = [each.shape for each in read]
     if (
@@ -235,7 +244,9 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
 
 
 def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
-    """Pixels (B, N, 2) and heights (B, N) of the maxima of maps (B, N, H, W), between the cells."""
+    """Positions (B, N, 2) in pixels, refined between the cells, and heights (B, N) of the maxima of
+    maps (B, N, H, W).
+    """
     shape = np.array(maps.shape[:1:-1])
     flat = np.nan_to_num(maps, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, *maps.shape[2:])
     row, column = np.divmod(flat.reshape(len(flat), -1).argmax(axis=1), shape[0])

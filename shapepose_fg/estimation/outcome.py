@@ -1,4 +1,6 @@
-"""What comes of a solved window: errors that last, doubts, how each joint is known, and what went wrong."""
+"""Results of a solved window: correlated errors, further uncertainty, how joints are known, and
+problems.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,6 +10,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
@@ -23,6 +26,7 @@ from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
+    information_by_view,
     inverses,
     linearise,
     mean_confidence,
@@ -30,6 +34,7 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.noise_law import core_sigma_m, variance_ratio
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import State
@@ -38,19 +43,20 @@ from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
 
 RUNAWAY_M = 1.0
-"""A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
+"""Distance of a joint with a user factor from its initial position at which it has diverged, m."""
 RUNAWAY_SIGMA = 20.0
-"""A joint that ends this many standard deviations, and half a metre, from what views and body say of it has run
-away."""
+"""Distance of a joint from its views and body, standard deviations, at which it has diverged, if
+also over 0.5 m."""
 _HALF_M = 0.5
 WEAK_SCORE = 0.3
-"""Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
+"""Score below which a detection is weak: in simulated crowds one in 18 is not the person's, of
+others one in 60."""
 WEAK_PROBABILITY = 0.5
-"""Detections that are less probably the person's are weak."""
+"""Probability below which a detection is weak."""
 
 
 def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
-    """What is reported of a window whose joints are solved: covariances with all doubts, codes, statuses."""
+    """Results of a window with solved joints: covariances with all uncertainty, codes, statuses."""
     rows, people, shape = state.observations, state.people, state.joints.shape
     solved, covariance, velocity_covariance = (np.full((*shape, 3), np.nan) for _ in range(3))
     velocity = np.full(shape, np.nan)
@@ -108,7 +114,7 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
 
 
 def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
-    """How many factors each function of the user's made, and how many were inactive in the last problem."""
+    """Number of factors by user function, and how many were inactive in the last problem."""
     ties = {id(person.ties): person.ties for person in people}.values()
     made, active = (
         Counter(factor.name for each in ties for factor in of(each))
@@ -118,9 +124,9 @@ def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:
-    """The bodies that are returned: where there are factors of the user's own, fitted to the joints as solved.
+    """The bodies to return. For people with user factors, they are fitted to the solved joints.
 
-    The bodies follow these factors so. What they say goes nowhere else: joints and covariances are done.
+    In this way, the bodies follow these factors. Joints and covariances are final and not affected.
     """
     fit = state.fit
     chosen = [
@@ -136,39 +142,45 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
 
 
 def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
-    """Covariances (N, J, 3, 3) with all doubts: over time as calibrated, frame by frame of the detections.
+    """Covariances (N, J, 3, 3) of the joints `X` with all uncertainty, for the detector's noise law.
 
-    `covariance` is that of the graph, errors that last in it; `final` what the views say around the joints `X`.
+    `covariance` is that of the graph, with correlated errors, and `final` the linearised
+    observations at `X`. In rows without temporal factors, the result is not smaller than
+    `covariance`.
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
-    calibration = Calibration.load(joints)
-    of_body = np.nan_to_num(squared_distance(body, state.joints, covariance))
-    association = association_spread(rows, state.sigmas, final, body, state.views, state.config.observations)
+    config, alone = state.config.observations, np.ones(len(X), dtype=bool)
+    for person in state.people:
+        alone[person.rows] = not person.temporal
+    sigma_m = core_sigma_m(rows.confidence, config) * config.scatter(joints)[:, None]
+    by_view = information_by_view(final, state.sigmas, state.views, config)
+    ratio = variance_ratio(state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information)
+    widened = ratio[..., None, None] * covariance
+    of_body = np.nan_to_num(squared_distance(body, state.joints, widened))
+    association = association_spread(rows, state.sigmas, final, body, state.views, config)
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
     exchange = exchange_spread(state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints))
-    alone = np.ones(len(X), dtype=bool)
     for person in state.people:
         mine, times_s = person.rows, person.times_s
-        alone[mine] = not person.temporal
         association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
             clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
-    clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
-    return np.where(
-        alone[:, None, None, None],
-        covariance + calibration.association * association,
-        calibration.covariance(clues),
-    )
+    clues = Clues(rows.frame, X, count, widened, of_body, association, draft, exchange)
+    found = Calibration.load(joints).covariance(clues)
+    single = alone[:, None] & np.isfinite(found).all(axis=(-2, -1))
+    found[single] = covariance[single] + raise_eigenvalues(found[single] - covariance[single], 0.0)
+    return found
 
 
 def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
-    """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, and the errors that it left out.
+    """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, plus the errors it
+    omits.
 
-    Added is the share that lasts, of what views and body leave in one frame; and of the share that motion smooths,
-    the part that it does not take away in truth, because errors fade over a few frames (`Lasting.kept`). Where a
-    joint is not seen, what was left in the nearest frame in which it was is carried along. What is solved with
-    offsets has its own lasting error in `marginal`.
+    Added are the correlated share of the single-frame covariance by views and body; and of the
+    white share, the part that smoothing does not really remove, because errors are correlated over
+    a few frames (`Lasting.kept`). For unseen joints this is taken from the nearest frame in which
+    they are seen. For joints solved with offsets, `marginal` already includes the correlated error.
     """
     said = state.of_views.information[person.rows]
     information = said + state.of_body.information[person.rows]
@@ -183,17 +195,17 @@ def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
 
 
 def strong(state: State) -> Mask:
-    """(N, J, V) the observations that are used and not weak."""
+    """(N, J, V) mask of used observations that are not weak."""
     observations = state.observations
     sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
     return state.inlier & sure
 
 
 def how_known(state: State, covariance: Array) -> NDArray[np.uint8]:
-    """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
+    """(N, J) code of `Known` for each joint, with `covariance` (N, J, 3, 3).
 
-    It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by
-    motion where it is known much better (half the variance) than the body knows it.
+    It is SEEN if two views have used detections that are not weak. An unseen joint is MOTION if its
+    variance is less than half that of the body's constraint.
     """
     pulled = state.of_body.known
     information = np.where(pulled[..., None, None], state.of_body.information, np.eye(3))
@@ -235,5 +247,5 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
 
 
 def _pull(message: JointTargets, X: Array) -> Array:
-    """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
+    """(N, J, 3) information times displacement from `X` to the estimate, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

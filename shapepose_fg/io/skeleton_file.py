@@ -1,4 +1,6 @@
-"""A detector's own skeleton, described in TOML: its keypoints, limbs, mirror, anchor and places on the body."""
+"""Reads a detector's skeleton from TOML: its keypoints, limbs, mirror pairs, anchor and body
+points.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +19,7 @@ _FACE_AND_TOES = {
     "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel",
     "left_hand", "right_hand", "left_foot", "right_foot",
 }  # fmt: skip
-"""Points of the body that are not core joints."""
+"""Body points that are not core joints."""
 _HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
 
 
@@ -33,8 +35,8 @@ class _File(BaseModel, strict=True, extra="forbid"):
 
 
 def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
-    """A skeleton, given as itself, by its name (`joint_names.layouts_called`), or by the file that describes
-    it.
+    """A skeleton from a `Skeleton`, from a name (`joint_names.layouts_called`), or from a TOML
+    file.
     """
     if wanted is None or isinstance(wanted, Skeleton):
         return wanted
@@ -46,28 +48,32 @@ def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
         if len(called) == 1:
             return called[0]
         names = " ".join(each.name for each in called) or " ".join(SKELETONS)
-        what = "several skeletons are called so; give" if called else "neither a file nor a known skeleton; give"
+        what = (
+            "several skeletons have this name; give"
+            if called
+            else ("this is neither a file nor a known skeleton; give")
+        )
         raise InputError(f"{name}: {what} {'one of' if called else 'a TOML file, or one of'} {names}")
     return read_skeleton(name)
 
 
 def read_skeleton(path: str | Path) -> Skeleton:
-    """Read a skeleton's TOML file; its joints get the names of the body's points.
+    """Read a skeleton's TOML file; its joints get the names of their body points.
 
     InputError, one sentence that names the file, the key and the cure.
     """
     path = Path(path)
     file = validated(_File, read_toml(path), path, "docs/conventions.md describes the file")
-    # The point of the body that each joint is, by the joint's name in the file.
+    # The body point of each joint, by the joint's name in the file.
     points = {joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint}
     unknown = [name for name in file.body if name not in points]
     if unknown:
-        raise InputError(f"{path}: body.{unknown[0]} is no keypoint of {file.name}; it has {' '.join(points)}")
+        raise InputError(f"{path}: body.{unknown[0]} is not a keypoint of {file.name}; it has {' '.join(points)}")
     for joint, point in points.items():
         if point not in BODY_POINTS:
             raise InputError(
-                f"{path}: the body has no point {point!r}; say under [body] which of its points {joint} is"
-                f' ({" ".join(BODY_POINTS)}), or write "" for keypoints to be passed over'
+                f"{path}: the body has no point {point!r}; write under [body] which of its points {joint} is"
+                f' ({" ".join(BODY_POINTS)}), or "" to ignore the keypoint'
             )
 
     def pair(names: list[str]) -> tuple[str, str]:
@@ -75,7 +81,7 @@ def read_skeleton(path: str | Path) -> Skeleton:
 
     anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
     if not isinstance(anchor, str) and set(anchor) not in _HIPS:
-        raise InputError(f"{path}: an anchor of two is the middle of the hips; name others under [middles]")
+        raise InputError(f"{path}: an anchor of two joints must be the hips; name other midpoints under [middles]")
     core = [points.get(joint, joint) for joint in file.core or ()]
     if file.core is None:
         core = [point for point in points.values() if point not in _FACE_AND_TOES]

@@ -1,4 +1,4 @@
-"""The cameras and the body that a saved result was solved with."""
+"""The cameras and the body model with which a saved result was solved."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,23 +13,25 @@ from shapepose_fg.io.calibration import read_rig
 
 
 def cameras_of(folder: Path) -> Rig:
-    """The cameras of the result in `folder`; InputError with the cure where there are none."""
+    """The cameras of the result in `folder`; InputError with the cure if there are none."""
     file = folder / CAMERAS
     if not file.exists():
         raise InputError(
-            f"{file}: there is none, and this needs the cameras of the result: write them with"
-            " `people.save(folder, rig)` or `write_rig(rig, file)`, or copy the calibration there under this name"
+            f"{file}: this file with the cameras of the result is missing; write it with `people.save(folder,"
+            " rig)` or `write_rig(rig, file)`, or copy the calibration to this path"
         )
     return read_rig(file)
 
 
 def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
-    """The body model of a result with run.json `run`, or of the file `given`; InputError if it is missing."""
+    """The body model named in `run` (the content of run.json), or in the file `given`; InputError
+    if it is missing.
+    """
     named = run.get("body") if given is None else given
     file = None if named is None else Path(str(named))
     if file is None:
         return BodyModel.default().arrays
     if file.exists():
         return read_smpl_file(file)
-    problem = "the body model of this result is not there any more"
-    raise InputError(f"{file}: {problem}; put it back, or say with --body where it is")
+    problem = "the body model of this result is missing"
+    raise InputError(f"{file}: {problem}; restore it, or give its path with --body")

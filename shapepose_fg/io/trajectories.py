@@ -1,4 +1,4 @@
-"""Trajectories of carriers of cameras: TUM's text and our own CSV, which may have covariances."""
+"""Trajectories of carriers of cameras: TUM's format, CSV with optional covariances, and MCAP."""
 
 from pathlib import Path
 
@@ -16,10 +16,11 @@ from shapepose_fg.io.validation import is_number
 def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     """Read the poses of a carrier: world from carrier, metres, seconds on the clock of the pictures.
 
-    Eight numbers a line (TUM: time x y z qx qy qz qw), apart by blanks or commas; or with a header that names the
-    columns `POSE` in any order, and those of `COVARIANCE` that there are: the diagonal at least. `#` begins a
-    comment. Or an MCAP file of ROS 2 messages, `FILE.mcap#FRAME` where more than one frame moves in it.
-    InputError, one sentence that names file, line and cure.
+    The file has eight numbers per line (TUM: time x y z qx qy qz qw), separated by blanks or
+    commas; or a header with the columns `POSE` in any order and optionally those of `COVARIANCE`,
+    at least its diagonal. `#` begins a comment. Or it is an MCAP file of ROS 2 messages;
+    `FILE.mcap#FRAME` if more than one frame moves in it. InputError, one sentence that names file,
+    line and cure.
     """
     from scipy.spatial.transform import Rotation
 
@@ -43,7 +44,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     pose = np.column_stack([columns[each] for each in POSE])
     far = np.abs(pose[:, 1:4]).max(axis=1) > MOST_METRES
     if far.any():
-        raise InputError(f"{path}: line {lines[far][0]} is over {MOST_METRES:g} m away; write metres")
+        raise InputError(f"{path}: line {lines[far][0]} is more than {MOST_METRES:g} m away; write metres")
     length = np.linalg.norm(pose[:, 4:], axis=1)
     wrong = ~(np.abs(length - 1) < UNIT_LENGTH)
     if wrong.any():
@@ -63,22 +64,20 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         odd = np.linalg.eigvalsh(covariance)[:, 0] < -1e-9
         if odd.any():
             what = f"line {lines[odd][0]}: the covariance must have no negative eigenvalue"
-            raise InputError(f"{path}: {what}; write variances, rad² and m², of the carrier's own axes")
+            raise InputError(f"{path}: {what}; write variances about the carrier's axes, rad² and m²")
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
 
 
 def _check_columns(path: Path, line: int, names: list[str]) -> None:
-    """InputError where the columns are not those of a trajectory."""
+    """InputError if these are not the columns of a trajectory."""
     known = {*POSE, *COVARIANCE}
     odd = next((name[:20] for name in names if name not in known or names.count(name) > 1), None)
     missing = next((name for name in POSE if name not in names), None)
     if odd is not None or missing is not None:
-        what = (
-            f"column {odd!r} is not known, or twice there" if odd is not None else f"column {missing} is missing"
-        )
+        what = f"column {odd!r} is unknown or occurs twice" if odd is not None else f"column {missing} is missing"
         raise InputError(
-            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and of covariances rx_rx ..."
+            f"{path}: line {line}: {what}; name the columns {' '.join(POSE)}, and for covariances rx_rx ..."
         )
     diagonal = [name for name in COVARIANCE if len(set(name.split("_"))) == 1]
     lacks = next((name for name in diagonal if name not in names), None)

@@ -1,4 +1,4 @@
-"""Offsets of a detector's joints from those of the body, estimated from frames spread over a recording."""
+"""Learns a detector's joint offsets and noise law from frames spread over a recording."""
 
 from dataclasses import fields, replace
 
@@ -8,7 +8,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.frame_times import FrameTimes
@@ -18,13 +18,20 @@ from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
+from shapepose_fg.estimation.noise_law import NoiseLaw, Residuals
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.proposal.people_2d import whole_people
 from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
-_OFFSETS = "keypoint-offsets"
-"""The name under which a run stores them."""
+_OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
+"""Names under which a run stores the offsets and the noise law."""
+NOISE_FRAMES = 60
+"""Maximum number of frames for learning the noise law. Shorter recordings use the shipped law."""
+_ENOUGH = 10_000
+"""Number of detections that are enough for the noise law; a crowd has them in about 12 frames."""
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 def estimate_offsets(
@@ -55,7 +62,7 @@ def estimate_offsets(
 def kept_offsets(
     kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """The offsets that a run stored when it began; `offsets_of` where it has none yet."""
+    """The offsets stored when the run began; `offsets_of` if there are none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         with naming(kept.place(_OFFSETS), ANEW):
@@ -66,11 +73,58 @@ def kept_offsets(
     return offsets
 
 
+def kept_noise(
+    kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
+) -> NoiseLaw:
+    """The noise law stored when the run began; `noise_of` if there is none yet."""
+    if len(kept.names(_NOISE)) > 0:
+        with naming(kept.place(_NOISE), ANEW):
+            return NoiseLaw.from_dict({name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS})
+    noise = noise_of(setup, frames, times, book)
+    if noise != NoiseLaw.shipped():
+        kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
+    return noise
+
+
+def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook) -> NoiseLaw:
+    """The detector's noise law, from the same source as the offsets.
+
+    A recording of fewer than `NOISE_FRAMES` frames uses the shipped law.
+    """
+    source = setup.config.offsets.source
+    if source not in ("none", "recording"):
+        return NoiseLaw.load(source)
+    count = len(detections) - detections.first
+    if source == "none" or count < NOISE_FRAMES:
+        return NoiseLaw.shipped()
+    chosen, every = list[Observations](), list[Observations]()
+    with book.stage("noise"):
+        stage, time_s = (
+            StageOne(setup.skeleton, setup.config.candidates, setup.config.proposals, Notebook()),
+            times.of_views(len(setup.rig)),
+        )
+        frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
+        # In golden-ratio order, frames are spread over the whole recording even if it ends early.
+        for frame in frames[np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")].tolist():
+            found = detections[frame]
+            people = stage(found, setup.rig.at(time_s[frame]))
+            people = replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))
+            whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
+            chosen.append(people)
+            every.append(whole)
+            learnt += int(whole.seen.sum())
+            if learnt >= _ENOUGH:
+                break
+        rows, whole = Observations.concatenate(chosen), Observations.concatenate(every)
+        views, config = Views.of(setup.rig, rows.time_s), setup.config.observations
+        return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
+
+
 def offsets_of(
     setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """The offsets of the detector's joints; None where there is no source. ValueError where a file does not
-    fit.
+    """Offsets of the detector's joints; None without a source. Raises ValueError for an unsuitable
+    file.
     """
     config, rig, fitter = setup.config, setup.rig, setup.fitter
     source = config.offsets.source

@@ -1,4 +1,4 @@
-"""Who is in each picture: candidates grouped by their part affinities, greedily, as OpenPose does."""
+"""2D people in each view: candidates grouped greedily by part affinities, as OpenPose does."""
 
 import numpy as np
 
@@ -6,11 +6,17 @@ from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 
+LEAST_JOINTS = 4
+"""Minimum number of joints that a 2D person must share with a 3D person to match it."""
+_MOST_OF = 0.6
+"""Minimum share of the 3D person's detections in the view that belong to this 2D person."""
+
 
 def without_repeats(found: Detections) -> tuple[Detections, Index]:
-    """The detections with what is listed twice listed once, and which of `found` each of them is.
+    """The detections without duplicates, and the index of each in `found`.
 
-    Some detectors give a person twice, or two people with the same arm: each view saw it once.
+    Some detectors give a person twice, or two people with the same arm; a view can see each only
+    once.
     """
     places = np.column_stack([found.view, found.joint, found.xy])
     order = np.lexsort((-found.confidence, *places.T))
@@ -30,10 +36,11 @@ def without_repeats(found: Detections) -> tuple[Detections, Index]:
 
 
 def group_people(found: Detections) -> list[Index]:
-    """Candidates grouped into people, greedily: the rows (N,) of each group, single candidates included.
+    """Group candidates into people, greedily: the rows (N,) of each group, single candidates
+    included.
 
-    As OpenPose does, by the affinities alone: pairs in falling order; a pair joins its two groups unless
-    both have a candidate of one kind of joint, so that nobody gets two left knees.
+    As OpenPose does, by affinities only: pairs in descending order; a pair joins its two groups
+    unless both have a candidate of the same joint, so that no person gets two left knees.
     """
     _, joint, _, pairs, affinity = found.columns
     count = len(found)
@@ -44,12 +51,35 @@ def group_people(found: Detections) -> list[Index]:
     return np.split(order, stop[: groups - 1]) if count > 0 else []
 
 
+def whole_people(chosen: Index, found: Detections) -> Index:
+    """All detections (N, J, V) of the 2D people that match N 3D people; -1 for none.
+
+    `chosen` (N, J, V) are the detections of the 3D people. A joint is left out if its 3D person has
+    a detection of another 2D person, or if another 3D person has its detection. There the grouping
+    into 2D people is wrong, not the detector.
+    """
+    group, groups = np.empty(len(found), dtype=np.intp), group_people(found)
+    for number, rows in enumerate(groups):
+        group[rows] = number
+    whole = np.full(chosen.shape, -1, dtype=np.intp)
+    for row, view in np.ndindex(len(chosen), chosen.shape[2]):
+        own = chosen[row, :, view]
+        number, count = np.unique(group[own[own >= 0]], return_counts=True)
+        if count.max(initial=0) >= max(LEAST_JOINTS, _MOST_OF * count.sum()):
+            rows = groups[number[count.argmax()]]
+            whole[row, found.joint[rows], view] = rows
+    taken = np.bincount(chosen[chosen >= 0], minlength=len(found) + 1)
+    theirs = np.where(chosen == whole, taken[whole] > 1, (taken[whole] > 0) | (chosen >= 0))
+    return np.where(theirs, -1, whole)
+
+
 @kernel("i2 i1 i1 i1 i1 b2 i1 i1")
 def _group(pairs, joint, group, after, last, has, order, stop):
-    """`group_people`: its groups one after the other into `order` (N,), their ends into `stop`; their number.
+    """Implements `group_people`: writes the groups, concatenated, into `order` (N,), their ends
+    into `stop`; returns their number.
 
-    To begin with each is a `group` (N,) of its own, with none `after` (N,) it, the `last` (N,) of it itself, and
-    `has` (N, J), which kinds of joints a group has, is False.
+    At the start each candidate is its own `group` (N,) and its `last` (N,), `after` (N,) is -1, and
+    `has` (N, J), the joints of each group, is False.
     """
     count = len(joint)
     for row in range(count):

@@ -195,10 +195,10 @@ def test_lenses_by_their_field_of_view(tmp_path):
     assert rig.names == ("left", "right") and rig.cameras[0].image_size == (1920, 1080)
     np.testing.assert_allclose(rig.focal_px, [960.0, 960 * np.sqrt(3)])
     for fields, size, said in (
-        (["90"], None, "camera left: nothing says how large its pictures are; pass --image-size"),
+        (["90"], None, "camera left: the size of its pictures is unknown; pass --image-size"),
         (["3"], (640, 480), "--field-of-view 3: must be 5 to 150 degrees"),
         (["up=60"], (640, 480), "there is no camera 'up'; there are left right"),
-        (["left=60"], (640, 480), "camera right has none"),
+        (["left=60"], (640, 480), "missing for camera right"),
     ):
         with pytest.raises(InputError, match=said):
             lenses_of(tmp_path, fields, size)
@@ -219,11 +219,11 @@ def test_lenses_by_a_photo(tmp_path):
         rig = lenses_of(tmp_path, [str(tmp_path / "phone.jpg"), "right=60"], size)
         np.testing.assert_allclose(rig.focal_px[0], along / 400 * 1920)
     for name, said in (
-        ("bare", "does not say FocalLengthIn35mmFilm"),
+        ("bare", "data have no FocalLengthIn35mmFilm"),
         ("torn", "cannot be read"),
         ("no", "no such file"),
     ):
-        with pytest.raises(InputError, match=rf"{name}\.jpg: .*{said}.*; give a photo as the camera wrote it"):
+        with pytest.raises(InputError, match=rf"{name}\.jpg: .*{said}.*; give an unedited photo of the camera"):
             lenses_of(tmp_path, [str(tmp_path / f"{name}.jpg")], (640, 480))
 
 
@@ -240,7 +240,7 @@ def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, caps
         return ended.value.code, said.out, " ".join(said.err.split())
 
     code, out, _ = run("--calibration", tmp_path / "lenses.json")
-    assert code == 0 and "next: shapepose-fg reconstruct" in out and "scale: adults of 1.70 m" in out
+    assert code == 0 and "next: shapepose-fg reconstruct" in out and "scale: assumed median stature 1.70 m" in out
     assert off_after_growing(read_rig(tmp_path / "new.json"), rig)[0].max() < 0.25
     (tmp_path / "new.json").unlink()
     code, out, error = run("--calibration", tmp_path / "lenses.json", "--frames", "0:10")
@@ -270,7 +270,7 @@ def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, caps
         code, _, error = run(*lenses, *more)
         assert code == 2 and said in error
     code, _, error = run()
-    assert code == 2 and "one of them must say how wide the cameras see" in error
+    assert code == 2 and "the focal lengths are needed; give one of them" in error
 
 
 @pytest.mark.slow

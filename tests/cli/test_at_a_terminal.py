@@ -94,7 +94,7 @@ from shapepose_fg.cli.terminal import bars, note, progress, show, table, use_any
 from shapepose_fg.core.errors import InputError
 
 def work(*_, **__):
-    with progress("looking through " + {ESCAPES!r}) as tell:
+    with progress("reading cam " + {ESCAPES!r}) as tell:
         for i in range(40):
             tell(i, 40)
             time.sleep(0.02)
@@ -139,21 +139,21 @@ def test_a_bar_is_drawn_and_taken_away(work, settings):
         assert "\x1b" not in seen.raw
     words = " ".join(" ".join(seen.lines).split())
     assert "note: meanwhile" in words and "from a library" in words and "done" in words
-    assert "looking through" not in words and "0/40" not in words, "the bar is taken away"
+    assert "reading cam" not in words and "0/40" not in words, "the bar is taken away"
 
 
 @pytest.mark.slow
 def test_a_bar_is_taken_away_where_an_error_ends_the_work(work):
     seen = at_terminal(sys.executable, work, "error")
     assert seen.code == 2 and seen.rubbish() == []
-    assert "looking through" not in "".join(seen.lines) and seen.lines[-1].startswith("error: frame 30")
+    assert "reading cam" not in "".join(seen.lines) and seen.lines[-1].startswith("error: frame 30")
 
 
 @pytest.mark.slow
 def test_a_bar_is_taken_away_where_it_is_stopped(work):
     seen = at_terminal(sys.executable, work, "stopped", stop_at="from a library")
     assert seen.code == 130 and seen.rubbish() == []
-    assert "looking through" not in "".join(seen.lines) and "stopped: " in seen.lines[-1]
+    assert "reading cam" not in "".join(seen.lines) and "stopped: " in seen.lines[-1]
 
 
 @pytest.mark.slow
@@ -167,7 +167,7 @@ def test_a_log_has_lines_now_and_then(work, tmp_path):
     start_s = time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     most = 1 + (time.monotonic() - start_s) / 0.3
-    told = [line for line in done.stderr.splitlines() if line.startswith("looking through")]
+    told = [line for line in done.stderr.splitlines() if line.startswith("reading cam")]
     assert 1 <= len(told) <= most and re.search(r"\d+ of 40 frames, 0 min left", told[0])
     assert "\x1b" not in done.stderr + done.stdout
 

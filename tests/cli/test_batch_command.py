@@ -113,10 +113,13 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     os.killpg(first.pid, signal.SIGINT)  # as a terminal does, to all of its processes
     _, said = first.communicate(timeout=120)
     assert first.returncode == 130, said
-    assert f"recordings are done in {tmp_path}; go on with --resume" in said and "Traceback" not in said
+    assert f"recordings are done in {tmp_path}; continue with --resume" in said and "Traceback" not in said
     stopped_behind_a_chunk(archive, tmp_path / "long")
     assert finished(*words) == 2
-    assert "a batch was begun here; go on with --resume, or begin anew with --restart" in capsys.readouterr().err
+    assert (
+        "this folder has a batch already; continue with --resume, or start again with --restart"
+        in capsys.readouterr().err
+    )
     assert finished(*words, "--resume") == 1, "one of them failed"
     said = capsys.readouterr()
     batch_status = json.loads((tmp_path / "batch.json").read_text())
@@ -153,23 +156,25 @@ def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monk
     assert "wrong.toml: recording a: " in (err := said('[recordings.a]\ndetections = "none"'))
     assert f"{archive / 'none'}: there is no such folder" in err
     two = said('[recordings.a]\ndetections = "none"\n[recordings.b]\ntimestamps = "none"\ndetections = "short"')
-    assert "(and something is wrong with b, too)" in two
+    assert "(other recordings with problems: b)" in two
     own = '[recordings.a]\ndetections = "long/openpose"\n'
-    assert "--fps and --timestamps: both say" in said(own + 'fps = 25\ntimestamps = "settings.toml"')
+    assert "--fps and --timestamps: both determine the times of frames" in said(
+        own + 'fps = 25\ntimestamps = "settings.toml"'
+    )
     assert "--chunk-frames 3: must be 6 (batch_frames) or more" in said(own + "chunk_frames = 3")
-    assert "--shapes: a person's shape is known over time only" in said(own + 'shapes = "s.npz"\ntemporal = false')
+    assert "--shapes: shapes need people over time" in said(own + 'shapes = "s.npz"\ntemporal = false')
     assert "--frames 3: must be A:B" in said(own + 'frames = "3"')
     assert "body.pkl: there is no such file" in said(own + 'body = "body.pkl"')
-    assert "fps 0: must be a number of frames a second" in said(own + "fps = 0")
+    assert "fps 0: must be 0.01 to 100000 Hz" in said(own + "fps = 0")
     (tmp_path / "out" / "a" / "people.npz").mkdir(parents=True)
     assert "people.npz: this is a folder, and a file is to be written here" in said(own)
     (tmp_path / "out" / "a" / "people.npz").rmdir()
     (tmp_path / "out" / "a" / "parts").mkdir()
-    assert "a run was stopped here; go on with --resume" in said(own)
+    assert "there is an interrupted run; continue with --resume" in said(own)
     assert "give one" in said(own, "--cluster", "tcp://x:1", "--workers", "2")
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 10}))
     (tmp_path / "out" / "a" / "parts").rmdir()
-    assert "are needed for 4 recordings, and 10 bytes are free; make room" in said(own)
+    assert "of disk space, and 10 bytes are free; free some space" in said(own)
 
 
 def test_another_program_on_a_worker_is_noticed(monkeypatch):

@@ -174,7 +174,7 @@ def test_recordings_with_shared_shapes_are_led_in_turn_and_not_without_those_bef
     batch_status = run(stage, tmp_path, chain, at_once=4)
     assert [each.name for each in stage.begun] == ["a", "bb", "bb"] and stage.together == 1
     assert batch_status.names("failed") == ["bb", "ccc", "dddd"]
-    assert "begins with the shapes that bb leaves, which failed" in batch_status.of["ccc"].reasons[0]
+    assert "needs the body shapes of recording bb, which failed" in batch_status.of["ccc"].reasons[0]
 
 
 def test_who_was_done_when_all_are_stopped_is_done(stage, tmp_path, monkeypatch):
@@ -190,7 +190,7 @@ def test_who_was_done_when_all_are_stopped_is_done(stage, tmp_path, monkeypatch)
 def test_a_damaged_list_is_named(tmp_path):
     file = tmp_path / "batch.json"
     for text, words in (
-        ("[]", "not of a batch of this program; begin anew with --restart"),
+        ("[]", "this is not the status file of a batch; start again with --restart"),
         ('{"format": "shapepose-fg batch 1"}', "recordings.* must be an object, got null"),
         ('{"format": "shapepose-fg batch 1", "recordings": {"a": {"asked": {}, "status": "lost"}}}', r"a\.status"),
     ):
@@ -209,5 +209,5 @@ def test_a_leader_that_fails_says_why_and_one_that_is_killed_is_noticed(tmp_path
     assert "error: " in (tmp_path / "log.txt").read_text()
     leader = Leader(lost)
     os.kill(leader._pid.result(), signal.SIGKILL)
-    assert leader.next() == "its process was ended from outside; there may be too little memory"
+    assert leader.next() == "its process was killed; there may be too little memory"
     leader.end()

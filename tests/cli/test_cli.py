@@ -109,7 +109,7 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     words = " ".join(printed.out.split())
     for part in (
         "5 (0:5) of 2 cameras, 30 a second (assumed: give --fps)",
-        "no identities, 2.0 a frame (2 to 2)",
+        "without identities, 2.0 a frame (2 to 2)",
         "rows 10 in all",
         "5 ok",
         "5 too few views",
@@ -238,7 +238,7 @@ def test_a_finished_result_stays_until_it_is_to_be_overwritten(recording, pipeli
     for options in ((), ("--resume",), ("--restart",)):
         capsys.readouterr()
         assert run(*recording, "--fps", "30", *options) == 2
-        assert f"{tmp_path / 'out'}: a finished result is here; give another" in capsys.readouterr().err
+        assert f"{tmp_path / 'out'}: there is a finished result; give another" in capsys.readouterr().err
     assert (tmp_path / "out" / "people.npz").read_bytes() == before
     for again in (1, 2):
         (tmp_path / "out" / "export").mkdir()
@@ -282,7 +282,7 @@ def test_one_camera_is_no_recording(recording, pipeline, tmp_path, capsys):
     cameras = json.loads((tmp_path / "calibration.json").read_text())
     (tmp_path / "calibration.json").write_text(json.dumps({"left": cameras["left"]}))
     assert run(*recording) == 2
-    assert "at least 2 cameras are needed to see depth, got 1" in capsys.readouterr().err
+    assert "at least 2 cameras are needed, got 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -301,24 +301,24 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
             "--frames 2:9: not in the recording, which has 5 frames; give A:B with 0 <= A < B <= 5",
         ),
         (["--frames", "3:3"], "--frames 3:3: not in the recording, which has 5 frames"),
-        (["--frames", "-2:"], "--frames -2:: must be A:B, two frame numbers with a colon between, such as 0:100"),
+        (["--frames", "-2:"], "--frames -2:: must be A:B with two frame numbers, such as 0:100"),
         (["--frames", "all"], "--frames all: must be A:B"),
-        (["--fps", "0"], "--fps 0: must be a number of frames a second, such as 25"),
+        (["--fps", "0"], "--fps 0: must be 0.01 to 100000 Hz, such as 25"),
         (["--readout", "20"], "--readout 20: must be 0 to 0.1 seconds, such as 0.02"),
-        (["--fps", "nan"], "--fps nan: must be a number of frames a second"),
+        (["--fps", "nan"], "--fps nan: must be 0.01 to 100000 Hz"),
         (["--cuts", "3,2"], "--cuts 3,2: must be rising frame numbers between 1 and 4, such as 300,600"),
         (["--cuts", "5"], "--cuts 5: must be rising frame numbers between 1 and 4"),
         (["--cuts", "a"], "--cuts a: must be rising frame numbers"),
         (["--timestamps", "/nothing.txt"], "/nothing.txt: there is no such file; check the path"),
-        (["--timestamps", __file__, "--fps", "25"], "--fps and --timestamps: both say when frames were taken"),
-        (["--shapes", "s.npz", "--no-temporal"], "--shapes: a person's shape is known over time only"),
+        (["--timestamps", __file__, "--fps", "25"], "--fps and --timestamps: both determine the times of frames"),
+        (["--shapes", "s.npz", "--no-temporal"], "--shapes: shapes need people over time"),
         (["--shapes", __file__], "cannot be read as an .npz file without pickled objects"),
         (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
         (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
         (["--body", "/nothing.npz"], "/nothing.npz: there is no such file"),
         (["--calibration", "/nothing.json"], "/nothing.json: there is no such file; check the path"),
-        (["--detections", "/nothing"], "/nothing: there is no such folder; check the path of the detections"),
+        (["--detections", "/nothing"], "/nothing: there is no such folder; check the path"),
         (["--output", f"{__file__}/out"], "out: results cannot be written here (Not a directory); give a folder"),
         (["--loud"], "No such option: --loud"),
     ],
@@ -394,7 +394,7 @@ def test_help_groups_the_options(capsys):
     """The same words for the same things, under the same headings."""
     for command, groups in (
         ("reconstruct", ("Input", "Time", "Result", "Run")),
-        ("overlay", ("Input", "What is drawn", "Time", "Result")),
+        ("overlay", ("Input", "Drawing", "Time", "Result")),
         ("detect", ("Input", "Network", "Time", "Result")),
     ):
         assert run(command, "--help") == 0
@@ -402,7 +402,7 @@ def test_help_groups_the_options(capsys):
         assert all(f"─ {group} ─" in printed for group in groups)
     assert run("--help") == 0
     printed = capsys.readouterr().out
-    assert all(words in printed for words in ("From a recording to a result", "With a result", "To try"))
+    assert all(words in printed for words in ("Reconstruct a recording", "Use a result", "Try and evaluate"))
 
 
 def test_evaluate_shelf(shared_data, tmp_path, capsys):
@@ -448,8 +448,8 @@ def test_demo_compares_with_the_truth_and_leaves_a_report(short_scene, tmp_path,
     words = " ".join(printed.out.split())
     for part in (
         "people found 20 of 20",
-        "found twice 0",
-        "invented 0",
+        "duplicates 0",
+        "false positives 0",
         "inside the 90 % ellipsoid",
     ):
         assert part in words
@@ -465,10 +465,10 @@ def test_demo_compares_with_the_truth_and_leaves_a_report(short_scene, tmp_path,
 def test_a_report_is_left_or_taken_away(recording, pipeline, capsys):
     page = Path(recording[recording.index("--output") + 1]) / "report.html"
     assert run(*recording) == 0
-    assert "to look at, in a browser" in capsys.readouterr().out
+    assert "open it in a browser" in capsys.readouterr().out
     assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert run(*recording, "--no-report", "--overwrite") == 0
-    assert not page.exists() and "to look at" not in capsys.readouterr().out
+    assert not page.exists() and "open it in" not in capsys.readouterr().out
 
 
 def test_the_scene_is_what_the_demo_says_it_is():
@@ -523,7 +523,7 @@ def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkey
     (tmp_path / "typo.toml").write_text("batch_frame = 3\n")
     for words, said in (
         (("--config", str(tmp_path / "typo.toml")), "typo.toml: batch_frame"),
-        (("--shapes", str(tmp_path / "s.npz"), "--no-temporal"), "--shapes: a person's shape is known over time"),
+        (("--shapes", str(tmp_path / "s.npz"), "--no-temporal"), "--shapes: shapes need people over time"),
         (("--chunk-frames", "20"), "--chunk-frames 20: must be 128"),
     ):
         assert run(*recording, *words) == 2
@@ -532,7 +532,7 @@ def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkey
 
 def test_processes_are_this_machine_s_or_the_cluster_s(recording, pipeline, capsys):
     assert run(*recording, "--workers", "2", "--cluster", "tcp://host:8786") == 2
-    assert "--workers and --cluster tcp://host:8786: these are processes of this" in capsys.readouterr().err
+    assert "--workers and --cluster tcp://host:8786: processes are either of this" in capsys.readouterr().err
     assert run(*recording, "--workers", "2", "--cluster", "local") == 0
     assert (pipeline["workers"], pipeline["cluster"]) == (2, "local")
 
@@ -566,7 +566,7 @@ def test_what_the_system_does_to_a_run_is_one_sentence_with_the_way_on(
         main(recording)
     said = capsys.readouterr().err
     assert ended.value.code == 2 and said.count("\n") == 1
-    assert words in said and "0 of 5 frames are kept in" in said and "go on with --resume" in said
+    assert words in said and "0 of 5 frames are stored in" in said and "continue with --resume" in said
 
 
 @pytest.mark.parametrize("name", ["parts", ".detections", ".lock"])

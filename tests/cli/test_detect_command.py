@@ -168,16 +168,16 @@ def test_one_camera_is_enough_to_detect(kitchen):
 
 @pytest.mark.parametrize("words, problem", [
     (["--videos", "none"], "none: there is no such folder"),
-    (["--videos", "shots", "--fps", "fast"], "--fps fast: must be a number of frames a second"),
+    (["--videos", "shots", "--fps", "fast"], "--fps fast: must be a frame rate in Hz"),
     (["--videos", "shots", "--fps", "kitchen=5"], "no camera 'kitchen'"),
     (["--videos", "shots", "--start", "0.2s"], "--start 0.2s: must be CAMERA=VALUE"),
-    (["--videos", "shots", "--start", "{a}=2"], "--start 2: must be seconds such as 0.2s, or the camera's own"),
-    (["--videos", "shots", "--start", "{a}=2s"], "nothing says how many frames a second there are; give --fps"),
+    (["--videos", "shots", "--start", "{a}=2"], "--start 2: must be seconds, such as 0.2s, or frames"),
+    (["--videos", "shots", "--start", "{a}=2s"], "the frame rate is unknown; give --fps"),
     (["--videos", "shots", "--start", "{a}=2f", "--start", "{a}=3f"], "is given twice"),
     (["--videos", "shots", "--start", "{a}=50f"], "have no moment in common; check --start"),
     (["--videos", "shots", "--image-placement", "bent"], "must be one of same crop crop-centre scale letterbox"),
-    (["--videos", "shots", "--image-placement", "same"], "not the same size; give another --image-placement"),
-    (["--videos", "shots"], "say what was done to them with --image-placement: letterbox"),
+    (["--videos", "shots", "--image-placement", "same"], "1280 x 720; give another --image-placement"),
+    (["--videos", "shots"], "give --image-placement: letterbox"),
     (["--videos", "shots", "--image-placement", "scale", "--frames", "7:9"], "which has 1 frames"),
     (["--videos", "shots", "--long-side", "7"], "--long-side 7: must be 128 to 4096"),
     (["--videos", "shots", "--backend", "abacus"], "--backend abacus: must be opencv or onnxruntime"),
@@ -273,4 +273,4 @@ def test_without_a_calibration_cameras_are_called_as_their_videos(kitchen, capsy
         np.testing.assert_allclose(found, (whole + 0.5) / 2 - 0.5, atol=3)
     Path("nothing").mkdir()
     assert run("--videos", "nothing", "--network", "network.onnx", "--output", "other") == 2
-    assert "no videos or pictures here" in " ".join(capsys.readouterr().err.split())
+    assert "there are no videos or pictures" in " ".join(capsys.readouterr().err.split())

@@ -70,7 +70,7 @@ def test_cameras_that_are_not_wanted_are_passed_over(tmp_path, cameras, five_cam
         ("{", "standing.jsonl, line 1: line 1 column 2 is not JSON"),
         ('{"camera": "9", "time_s": 0, "people": []}', "there is no camera 9"),
         ('{"camera": "CAM", "people": []}', "time_s is missing"),
-        ('{"camera": "CAM", "time_s": 0, "people": [{"pose_keypoints_2d": [1, 2]}]}', "75 numbers a person"),
+        ('{"camera": "CAM", "time_s": 0, "people": [{"pose_keypoints_2d": [1, 2]}]}', "75 numbers per person"),
     ],
 )
 def test_a_line_that_is_none_is_named(tmp_path, cameras, five_cameras, capsys, line, said):

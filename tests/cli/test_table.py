@@ -69,7 +69,7 @@ def test_recordings_that_share_shapes_wait_for_each_other_in_the_table_s_order(t
     ("text", "words"),
     [
         ("", "the file is empty"),
-        ("[defaults]\nfps = 25", "0 recordings; give 1 to 10000 of them, each as"),
+        ("[defaults]\nfps = 25", "the table has 0 recordings; give 1 to 10000, each as"),
         ("[recording.a]", r"recording is not a known table; write \[defaults\] and \[recordings.NAME\]"),
         ("recordings = 3", "recordings must be a table, got 3"),
         ("[recordings]\na = 3", r"recordings\.a must be a table, got 3; docs/batch\.md"),
@@ -82,17 +82,33 @@ def test_recordings_that_share_shapes_wait_for_each_other_in_the_table_s_order(t
         ("[recordings.a]\ncuts = [1, 2.5]", r"recordings\.a\.cuts\[1\] must be a whole number, got 2\.5"),
         ("[defaults]\nworkers = 2\n[recordings.a]", r"defaults\.workers is not a known key"),
         ("[recordings.a]\n[recordings.a]", "this is not TOML: Cannot declare"),
-        ("[recordings.a]\n[recordings.A]", r"recordings\.A: a has this name on some systems, too; rename it"),
-        ("[recordings.'batch.json']", r"recordings\.batch\.json: batch\.json has this name"),
-        ("[recordings.'../a']", r"recordings\.\.\./a: a name has up to 100 letters"),
-        ("[recordings.'.a']", "begins with a letter or digit"),
-        (f"[recordings.{101 * 'a'}]", "a name has up to 100"),
-        ("[recordings.a]\ndetections = '../b'", r"a\.detections: \.\./b leads out of the table's folder; if that"),
-        ("[recordings.a]\nshapes = 'out/who.npz'", r"a\.shapes: out/who\.npz leads out of the table's folder"),
-        ("[recordings.a]\nskeleton = '../s.toml'", r"a\.skeleton: \.\./s\.toml leads out"),
-        ('[recordings.a]\nbody = "a\\u0000b"', r"recordings\.a\.body: no file has the name 'a\\x00b'"),
-        ('[recordings.a]\nproject = "/a\\u0000b"', r"recordings\.a\.project: no file has the name"),
-        ("[recordings.a]\nproject='p'\n[recordings.b]\nproject='p'", r"recordings\.b: .*p is that of a, too"),
+        (
+            "[recordings.a]\n[recordings.A]",
+            r"recordings\.A: some file systems do not distinguish this name from"
+            r" a; rename it",
+        ),
+        (
+            "[recordings.'batch.json']",
+            r"recordings\.batch\.json: some file systems do not distinguish this name"
+            r" from batch\.json",
+        ),
+        (
+            "[recordings.'../a']",
+            r"recordings\.\.\./a: the name is also that of a folder, so it must have up to"
+            r" 100 letters",
+        ),
+        ("[recordings.'.a']", "begin with a letter or digit"),
+        (f"[recordings.{101 * 'a'}]", "the name is also that of a folder"),
+        ("[recordings.a]\ndetections = '../b'", r"a\.detections: \.\./b is outside the table's folder; if this"),
+        ("[recordings.a]\nshapes = 'out/who.npz'", r"a\.shapes: out/who\.npz is outside the table's folder"),
+        ("[recordings.a]\nskeleton = '../s.toml'", r"a\.skeleton: \.\./s\.toml is outside"),
+        ('[recordings.a]\nbody = "a\\u0000b"', r"recordings\.a\.body: 'a\\x00b' is not a valid file name"),
+        ('[recordings.a]\nproject = "/a\\u0000b"', r"recordings\.a\.project: .* is not a valid file name"),
+        (
+            "[recordings.a]\nproject='p'\n[recordings.b]\nproject='p'",
+            r"recordings\.b: .*p is also the project"
+            r" of a",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_sentence(tmp_path, text, words):

@@ -130,9 +130,9 @@ def test_rows_in_the_middle_take_the_memory_of_these_rows(folder, result):
 
 def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1_000_000))
-    with pytest.raises(InputError, match=r"people\.npz: 934 rows would take .* and 1\.0 MB are free; take some"):
+    with pytest.raises(InputError, match=r"people\.npz: 934 rows need .* and 1\.0 MB are free; read fewer"):
         Reconstruction.load(folder)
-    with pytest.raises(InputError, match=r"rows would take"):
+    with pytest.raises(InputError, match=r"rows need"):
         read_take(folder, up="z")
     with Reconstruction.open(folder) as opened:
         assert len(opened.frames(0, 20)) > 0
@@ -142,7 +142,7 @@ def test_many_people_in_many_frames_are_a_sentence(folder, monkeypatch):
     """A place for everybody in every frame: 12,000 people in as many frames took a gigabyte from 83 KB."""
     monkeypatch.setattr("shapepose_fg.io.export.take._BODY_BYTES", 10**12)
     with pytest.raises(
-        InputError, match=r"people\.npz: \d+ people over \d+ frames would take .* \(--frames, --person\)"
+        InputError, match=r"people\.npz: \d+ people over \d+ frames need .* \(--frames, --person\)"
     ):
         read_take(folder, up="z")
 

@@ -126,19 +126,19 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
     with pytest.raises(Stopped):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network), stop)
     with pytest.raises(
-        InputError, match="a run that differs in its detection was stopped here; start it as it was"
+        InputError, match="there is an interrupted run with different detection; start it with the same options"
     ):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network, long_side=320))
     moved = tmp_path / "moved"
     shutil.copytree(pictures, moved)
-    with pytest.raises(InputError, match="a run that differs in its cameras was stopped"):
+    with pytest.raises(InputError, match="there is an interrupted run with different cameras"):
         run_detection(run_of(rolled_rig, moved, tmp_path, painted_network))
     run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network))
     with pytest.raises(InputError, match=r"a\.txt: there are detections already; delete them"):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network))
     (tmp_path / "other" / "unfinished").mkdir(parents=True)
     (tmp_path / "other" / "unfinished" / "thesis.txt").write_text("mine")
-    with pytest.raises(InputError, match="not a run of this program"):
+    with pytest.raises(InputError, match="this is not a run of this program"):
         run_detection(run_of(rolled_rig, pictures, tmp_path / "other", painted_network))
     assert (tmp_path / "other" / "unfinished" / "thesis.txt").read_text() == "mine"
 

@@ -151,7 +151,7 @@ def test_a_network_of_whole_pictures_may_find_several_people(tmp_path):
     (['skeleton = "COCO_17"'], "the network finds 26 joints, 17 are named (COCO_17)"),
     (['joints = ["Nose", "Nose"]'], "joints has 'Nose', which must be a keypoint of HALPE_26, once (Nose LEye"),
     (['joints = ["Tail"]'], "joints has 'Tail', which must be a keypoint of HALPE_26, once"),
-    (["padding = 0.5"], "padding is refused"),
+    (["padding = 0.5"], "padding is not valid"),
     (["colour = 'rgb'"], "colour is not a known key"),
     (["skeleton = '../mine.toml'"], "skeleton '../mine.toml' must be a file in the same folder"),
 ])  # fmt: skip

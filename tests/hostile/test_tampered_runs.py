@@ -84,7 +84,7 @@ def test_a_part_that_is_not_as_it_was_written_is_named(parts, task):
         arrays, said = contents(file)
         save_file(arrays | {name: change(arrays[name])}, file, said)
         text = refused(parts, task)
-        assert file.name in text and "not as it was written" in text and "--restart" in text
+        assert file.name in text and "its content has changed" in text and "--restart" in text
         file.write_bytes(before)
 
 
@@ -92,9 +92,9 @@ def test_parts_that_changed_places_or_are_of_another_run_are_refused(parts, task
     one, other = sorted(parts.glob("part-*"))[:2]
     before = one.read_bytes()
     one.write_bytes(other.read_bytes())
-    assert "not as it was written" in refused(parts, task)
+    assert "its content has changed" in refused(parts, task)
     one.write_bytes(before)
-    with pytest.raises(InputError, match="or of another run"):
+    with pytest.raises(InputError, match="it belongs to another run"):
         reconstruct_parts(InFolder(parts, run="b" * 64), task)
 
 

@@ -143,7 +143,11 @@ BAD_ASSOCIATION = [
         1.1,
         'camera "a": the rotation of RT is not orthonormal (R Rᵀ is off by 0.21); give a pure rotation',
     ),
-    (("a", "RT"), MIRRORED, 'camera "a": the rotation of RT mirrors (determinant -1); use a right-handed world'),
+    (
+        ("a", "RT"),
+        MIRRORED,
+        'camera "a": the rotation of RT is a reflection (determinant -1); use a right-handed world',
+    ),
     (("a", "imgSize"), [1920], 'camera "a": imgSize must hold 2 numbers, got 1; write width and height'),
     (("a", "imgSize", 0), 0, "camera a: image_size must be positive and at most 1000000, got (0, 1080)"),
     (
@@ -161,8 +165,8 @@ def test_bad_association(tmp_path, where, value, sentence):
 
 
 BAD_OWN = [
-    (("up",), "remove", 'up is missing; say which axis points up, "up": "z", or pass --up z'),
-    (("unit",), "remove", 'unit is missing; say what lengths are in, "unit": "m", or pass --unit m'),
+    (("up",), "remove", 'up is missing; write the axis that points up, such as "up": "z", or pass --up z'),
+    (("unit",), "remove", 'unit is missing; write the unit of lengths, such as "unit": "m", or pass --unit m'),
     (("unit",), "inch", "unit must be 'm', 'cm' or 'mm', got text 'inch'"),
     (("format",), "shapepose-fg rig 2", 'format must be "shapepose-fg rig 1", got text'),
     (("cameras", 1, "name"), "a", "camera names must differ, got ['a', 'a']"),
@@ -192,10 +196,10 @@ BAD_TEXT = [
     (json.dumps(association(), indent=1)[:300], "is not JSON: "),
     ('{"a": {"K": [1,\n 2,, 3]}}', "line 2 column 4 is not JSON"),
     ('{"a": {"K": []}, "a": {"K": []}}', 'key "a" occurs twice in one object; give each its own name'),
-    ("[1, 2]", "recognised as JSON (a list of 2), but this is not a calibration that is known here; give one of"),
-    ("3", "this is not a calibration that is known here"),
-    ("{}", "this is not a calibration that is known here"),
-    ('{"a": {"fx": 3}}', "this is not a calibration that is known here"),
+    ("[1, 2]", "recognised as JSON (a list of 2), but this is not a known calibration format; give one of"),
+    ("3", "this is not a known calibration format"),
+    ("{}", "this is not a known calibration format"),
+    ('{"a": {"fx": 3}}', "this is not a known calibration format"),
     ('{"a": ' * 100_000, "cannot be read as JSON"),
     ('{"a": {"K": [' + "1" * 5000 + "]}}", "cannot be read as JSON"),
     ('{"a": {"K": [' + "1" * 400 + ",0,0,0,1,0,0,0,1]}}", "a.K[0] is a whole number"),

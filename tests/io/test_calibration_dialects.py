@@ -147,7 +147,7 @@ def test_opencv_s_stereo_pair(tmp_path, keys, together):
     np.testing.assert_allclose(rig.cTw[1, :, :3], R, atol=1e-12)
     np.testing.assert_allclose(rig.cTw[1, :, 3], [-0.3, 0.01, 0.005], atol=1e-12)
     assert rig.K[1, 0, 0] == 505 and rig.cameras[0].distortion[0] == -0.28
-    assert ("left" in rig.names) == ("left" in str(keys)) and "cameras are called" in rig.notes[0]
+    assert ("left" in rig.names) == ("left" in str(keys)) and "cameras are named" in rig.notes[0]
 
 
 def test_opencv_s_stereo_folder(shared_cases, tmp_path):
@@ -155,7 +155,7 @@ def test_opencv_s_stereo_folder(shared_cases, tmp_path):
     np.testing.assert_allclose(rig.centres[1], [3.3, 0, 0], atol=1e-12)
     for name, other in (("intrinsics.yml", "extrinsics.yml"),) * 2:
         (tmp_path / name).write_text((shared_cases / "opencv_stereo_folder" / name).read_text())
-        with pytest.raises(InputError, match=rf"half of OpenCV's stereo calibration; put {other}"):
+        with pytest.raises(InputError, match=rf"only one file of OpenCV's stereo calibration; put {other}"):
             read_rig(tmp_path / name)
 
 
@@ -164,7 +164,7 @@ def test_one_camera_s_lens_is_named_as_what_it_is(tmp_path):
     storage.write("camera_matrix", np.eye(3))
     storage.write("distortion_coefficients", np.zeros((5, 1)))
     storage.release()
-    with pytest.raises(InputError, match="these are the intrinsics of one camera"):
+    with pytest.raises(InputError, match="this file has the intrinsics of one camera"):
         read_rig(tmp_path / "out.yml")
 
 
@@ -199,13 +199,13 @@ def test_a_camera_that_is_not_wanted_may_be_faulty(rig_file):
 def test_a_file_is_never_written_under_another_format_s_name(tmp_path, rig_file):
     """A part of the cameras cannot be written as QTM does: then our own format gets its own name."""
     rig, file = rig_file
-    with pytest.raises(InputError, match=r"new\.qca\.txt: cameras that came as our own rig file .*FILE\.json"):
+    with pytest.raises(InputError, match=r"new\.qca\.txt: cameras read as rig file .*FILE\.json"):
         write_like(file, rig, tmp_path / "new.qca.txt")
     source = toml(tmp_path, CALISCOPE, **POSE2SIM)
     part = read_rig(source, cameras=["cam_1"])
     (tmp_path / "new.json").write_text("somebody else's")
     form, there = write_like(source, part, tmp_path / "new.toml")
-    assert form == "our own rig file" and there == tmp_path / "new-1.json"
+    assert form == "rig file" and there == tmp_path / "new-1.json"
     assert read_rig(there).names == ("cam_1",) and not (tmp_path / "new.toml").exists()
     assert (tmp_path / "new.json").read_text() == "somebody else's"
 
@@ -213,5 +213,5 @@ def test_a_file_is_never_written_under_another_format_s_name(tmp_path, rig_file)
 def test_cameras_that_are_not_wanted_are_named(rig_file):
     rig, file = rig_file
     (note,) = read_rig(file, without=rig.names[:2]).notes
-    assert note == f"{file}: camera {rig.names[0]} {rig.names[1]} is left out, as asked"
+    assert note == f"{file}: camera {rig.names[0]} {rig.names[1]} is left out as requested"
     assert read_rig(file).notes == ()

@@ -300,7 +300,7 @@ WRITERS = {
 UP = {"CMU Panoptic": "-y"}
 ASKED = {
     "Caliscope": ("up is missing", "--up"),
-    "AniPose": ("unit and up are missing", "that of the board's squares"),
+    "AniPose": ("unit and up are missing", "the unit of the board's squares"),
     "FreeMoCap": ("unit and up are missing", "FreeMoCap works in mm"),
     "VoxelPose": ("image_size is missing", "--image-size WIDTHxHEIGHT"),
     "OpenCV's multi-view": ("unit and up are missing", "--unit", "--up"),
@@ -344,7 +344,7 @@ MALFORMED = {
     "CMU Panoptic": ('"distCoef"', '"distCoef2"', None),
     "VoxelPose": ('"fx": 9', '"fx": -9', "camera alpha: K must have positive focal lengths"),
     "OpenCV's multi-view": ("Ts:", "Qs:", None),
-    "a node per camera": ("</camera_matrix>", "</kamera_matrix>", "is not XML; correct it there"),
+    "a node per camera": ("</camera_matrix>", "</kamera_matrix>", "is not XML; correct it"),
 }
 
 
@@ -370,7 +370,7 @@ def test_columns_that_are_ragged_are_named(tmp_path, program, keys):
         flat = np.ravel(cameras[0][key]).tolist()
         cameras[0][key] = [*([each] for each in flat[:-1]), flat[-1]]
         (tmp_path / "ragged.json").write_text(json.dumps(content))
-        refuses(tmp_path / "ragged.json", f"{key} must have rows of one length", **wishes)
+        refuses(tmp_path / "ragged.json", f"{key} must have rows of equal length", **wishes)
 
 
 def test_malformed_panoptic(tmp_path):
@@ -391,7 +391,7 @@ def test_easymocap_is_known_by_either_half_and_by_the_folder(tmp_path):
     for path in (tmp_path, tmp_path / "intri.yml", tmp_path / "extri.yml"):
         assert_same(read_rig(path), TRUTH)
     (tmp_path / "extri.yml").unlink()
-    with pytest.raises(InputError, match=r"extri\.yml: this half of EasyMocap's calibration is missing"):
+    with pytest.raises(InputError, match=r"extri\.yml: this file of EasyMocap's calibration is missing"):
         read_rig(tmp_path / "intri.yml")
 
 
@@ -410,7 +410,9 @@ def test_easymocap_without_sizes_and_malformed(tmp_path):
 
 def test_a_picture_size_that_the_file_knows_itself(tmp_path):
     refuses(
-        pose2sim(tmp_path), "says itself how large the pictures are; leave --image-size out", image_size=(3, 3)
+        pose2sim(tmp_path),
+        "contains the picture sizes; leave out --image-size",
+        image_size=(3, 3),
     )
 
 
@@ -430,7 +432,7 @@ def test_colmap_as_pycolmap_wrote_it():
         assert rig.names == ("cam01", "cam02", "cam03")
         for each, expected in zip(rig.cameras, seen, strict=True):
             np.testing.assert_allclose(each.distort(each.project(points)[0]) + 0.5, expected, atol=1e-6)
-    refuses(DATA / "colmap", "unit and up are missing", "to no scale until colmap model_aligner")
+    refuses(DATA / "colmap", "unit and up are missing", "no scale until colmap model_aligner")
 
 
 @pytest.mark.parametrize("line", ["1 1 0 0 0 0 0 0 1", "1 1 0 0 0 0 0 0", "1 1 0 0 0 0 0 0 7 a.jpg"])
@@ -449,9 +451,9 @@ def test_colmap_s_pictures_are_followed_by_their_points(tmp_path):
         file.write_text("# pictures\n\n" + "".join(f"{image}\n{points}\n" for image in images))
         assert read_rig(tmp_path, unit="m", up="z").names == ("a", "b", "c")
     file.write_text("# pictures\n" + "\n".join(images))
-    refuses(tmp_path, "images.txt: line 3: must hold the points of the image before it", unit="m", up="z")
+    refuses(tmp_path, "images.txt: line 3: must hold the points of the image in the line before", unit="m", up="z")
     file.write_text(f"{images[0]}\n1 2\n{images[1]}\n\n")
-    refuses(tmp_path, "images.txt: line 2: must hold the points of the image before it", unit="m", up="z")
+    refuses(tmp_path, "images.txt: line 2: must hold the points of the image in the line before", unit="m", up="z")
 
 
 @pytest.mark.parametrize(
@@ -464,7 +466,7 @@ def test_colmap_s_pictures_are_followed_by_their_points(tmp_path):
             "dist[0] must be a finite number",
         ),
         ("distortion_coefficients: none", "distortion_coefficients must hold at most 14 numbers"),
-        ("D: [[0.1, 0.2], [0.3]]", "D must have rows of one length"),
+        ("D: [[0.1, 0.2], [0.3]]", "D must have rows of equal length"),
     ],
 )
 def test_distortion_of_a_file_per_camera(tmp_path, text, expected):
@@ -480,12 +482,14 @@ def test_distortion_of_a_file_per_camera(tmp_path, text, expected):
 
 def test_colmap_that_cannot_be_read(tmp_path):
     (tmp_path / "cameras.bin").write_bytes(b"\x01")
-    with pytest.raises(InputError, match="run colmap model_converter --output_type TXT"):
+    with pytest.raises(
+        InputError, match="binary format: convert it with colmap model_converter --output_type TXT"
+    ):
         read_rig(tmp_path)
     (tmp_path / "cameras.txt").write_text("1 FOV 10 10 1 1 1 1 1\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n\n")
     with pytest.raises(
-        InputError, match=r"cameras\.txt: line 1: camera model FOV is not read; use one of SIMPLE_PIN"
+        InputError, match=r"cameras\.txt: line 1: camera model FOV is not supported; use one of SIMPLE_PIN"
     ):
         read_rig(tmp_path)
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 10 10 1 1 1 1\n")
@@ -496,12 +500,12 @@ def test_colmap_that_cannot_be_read(tmp_path):
 
 def test_ros_refuses_intrinsics_alone_and_frames_that_are_not_optical(tmp_path):
     ros(tmp_path)
-    refuses(tmp_path / "alpha.yaml", "the intrinsics of one camera of ROS; give the folder")
-    refuses(tmp_path / "alpha_pose.yaml", "the pose of one camera of ROS; give the folder")
+    refuses(tmp_path / "alpha.yaml", "the intrinsics of one camera of ROS only; give the folder")
+    refuses(tmp_path / "alpha_pose.yaml", "the pose of one camera of ROS only; give the folder")
     pose = tmp_path / "beta_pose.yaml"
     good = pose.read_text()
     pose.write_text(good.replace("beta_optical_frame", "beta_link"))
-    with pytest.raises(InputError, match=r"beta_pose\.yaml: child_frame_id beta_link is no optical frame"):
+    with pytest.raises(InputError, match=r"beta_pose\.yaml: child_frame_id beta_link is not an optical frame"):
         read_rig(tmp_path)
     pose.write_text(good.replace("w: ", "q: "))
     with pytest.raises(InputError, match=r"beta_pose\.yaml: rotation: w is missing; write <camera>_pose"):
@@ -513,10 +517,10 @@ def test_ros_refuses_intrinsics_alone_and_frames_that_are_not_optical(tmp_path):
 
 def test_nothing_that_runs_code(tmp_path):
     refuses(
-        written_bytes(tmp_path / "cam.pickle", b"\x80\x04\x95rest"), "this is a Python pickle, as OpenCap", "docs/"
+        written_bytes(tmp_path / "cam.pickle", b"\x80\x04\x95rest"), "this is a Python pickle (as OpenCap", "docs/"
     )
     bomb = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><calibration><cameras/></calibration>'
-    refuses(written(tmp_path / "a.qca.txt", bomb), "XML with a document type or entities is not read")
+    refuses(written(tmp_path / "a.qca.txt", bomb), "XML with a document type or entities is not accepted")
     code = "image_width: !!python/object/apply:os.system ['true']\n"
     refuses(written(tmp_path / "a.yaml", code), "is not YAML")
 
@@ -614,7 +618,7 @@ def test_qualisys_hybrid_cameras_are_video_cameras_and_others_are_named(tmp_path
     rig = read_rig(file)
     assert_same(rig, TRUTH)
     assert [note.split(": ", 1)[1] for note in rig.notes] == [
-        "camera marker (Miqus M3) is left out: it takes no videos"
+        "camera marker (Miqus M3) is left out: it does not record video"
     ]
 
 
@@ -682,7 +686,7 @@ def test_voxelpose_s_rotations_are_matrices(tmp_path):
     content = json.loads(voxelpose(tmp_path).read_text())
     content["beta"]["R"] = [0.1, 0.2, 0.3]
     path = written(tmp_path / "calibration.json", json.dumps(content))
-    refuses(path, 'camera "beta": R must hold 9 numbers, got 3; write it as VoxelPose does')
+    refuses(path, 'camera "beta": R must hold 9 numbers, got 3; write it in VoxelPose\'s format')
 
 
 def test_huge_numbers_are_refused_in_one_sentence(tmp_path):

@@ -50,7 +50,7 @@ def same(one: Rig, other: Rig) -> None:
 def test_our_own_rig_file_reads_back(tmp_path):
     rig = built_in_scene(frames=1).rig
     write_rig(rig, tmp_path / "rig.json")
-    assert write_like(tmp_path / "rig.json", changed(rig), tmp_path / "new.json")[0] == "our own rig file"
+    assert write_like(tmp_path / "rig.json", changed(rig), tmp_path / "new.json")[0] == "rig file"
     same(read_rig(tmp_path / "new.json"), changed(rig))
 
 
@@ -60,7 +60,7 @@ def test_real_files_read_back_and_keep_the_rest(tmp_path, name):
     if not source.exists():
         pytest.skip("recordings are not here")
     rig, target = read_rig(source, **how), tmp_path / f"new{source.suffix}"
-    assert write_like(source, changed(rig), target, how.get("unit"))[0] != "our own rig file"
+    assert write_like(source, changed(rig), target, how.get("unit"))[0] != "rig file"
     same(read_rig(target, **how), changed(rig))
     write_like(source, rig, target, how.get("unit"))
     same(read_rig(target, **how), rig)
@@ -74,14 +74,14 @@ def test_every_format_is_written_as_it_came_in(tmp_path, name):
     source = write(tmp_path / "given")
     rig, target = read_rig(source, **how), tmp_path / ("new" if source.is_dir() else f"new{source.suffix}")
     form, there = write_like(source, changed(rig), target, how.get("unit"))
-    assert there == target and form != "our own rig file"
+    assert there == target and form != "rig file"
     same(read_rig(target, **how), changed(rig))
 
 
 def test_a_folder_s_format_goes_into_a_file_as_our_own(tmp_path):
     source = easymocap(tmp_path)
     rig = read_rig(source)
-    assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "our own rig file"
+    assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "rig file"
     same(read_rig(tmp_path / "new.json"), changed(rig))
 
 
@@ -92,7 +92,7 @@ def test_what_does_not_read_back_is_written_as_our_own(tmp_path, monkeypatch):
     rig = read_rig(source, **how)
     for text in ("", "<calibration><cameras><camera serial='1'/></cameras></calibration>"):
         monkeypatch.setitem(REWRITTEN, QUALISYS.name, lambda content, *_, text=text: {content.path: text})
-        assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "our own rig file"
+        assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "rig file"
         same(read_rig(tmp_path / "new.json"), changed(rig))
 
 
@@ -112,5 +112,5 @@ def test_a_lens_that_two_pictures_share_cannot_be_written_as_two(tmp_path):
     K[:2] *= 1.01
     apart = replace(moved, cameras=(replace(moved.cameras[0], K=K), moved.cameras[1]))
     form, there = write_like(folder, apart, tmp_path / "apart", "m")
-    assert form == "our own rig file" and there == tmp_path / "apart.json"
+    assert form == "rig file" and there == tmp_path / "apart.json"
     same(read_rig(there), apart)

@@ -79,13 +79,13 @@ def test_printed_settings_carry_their_docstrings():
         ("[gates]\ngate_px = 3", "gates is not a known key; did you mean gate?"),
         (
             "[gate]\ngate_px = 'wide'",
-            "gate.gate_px must be a number, got text 'wide'; `shapepose-fg config` shows",
+            "gate.gate_px must be a number, got text 'wide'; `shapepose-fg config` prints",
         ),
         ("[gate]\ngate_px = true", "gate.gate_px must be a number, got true"),
         ("[gate]\ngate_px = nan", "gate.gate_px must be a finite number, got NaN"),
         (
             "[gate]\ngate_px = -2",
-            "gate.gate_px must be positive, got -2; `shapepose-fg config` shows the defaults",
+            "gate.gate_px must be positive, got -2; `shapepose-fg config` prints the defaults",
         ),
         ("[gate]\nmin_views = 2.5", "gate.min_views must be a whole number, got 2.5"),
         ("gate = 3", "gate must be a table, got 3; write [gate] above its keys"),
@@ -125,7 +125,7 @@ def test_the_pipelines_own_settings(tmp_path):
 def test_what_took_the_place_of_old_settings_is_said(tmp_path, old):
     (tmp_path / "old.toml").write_text(f"[{old}]\ngate_m = 0.2\n")
     with pytest.raises(
-        InputError, match=f"{old} is no table any more: .*; `shapepose-fg config` shows the defaults"
+        InputError, match=f"{old} is no table any more: .*; `shapepose-fg config` prints the defaults"
     ):
         read_config(tmp_path / "old.toml", PipelineConfig)
 

@@ -52,7 +52,7 @@ def test_corrections_are_listed_and_taken_back_to_the_last_byte(folder):
     np.testing.assert_array_equal(Reconstruction.load(folder).joints, after_first.joints)
     take_back(folder)
     assert contents(folder) == before
-    with pytest.raises(InputError, match="there is no correction to take back"):
+    with pytest.raises(InputError, match="there is no correction to undo"):
         take_back(folder)
 
 
@@ -94,7 +94,7 @@ def test_a_first_correction_that_was_stopped_half_way_is_told(folder, monkeypatc
         with pytest.raises(KeyboardInterrupt):
             correct(folder, Edit(Action.DROP, 2))
     assert set(Reconstruction.load(folder).person.tolist()) == {0, 1}
-    sentence = r"corrections\.json: it is missing beside uncorrected"
+    sentence = r"corrections\.json: this file is missing beside uncorrected"
     for action in (lambda: read_corrections(folder), lambda: correct(folder, Edit(Action.DROP, 1))):
         with pytest.raises(InputError, match=sentence):
             action()
@@ -115,7 +115,7 @@ def test_a_result_without_run_json_comes_back_without_it(folder):
         (lambda c: c | {"format": "1"}, "format must be 'shapepose-fg corrections 1', got text '1'"),
         (lambda c: c | {"edits": []}, "edits must hold 1 value, got 0"),
         (lambda c: c | {"more": 1}, "more is not a known key"),
-        (lambda c: c | {"people": "0"}, "people.npz is not what these corrections led to"),
+        (lambda c: c | {"people": "0"}, "people.npz is not the result of these corrections"),
         (lambda c: c | {"edits": [{"action": "drop", "person": 2, "frame": 3}]}, "drop needs no frame"),
         (lambda c: c | {"edits": [{"action": "hide", "person": 2}]}, "edits[0].action must be 'merge', 'split',"),
         (lambda c: c | {"edits": [{"action": "drop", "person": -2}]}, "edits[0].person"),
@@ -137,7 +137,7 @@ def test_a_result_that_changed_since_is_noticed(folder):
     correct(folder, Edit(Action.DROP, 2))
     truth_of(built_in_scene(people=2, frames=10)).save(folder)
     for action in (lambda: correct(folder, Edit(Action.DROP, 1)), lambda: take_back(folder)):
-        with pytest.raises(InputError, match=r"people\.npz is not what these corrections led to"):
+        with pytest.raises(InputError, match=r"people\.npz is not the result of these corrections"):
             action()
 
 
@@ -166,9 +166,9 @@ def test_tracks_on_the_command_line(folder, capsys):
     assert "3 people, 30 rows" in printed
     assert run(folder, "split", 1, 4) == 0
     printed = capsys.readouterr().out
-    assert "done: split 1 4 --new 3; joints and bodies stay as they were solved" in printed
+    assert "done: split 1 4 --new 3; joints and bodies were not solved again" in printed
     assert "4 people, 30 rows" in printed and "corrected: split 1 4 --new 3" in printed
-    assert f"take it back: shapepose-fg tracks {folder} undo" in printed
+    assert f"to undo it: shapepose-fg tracks {folder} undo" in printed
     assert run(folder, "merge", 1, 3) == 0
     assert run(folder / "people.npz", "swap", 0, 2, 5) == 0
     assert run(folder, "rename", 2, 9) == 0
@@ -179,7 +179,7 @@ def test_tracks_on_the_command_line(folder, capsys):
     )
     for _ in range(5):
         assert run(folder, "undo") == 0
-    assert "taken back: split 1 4 --new 3" in capsys.readouterr().out
+    assert "undone: split 1 4 --new 3" in capsys.readouterr().out
     assert sorted(path.name for path in folder.iterdir()) == ["people.npz", "run.json"]
     assert run(folder, "list", "--json") == 0
     listed = json.loads(capsys.readouterr().out)
@@ -192,7 +192,7 @@ def test_tracks_on_the_command_line(folder, capsys):
     [
         (["merge", 0, 1], "0 and 1 are both there in 10 frames, the first is 0: they are two people"),
         (["drop", 7], "there is no person 7; there are 0 1 2"),
-        (["undo"], "there is no correction to take back"),
+        (["undo"], "there is no correction to undo"),
         (["split", 0, 0], "cannot be split at 0; give a frame from 1 to 9"),
         (["merge", 0], "Missing argument 'B'"),
         (["merge", "a", 0], "Invalid value for 'A'"),

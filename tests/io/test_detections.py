@@ -93,19 +93,23 @@ def edit(path: Path, index: int, word: str | None) -> None:
 
 
 BAD_NUMBERS = [
-    ("necks", "-1", "line 6: frame 0 must give the number of candidates of Neck, got -1; a number is missing"),
+    (
+        "necks",
+        "-1",
+        "line 6: frame 0 must give the number of candidates of Neck, got -1; there is a number too few",
+    ),
     ("necks", "1.5", "line 6: frame 0 must give the number of candidates of Neck, got 1.5"),
     ("x", None, " must give the number of candidates of"),
     ("x", "nan", "line 7: 'nan' is not a finite number; write the detections again"),
     ("x", "inf", "line 7: 'inf' is not a finite number"),
     ("x", "0,5", "line 7: '0,5' is not a finite number"),
-    ("x", "512", "line 7: a candidate lies at (512, 0."),
+    ("x", "512", "line 7: a candidate is at (512, 0."),
     ("x", "-0.3", "frame 0 has a joint at pixel (-300, "),
     ("y", "7.5", "divide x by width - 1 and y by height - 1"),
     ("the score of the first neck", "1.2", "line 9: a candidate's score must lie between 0 and 1, got 1.2; write"),
     ("the score of the first neck", "-0.1", "line 9: a candidate's score must lie between 0 and 1, got -0.1"),
     ("frames", "4", "the file ends in frame 3 of 4, where the number of candidates of Nose should be; copy"),
-    ("frames", "1", "numbers follow the last of the 1 frames; correct the number of frames in line 1"),
+    ("frames", "1", "numbers after the last of the 1 frames; correct the number of frames in line 1"),
     ("frames", "0", "line 1: the number of frames must be 1 or more, got 0"),
     ("frames", "1e300", "the file ends in frame 3 of 1"),
     ("necks", "1e300", "the file ends in frame 0 of 3, where the candidates of Neck should be"),
@@ -121,10 +125,10 @@ def test_bad_number(text_folder, rig, what, word, sentence):
 @pytest.mark.parametrize(
     ("kind", "sentence"),
     [
-        ("2", "line 1: skeleton type 2 (SKEL15) is not read here, only 4 (BODY_25) and 3 (COCO_18); run the"),
-        ("0", "skeleton type 0 (SKEL19) is not read here"),
-        ("25", "skeleton type 25 is not read here"),
-        ("4.5", "skeleton type 4.5 is not read here"),
+        ("2", "line 1: skeleton type 2 (SKEL15) is not supported, only 4 (BODY_25) and 3 (COCO_18); run the"),
+        ("0", "skeleton type 0 (SKEL19) is not supported"),
+        ("25", "skeleton type 25 is not supported"),
+        ("4.5", "skeleton type 4.5 is not supported"),
     ],
 )
 def test_other_skeletons(text_folder, rig, kind, sentence):
@@ -152,23 +156,22 @@ def test_frame_counts_that_differ(text_folder, recordings, rig):
     table = read_detections(text_folder, rig)
     assert len(table) == 2 and set(table[0].view.tolist()) == {0, 1}
     assert (
-        "(left.txt has 3, 0 to 2, right.txt has 2, 0 to 1); the 2 that all have, 0 to 1, are used"
-        in table.notes[-1]
+        "(left.txt has 3, 0 to 2, right.txt has 2, 0 to 1); the 2 common ones, 0 to 1, are used" in table.notes[-1]
     )
     assert len(read_detections(text_folder, rig, own_frames=True)) == 3
 
 
 def test_missing_camera(text_folder, rig):
     (text_folder / "right.txt").unlink()
-    refuses(text_folder, rig, text_folder / "right.txt", 'camera "right" are missing', "holds left.txt; add them")
+    refuses(
+        text_folder, rig, text_folder / "right.txt", 'camera "right" are missing', "contains left.txt; add them"
+    )
 
 
 def test_no_detections(tmp_path, text_folder, rig):
-    (tmp_path / "readme.md").write_text("nothing here")
+    (tmp_path / "readme.md").write_text("nothing in it")
     (tmp_path / "empty").mkdir()
-    refuses(
-        tmp_path, rig, tmp_path, "no detections of the cameras left right here, only empty readme.md recording"
-    )
+    refuses(tmp_path, rig, tmp_path, "no detections of the cameras left right, only empty readme.md recording")
     refuses(tmp_path / "empty", rig, tmp_path / "empty", "only nothing; give the folder with <camera>.txt")
     refuses(tmp_path / "nowhere", rig, tmp_path / "nowhere", "there is no such folder")
     left = text_folder / "left.txt"
@@ -214,7 +217,7 @@ def test_openpose_frames_may_be_missing_in_between_and_it_is_said(openpose_folde
     assert set(whole[1].view.tolist()) == {0, 1} and set(table[1].view.tolist()) == {0}
     for frame in (0, 2):
         np.testing.assert_array_equal(table[frame].xy, whole[frame].xy)
-    assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); no people are seen there" in table.notes
+    assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); no people are read there" in table.notes
     assert not any("no file" in note for note in whole.notes)
 
 
@@ -227,7 +230,7 @@ def test_openpose_numbers_that_are_no_frames_are_refused(openpose_folder, rig):
 def test_openpose_frame_counts_that_differ(openpose_folder, rig):
     (openpose_folder / "right" / "video_000000000009_keypoints.json").unlink()
     table = read_detections(openpose_folder, rig)
-    assert len(table) == 2 and "(left has 3, 7 to 9, right has 2, 7 to 8); the 2 that all have" in table.notes[-1]
+    assert len(table) == 2 and "(left has 3, 7 to 9, right has 2, 7 to 8); the 2 common ones" in table.notes[-1]
 
 
 def test_openpose_first_numbers_that_differ(openpose_folder, rig):
@@ -236,12 +239,12 @@ def test_openpose_first_numbers_that_differ(openpose_folder, rig):
         folder = openpose_folder / "right"
         (folder / name.format(number)).rename(folder / name.format(number + 1))
     whole = read_detections(openpose_folder, rig, own_frames=False)
-    assert len(whole) == 2 and "(left has 3, 7 to 9, right has 3, 8 to 10); the 2 that all have" in whole.notes[-1]
+    assert len(whole) == 2 and "(left has 3, 7 to 9, right has 3, 8 to 10); the 2 common ones" in whole.notes[-1]
     # Frame 8 is the second of the left camera and the first of the right one.
     assert np.bincount(whole[0].view).tolist() == [0, 8] and np.bincount(whole[1].view).tolist() == [25]
     every = read_detections(openpose_folder, rig, own_frames=True)
     assert (
-        len(every) == 4 and "frame 0 is number 7 of the files (left has 3, 7 to 9, right has 3" in every.notes[-1]
+        len(every) == 4 and "frame 0 has number 7 in the files (left has 3, 7 to 9, right has 3" in every.notes[-1]
     )
     assert [np.bincount(frame.view, minlength=2).tolist() for frame in every] == [[8, 0], [0, 8], [25, 0], [0, 25]]
 
@@ -255,7 +258,7 @@ def test_openpose_numbers_without_a_frame_in_common(openpose_folder, rig):
         openpose_folder,
         rig,
         openpose_folder,
-        "no frame is there of every camera (left has 3, 7 to 9, right has 3, 57 to 59); give the same frames",
+        "no frame exists for all cameras (left has 3, 7 to 9, right has 3, 57 to 59); give the same frames",
     )
 
 
@@ -267,7 +270,9 @@ def test_openpose_two_recordings_in_a_folder(openpose_folder, rig):
 
 def test_openpose_missing_or_empty_camera(openpose_folder, rig):
     shutil.rmtree(openpose_folder / "right")
-    refuses(openpose_folder, rig, openpose_folder / "right", 'camera "right" are missing', "holds left; add them")
+    refuses(
+        openpose_folder, rig, openpose_folder / "right", 'camera "right" are missing', "contains left; add them"
+    )
     (openpose_folder / "right").mkdir()
     refuses(openpose_folder, rig, openpose_folder / "right", "no *_keypoints.json (OpenPose) or *_000000.json")
 
@@ -307,7 +312,7 @@ def test_openpose_parts_of_the_picture_instead_of_pixels(openpose_folder, rig):
         openpose_folder,
         rig,
         openpose_folder / "left",
-        "recognised as OpenPose's JSON, but all keypoints lie between -1 and 1",
+        "recognised as OpenPose's JSON, but all keypoints are between -1 and 1",
         "run OpenPose again with --write_json --keypoint_scale 0",
     )
 
@@ -319,7 +324,7 @@ def test_openpose_of_larger_pictures(openpose_folder, rig):
         rig,
         openpose_folder / "left",
         "frame 1 has a joint at pixel (1800, 900), far outside the 1001 x 801 picture of the calibration",
-        "give detections made on pictures of the calibrated size",
+        "give detections from pictures of the calibrated size",
     )
 
 
@@ -369,7 +374,7 @@ def test_a_corner_of_a_wide_lens_does_not_cost_the_recording(shared_cases):
     rig = read_rig(shared_cases / "lens_corner" / "calibration.toml", unit="mm", up="-y")
     table = read_detections(shared_cases / "lens_corner" / "detections", rig)
     assert len(table) == 60 and len(table[0]) == 72 and 22 not in table[0].joint
-    assert sum("cannot be undone; 60 joints of 1500 (4.0%) left out" in note for note in table.notes) == 3
+    assert sum("cannot be inverted; 60 joints of 1500 (4.0%) left out" in note for note in table.notes) == 3
 
 
 def test_a_lens_that_bends_most_joints_away_is_named(shared_cases):
@@ -377,14 +382,18 @@ def test_a_lens_that_bends_most_joints_away_is_named(shared_cases):
     wrong = [
         replace(each, distortion=20 * each.distortion) if n == 1 else each for n, each in enumerate(rig.cameras)
     ]
-    with pytest.raises(InputError, match=r"Cam2 cannot be undone; so are .* of this camera; check the distortion"):
+    with pytest.raises(
+        InputError,
+        match=r"Cam2 cannot be inverted; this holds for .* of this camera; check the"
+        r" distortion",
+    ):
         read_detections(shared_cases / "lens_corner" / "detections", replace(rig, cameras=tuple(wrong)))
 
 
 def test_folders_of_unequal_length(shared_cases):
     rig = read_rig(shared_cases / "unequal" / "calibration.json")
     table = read_detections(shared_cases / "unequal" / "det", rig)
-    assert len(table) == 11 and "the 11 that all have, 0 to 10, are used" in table.notes[-1]
+    assert len(table) == 11 and "the 11 common ones, 0 to 10, are used" in table.notes[-1]
 
 
 @pytest.mark.parametrize(

@@ -304,12 +304,12 @@ def test_cameras_without_a_calibration_are_found_by_their_files(program, rig, pe
 
 
 REFUSED = [
-    ("a.npz", b"PK\x03\x04", "a NumPy archive, which has no layout of its own; write"),
-    ("a.mat", b"MATLAB 5.0", "a MATLAB file, which has no layout of its own; write"),
-    ("a.pkl", b"\x80\x04", "a Python pickle, which could run code and is not opened; write"),
+    ("a.npz", b"PK\x03\x04", "a NumPy archive, which has no standard layout; convert"),
+    ("a.mat", b"MATLAB 5.0", "a MATLAB file, which has no standard layout; convert"),
+    ("a.pkl", b"\x80\x04", "a Python pickle, which could run code and is not opened; convert"),
     ("a.slp", b"\x89HDF\r\n\x1a\n", r"a SLEAP project; export the analysis HDF5: sio export FILE\.slp"),
-    ("mediapipe_body_3d_xyz.csv", b"frame,x,y,z\n", "FreeMoCap's table of points in 3D.*pixelXY"),
-    ("a.npy", b"\x93NUMPY", "a NumPy array, and only FreeMoCap's"),
+    ("mediapipe_body_3d_xyz.csv", b"frame,x,y,z\n", "FreeMoCap's table of 3D points.*pixelXY"),
+    ("a.npy", b"\x93NUMPY", "a NumPy array, of which only FreeMoCap's"),
 ]
 
 
@@ -328,7 +328,7 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
     with pytest.raises(InputError, match="holds Python objects"):
         read_detections(file, rig)
     np.save(file, np.zeros((3, 4, 33, 2)))
-    with pytest.raises(InputError, match="has 3 cameras, and 2 are wanted"):
+    with pytest.raises(InputError, match="has 3 cameras, but 2 are expected"):
         read_detections(file, rig)
     content = file.read_bytes()
     file.write_bytes(content.replace(b"(3, 4, 33, 2)", b"(2, 9, 99, 2)"))
@@ -341,7 +341,7 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
         with h5py.File(tmp_path / f"{name}.h5", "w") as damaged:
             damaged["tracks"] = h5py.ExternalLink(str(tmp_path / "secret.hdf"), "tracks")
             damaged["node_names"] = [each.encode() for each in NAMES]
-    with pytest.raises(InputError, match="only SLEAP's analysis files and DeepLabCut's tables are known here"):
+    with pytest.raises(InputError, match="only SLEAP's analysis files and DeepLabCut's tables are supported"):
         read_detections(tmp_path, rig)
     for name in rig.names:
         (tmp_path / f"{name}.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 8)
@@ -351,7 +351,7 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
         with h5py.File(tmp_path / f"{name}.h5", "w") as huge:
             huge.create_dataset("tracks", shape=(10**5, 2, 17, 10**5), dtype="f8", chunks=(1, 2, 17, 100))
             huge["node_names"] = [each.encode() for each in NAMES]
-    with pytest.raises(InputError, match="too many numbers"):
+    with pytest.raises(InputError, match="are too large"):
         read_detections(tmp_path, rig)
 
 
@@ -364,12 +364,12 @@ def test_names_of_columns_are_read_without_carrying_out_their_pickle(rig, people
     h5py = pytest.importorskip("h5py", reason="an extra")
     monkeypatch.chdir(tmp_path)
     for kind, says in (
-        (pickle.dumps([Harmful()], 0), "is no list of names: GLOBAL"),
-        (pickle.dumps([("s", "nose", "x")], 4), "is no list of names"),
+        (pickle.dumps([Harmful()], 0), "is not a list of names: GLOBAL"),
+        (pickle.dumps([("s", "nose", "x")], 4), "is not a list of names"),
         (b"(lp0\nVa\n", "damaged HDF5"),
         (b"g7\n.", "damaged HDF5"),
         (b"(l(Va\nta.", "only SLEAP's analysis files and"),
-        (pickle.dumps([("s", "nose", "x"), ("s", "nose", "y")], 0), "its columns are not those it names"),
+        (pickle.dumps([("s", "nose", "x"), ("s", "nose", "y")], 0), "its columns do not match their names"),
     ):
         for name, own in zip(rig.names, people, strict=True):
             deeplabcut_hdf5(tmp_path, name, own, None)
@@ -388,7 +388,7 @@ def test_names_of_columns_are_read_without_carrying_out_their_pickle(rig, people
         ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,likelihood\n0,1,2\n", "must have the columns x and y"),
         ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n0,1\n", "line 4 must hold 3 fields, got 2"),
         ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n0,1,b\n", "line 4 must hold numbers, got 'b'"),
-        ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n1,1,2\n1,1,2\n", "line 5: frames must rise"),
+        ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n1,1,2\n1,1,2\n", "line 5: frame numbers must increase"),
         ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n", "no frames"),
     ],
 )
@@ -402,8 +402,8 @@ def test_damaged_csv_is_named_by_its_line(text, says, rig, tmp_path):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("0 0.5 0.5 0.2 0.2", "has a box and no keypoints"),
-        ("0 0.5 0.5 0.2 0.2 " + "512 0.5 0.9 " * 17, "parts of the picture"),
+        ("0 0.5 0.5 0.2 0.2", "has a box but no keypoints"),
+        ("0 0.5 0.5 0.2 0.2 " + "512 0.5 0.9 " * 17, "fractions of the picture"),
         ("0 0.5 0.5 0.2 0.2 " + "a b c " * 17, "must hold numbers"),
     ],
 )

@@ -59,8 +59,8 @@ def test_a_video_that_was_cut_is_told_of(tmp_path):
     read = Video.open(cut)
     assert 15 < len(read.time_s) < 45
     assert read.notes == (
-        f"{cut}: only {len(read.time_s)} of the 60 frames that the file tells of can be read;"
-        " it was cut or is damaged",
+        f"{cut}: only {len(read.time_s)} of the 60 frames in its header can be read;"
+        " the file is truncated or damaged",
     )
 
 
@@ -69,7 +69,7 @@ def test_damaged_videos_are_refused(tmp_path, capfd):
     bad = tmp_path / "bad.mp4"
     for content in (b"", b"no video", whole[: len(whole) // 2]):
         bad.write_bytes(content)
-        with pytest.raises(InputError, match=r"bad\.mp4: not a video that can be read; give another copy"):
+        with pytest.raises(InputError, match=r"bad\.mp4: cannot be read as a video; give another copy"):
             open_footage(bad)
     assert "OpenCV" not in (err := capfd.readouterr().err) and "WARN" not in err
     with pytest.raises(InputError, match="there is no such video"):
@@ -83,7 +83,7 @@ def test_damaged_videos_are_refused(tmp_path, capfd):
 def test_a_playlist_leads_to_no_other_file(tmp_path, playlist):
     video(tmp_path / "secret.mp4")
     (tmp_path / "a.mp4").write_text(playlist)
-    with pytest.raises(InputError, match="not a video that can be read"):
+    with pytest.raises(InputError, match="cannot be read as a video"):
         open_footage(tmp_path / "a.mp4")
     assert open_footage(tmp_path / "secret.mp4").size == (96, 64)
 
@@ -107,7 +107,7 @@ def test_pictures_without_frames_are_refused(tmp_path):
     picture(tmp_path / "cam" / "one.png")
     assert len(open_footage(tmp_path / "cam").number) == 1
     picture(tmp_path / "cam" / "2.png")
-    with pytest.raises(InputError, match=r"one\.png: no number in its name says which frame"):
+    with pytest.raises(InputError, match=r"one\.png: its name has no frame"):
         open_footage(tmp_path / "cam")
     (tmp_path / "cam" / "one.png").rename(tmp_path / "cam" / "02.png")
     with pytest.raises(InputError, match=r"2\.png: frame 2 is also in 02\.png"):
@@ -116,7 +116,7 @@ def test_pictures_without_frames_are_refused(tmp_path):
     with pytest.raises(InputError, match="no pictures in this folder"):
         open_footage(tmp_path / "empty")
     (tmp_path / "3.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="not a picture that can be read"):
+    with pytest.raises(InputError, match="cannot be read as a picture"):
         open_footage(tmp_path / "3.png")
 
 
@@ -153,16 +153,16 @@ def test_footage_camera_by_camera(tmp_path):
 
 def test_footage_that_is_not_found_is_named(tmp_path):
     folder = str(touched(tmp_path / "some", "cam1.mp4", "other.mp4"))
-    with pytest.raises(InputError, match=r"nothing here is named after camera cam2, it holds cam1\.mp4 other"):
+    with pytest.raises(InputError, match=r"nothing in it is named after camera cam2; it contains cam1\.mp4 other"):
         find_footage([folder], CAMERAS)
     touched(tmp_path / "some", "cam2.mp4", "cam2/1.png")
-    with pytest.raises(InputError, match=r"cam2 and cam2\.mp4 could all be camera cam2's"):
+    with pytest.raises(InputError, match=r"cam2 and cam2\.mp4 all match camera cam2"):
         find_footage([folder], CAMERAS)
     for given, problem in (
         ([str(tmp_path / "none")], "there is no such folder"),
         ([f"{folder}/cam1.mp4"], "this is one file"),
         (["cam9=x.mp4", "cam1=y.mp4"], "no camera 'cam9'; there are cam1 cam2"),
-        ([f"cam1={folder}/cam1.mp4"], "nothing is given for camera cam2; add --videos cam2=PATH"),
+        ([f"cam1={folder}/cam1.mp4"], "there is no footage for camera cam2; add --videos cam2=PATH"),
         (["cam1=x.mp4", "cam1=y.mp4"], "camera cam1 is given twice"),
         (["cam1=x.mp4", "cam2=y.mp4"], "x.mp4: there is no such file or folder"),
         ([folder, "cam2=y.mp4"], "must be CAMERA=VALUE, such as --videos cam1=VALUE"),
@@ -173,10 +173,10 @@ def test_footage_that_is_not_found_is_named(tmp_path):
 
 @pytest.mark.parametrize("picture_size, kind, note", [
     ((1920, 1080), PlacementKind.SAME, None),
-    ((1912, 1080), PlacementKind.CROP, "first column and row are taken to be the calibrated ones"),
+    ((1912, 1080), PlacementKind.CROP, "assumed to be cropped on the right or at the bottom"),
     ((1920, 1088), PlacementKind.CROP, "crop-centre"),
-    ((960, 540), PlacementKind.SCALE, "of the same shape: taken as resized"),
-    ((3840, 2160), PlacementKind.SCALE, "taken as resized"),
+    ((960, 540), PlacementKind.SCALE, "of the same aspect ratio: they are assumed to be resized"),
+    ((3840, 2160), PlacementKind.SCALE, "assumed to be resized"),
 ])  # fmt: skip
 def test_sizes_that_can_only_mean_one_thing_are_placed(picture_size, kind, note):
     placement, said = place("c", picture_size, (1920, 1080), None)
@@ -185,8 +185,9 @@ def test_sizes_that_can_only_mean_one_thing_are_placed(picture_size, kind, note)
 
 
 @pytest.mark.parametrize("picture_size, problem", [
-    ((960, 512), "camera c: the pictures are 960 x 512, the calibration is for 1920 x 1080; say what was done"),
-    ((1080, 1920), "lie on their side"),
+    ((960, 512), "camera c: the pictures have 960 x 512 pixels, but the calibration is for 1920 x 1080; give"
+        " --image-placement"),
+    ((1080, 1920), "rotated by 90 degrees"),
 ])  # fmt: skip
 def test_other_sizes_are_the_user_s_to_explain(picture_size, problem):
     with pytest.raises(InputError, match=problem):
@@ -233,7 +234,7 @@ def test_what_was_used_is_read_back(tmp_path):
         (text.replace('"letterbox"', '"folded"'), r"cameras\[0\]\.placement must be"),
         (
             text.replace("960", "0"),
-            r"cameras\[0\]\.picture_size\[0\] is refused: input should be greater than or equal to 1",
+            r"cameras\[0\]\.picture_size\[0\] is not valid: input should be greater than or equal to 1",
         ),
         (text[:50], "is not JSON"),
     ):
@@ -250,7 +251,7 @@ def test_rates_are_a_hundredth_to_a_hundred_thousand_frames_a_second(text):
     if text in GOOD_RATES:
         assert typed_rate(text) == GOOD_RATES[text]
         return
-    with pytest.raises(InputError, match=f"--fps {text}: must be a number of frames a second"):
+    with pytest.raises(InputError, match=f"--fps {text}: must be a frame rate in Hz"):
         typed_rate(text)
 
 

@@ -93,14 +93,14 @@ def test_a_data_set_s_name_is_obeyed(tmp_path, rig):
     assert read_detections(written(tmp_path, video({"dataset_name": "h36m"}, 17)), rig).skeleton.name == "H36M_17"
     assert read_detections(written(tmp_path, video({"dataset_name": "coco"}, 17)), rig).skeleton is COCO_17
     table = read_detections(written(tmp_path, video({"dataset_name": "horse10"}, 17)), rig)
-    assert any("says horse10, which are not known here" in note for note in table.notes)
+    assert any("names horse10, which are not a known layout" in note for note in table.notes)
 
 
 def test_joints_that_a_body_lacks_are_passed_over_and_said(tmp_path, rig):
     names = [*keypoint_names(COCO_17), "mouth_left", "left_thumb"]
     table = read_detections(written(tmp_path, data_set(names, 19)), rig)
     assert table.skeleton.joints == COCO_17.joints
-    assert any("passed over: mouth_left left_thumb" in note for note in table.notes)
+    assert any("ignored: mouth_left left_thumb" in note for note in table.notes)
 
 
 def test_names_that_cannot_be_are_refused(tmp_path, rig):
@@ -110,7 +110,7 @@ def test_names_that_cannot_be_are_refused(tmp_path, rig):
         return str(caught.value)
 
     names = keypoint_names(COCO_17)
-    assert "names 17 joints, and its people have 18 keypoints" in refused(data_set(names, 18))
+    assert "names 17 joints, but its people have 18 keypoints" in refused(data_set(names, 18))
     assert "there is no RHip and no LHip" in refused(
         data_set([n if "Hip" not in n else "tail" for n in names], 17)
     )
@@ -122,14 +122,14 @@ def test_names_that_cannot_be_are_refused(tmp_path, rig):
 def test_the_user_s_word_goes_before_the_file_s_and_it_is_said(tmp_path, rig):
     table = read_detections(written(tmp_path, data_set(keypoint_names(COCO_17)[::-1], 17)), rig, "COCO_17")
     assert table.skeleton is COCO_17
-    assert any("names its joints, but they are read as COCO_17, as you said" in note for note in table.notes)
+    assert any("names its joints, but they are read as COCO_17, as requested" in note for note in table.notes)
 
 
 @pytest.mark.parametrize("names", [None, [], [f"kp{n}" for n in range(17)]], ids=["none", "empty", "numbers"])
 def test_files_without_names_are_read_by_their_number(tmp_path, rig, names):
     table = read_detections(written(tmp_path, data_set(names, 17)), rig)
     assert table.skeleton is COCO_17
-    assert any("17 keypoints a person and no names of joints: taken as those of COCO_17" in n for n in table.notes)
+    assert any("17 keypoints per person without joint names: read as COCO_17" in n for n in table.notes)
 
 
 def test_mmpose_s_pictures_of_its_demo_are_read(tmp_path, rig):
@@ -194,14 +194,14 @@ id = "None"
 @pytest.mark.parametrize(
     ("pose", "count", "name", "said"),
     [
-        ("[pose]\npose_model = 'BODY_25B'", 25, "BODY_25B", "pose.pose_model says BODY_25B"),
-        ("[pose]\npose_model = 'Body_with_feet'", 26, "HALPE_26", "says Body_with_feet"),
-        ("[pose]\npose_model = 'COCO'", 18, "COCO_18", "says COCO"),
-        ("[pose]\npose_model = 'MPII'", 15, "MPI_15", "says MPII"),
-        ("[pose]\npose_model = 'BLAZEPOSE'", 33, "BLAZEPOSE_33", "says BLAZEPOSE"),
-        ("[pose]\npose_model = 'Body_with_feet'", 17, "COCO_17", "which have 26 keypoints, not 17"),
-        ("[pose]\npose_model = 'unheard_of'", 17, "COCO_17", "which are not known here"),
-        ("[pose]\n", 17, "COCO_17", "no names of joints"),
+        ("[pose]\npose_model = 'BODY_25B'", 25, "BODY_25B", "pose.pose_model names BODY_25B"),
+        ("[pose]\npose_model = 'Body_with_feet'", 26, "HALPE_26", "names Body_with_feet"),
+        ("[pose]\npose_model = 'COCO'", 18, "COCO_18", "names COCO"),
+        ("[pose]\npose_model = 'MPII'", 15, "MPI_15", "names MPII"),
+        ("[pose]\npose_model = 'BLAZEPOSE'", 33, "BLAZEPOSE_33", "names BLAZEPOSE"),
+        ("[pose]\npose_model = 'Body_with_feet'", 17, "COCO_17", "which have 26 keypoints instead of 17"),
+        ("[pose]\npose_model = 'unheard_of'", 17, "COCO_17", "which are not a known layout"),
+        ("[pose]\n", 17, "COCO_17", "without joint names"),
         (CUSTOM, 8, "NAMED_8", "names its joints"),
     ],
 )
@@ -282,7 +282,7 @@ def test_how_people_look_tells_layouts_of_one_number_apart(tmp_path, rig, skelet
         "POSETRACK_17",
         "COCO_17",
     )
-    assert any(f"taken as those of {table.skeleton.name}" in note for note in table.notes)
+    assert any(f"without joint names: read as {table.skeleton.name}" in note for note in table.notes)
 
 
 def test_a_few_people_are_enough_for_layouts_that_differ_much(tmp_path, rig):
@@ -295,13 +295,13 @@ def test_people_who_look_like_no_layout_leave_the_most_usual_and_it_is_said(tmp_
     mixed = looks(keypoint_names(SKELETONS["BODY_25B"]), 60, 1)[:, np.random.default_rng(0).permutation(25)]
     mixed[..., :2] = np.random.default_rng(1).uniform(200, 600, mixed[..., :2].shape)
     table = read_detections(results(tmp_path, a=mixed, b=mixed), rig)
-    assert table.skeleton is BODY_25 and any("people look like those of no layout" in note for note in table.notes)
+    assert table.skeleton is BODY_25 and any("people look like none of them" in note for note in table.notes)
 
 
 def test_cameras_of_two_models_are_refused(tmp_path, rig):
     one, other = (looks(keypoint_names(SKELETONS[name]), 60, 1) for name in ("BODY_25", "BODY_25B"))
     with pytest.raises(
-        InputError, match=r"joints lie as in BODY_25, those of .* as in BODY_25B; give the detections"
+        InputError, match=r"people look like BODY_25, those of .* like BODY_25B; give the detections"
     ):
         read_detections(results(tmp_path, a=one, b=other), rig)
 

@@ -214,8 +214,8 @@ def test_pose2sim_s_own_writer(rig):
     assert [np.bincount(frame.view, minlength=2).tolist() for frame in table] == [[26, 26], [0, 0], [25, 25]]
     assert max(frame.confidence.max(initial=0) for frame in table) == 1.0
     note, layout = table.notes
-    assert layout.startswith("26 keypoints a person and no names of joints: taken as those of HALPE_26")
-    assert "scores reach 1.3, so they are no probabilities" in note
+    assert layout.startswith("26 keypoints per person without joint names: read as HALPE_26")
+    assert "scores reach 1.3, so they are not probabilities" in note
 
 
 def test_cameras_are_told_by_their_numbers_where_names_differ():
@@ -225,7 +225,7 @@ def test_cameras_are_told_by_their_numbers_where_names_differ():
     first = straight[0].view == 0
     np.testing.assert_array_equal(table[0].xy[table[0].view == 1], straight[0].xy[first])
     with pytest.raises(
-        InputError, match="no detections of the cameras cam 1 a, other here, only cam01_json cam02_json"
+        InputError, match="no detections of the cameras cam 1 a, other, only cam01_json cam02_json"
     ):
         read_detections(DATA / "pose2sim", two_cameras("cam 1 a,", "other"))
 
@@ -235,7 +235,7 @@ def test_cameras_are_told_by_their_names_within_others(tmp_path):
     people = people_of(BODY_25)
     names = {"left": "walk3_Miqus_2_23087", "right": "walk3_Miqus_1_23088"}
     pose2sim(tmp_path, {names[name]: frames for name, frames in people.items()})
-    with pytest.raises(InputError, match="no detections of the cameras 23087 walk3 here"):
+    with pytest.raises(InputError, match="no detections of the cameras 23087 walk3, only"):
         read_detections(tmp_path, two_cameras("23087", "walk3"))  # which stands in both
     note, _ = read_detections(tmp_path, rig).notes
     assert note.endswith("23087 is walk3_Miqus_2_23087_json, 1 is walk3_Miqus_1_23088_json")
@@ -244,7 +244,7 @@ def test_cameras_are_told_by_their_names_within_others(tmp_path):
 def test_middles_are_said(tmp_path, rig):
     coco(tmp_path, people_of(COCO_17))
     assert read_detections(tmp_path, rig).notes[1:] == (
-        "COCO_17 has no Neck and no MidHip: made as middles, where a person's two ends were seen",
+        "COCO_17 has no Neck and no MidHip: they are the midpoints of two joints, if both were detected",
     )
 
 
@@ -258,7 +258,7 @@ def test_scores_of_other_kinds(tmp_path, rig):
     scale = np.quantile(every[every > 0], 0.99)
     found = np.concatenate([frame.confidence for frame in table])
     np.testing.assert_allclose(np.sort(found), np.sort(np.minimum(every[every > 0] / scale, 1)))
-    assert f"divided by {scale:.3g}, which 1 in 100 exceeds, and cut at 1" in table.notes[0]
+    assert f"divided by {scale:.3g}, their 99 % quantile, and clipped to 1" in table.notes[0]
 
 
 def test_coco_s_visibilities(tmp_path, rig):
@@ -268,7 +268,7 @@ def test_coco_s_visibilities(tmp_path, rig):
     coco(tmp_path, people)
     table = read_detections(tmp_path, rig)
     assert {score for frame in table for score in frame.confidence.tolist()} == {0.5, 1.0}
-    assert "COCO's visibilities" in table.notes[0]
+    assert "COCO visibilities" in table.notes[0]
 
 
 def test_frames_that_only_some_cameras_list(tmp_path, rig):
@@ -287,7 +287,7 @@ def test_pictures_without_people_are_frames_where_the_file_lists_them(tmp_path, 
     coco_data_set(tmp_path, dict.fromkeys(rig.names, frames))
     table = read_detections(tmp_path, rig)
     assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(table) == 50
-    assert not any("frame 0 is number" in note for note in table.notes)
+    assert not any("frame 0 has number" in note for note in table.notes)
 
 
 @pytest.mark.parametrize("write", [coco, alphapose])
@@ -306,7 +306,7 @@ def test_numbers_too_high_for_frames_count_from_the_first_and_it_is_said(tmp_pat
         (tmp_path / f"{name}.json").write_text(json.dumps(found))
     table = read_detections(tmp_path, rig)
     assert len(table) == 3 and table.first == 0
-    assert "frame 0 is number 10128340000 of the files" in table.notes
+    assert "frame 0 has number 10128340000 in the files" in table.notes
 
 
 def test_numbers_in_are_numbers_out_of_an_operating_room(shared_data):
@@ -331,7 +331,7 @@ def test_a_number_that_no_frame_has(tmp_path, rig):
     for file in (tmp_path / "left").iterdir():
         file.unlink()
     (tmp_path / "left" / "100000000000000000000_keypoints.json").write_text('{"people": []}')
-    refuses(tmp_path, rig, "100000000000000000000_keypoints.json: no frame has so high a number")
+    refuses(tmp_path, rig, "100000000000000000000_keypoints.json: this frame number")
 
 
 USER = """
@@ -390,14 +390,14 @@ BAD_SKELETONS = [
     (
         'head = "Nose"',
         'head = "Tail"',
-        "the body has no point 'Tail'; say under [body] which of its points head is",
+        "the body has no point 'Tail'; write under [body] which of its points head is",
     ),
     ('["head", "neck"]', '["head", "throat"]', "ours has no joint 'throat'; it has Nose"),
     ('["r_sho", "r_wri"],', "", "no limbs lead from the anchor MidHip to RWrist; add limbs"),
     ('anchor = ["r_hip", "l_hip"]', 'anchor = "head"', "ours has no joint 'MidHip'; it has Nose"),
-    ('anchor = ["r_hip", "l_hip"]', 'anchor = ["r_sho", "l_sho"]', "an anchor of two is the middle of the hips"),
+    ('anchor = ["r_hip", "l_hip"]', 'anchor = ["r_sho", "l_sho"]', "an anchor of two joints must be the hips"),
     ('name = "ours"', "", "name is missing; docs/conventions.md describes the file"),
-    ('neck = "Neck"', 'nick = "Neck"', "body.nick is no keypoint of ours; it has head"),
+    ('neck = "Neck"', 'nick = "Neck"', "body.nick is not a keypoint of ours; it has head"),
     ('r_wri = "RWrist"', 'r_wri = "LWrist"', "joint LWrist occurs twice"),
     ("limbs = [", "limbs = ", "is not TOML"),
     (
@@ -429,9 +429,9 @@ def test_bad_skeleton(tmp_path, rig, old, new, sentence):
 def test_a_named_skeleton(tmp_path, rig):
     openpose(tmp_path, people_of(COCO_133))
     assert read_detections(tmp_path, rig, "COCO_133").skeleton is COCO_133
-    refuses(tmp_path, rig, "with 133 keypoints a person, but COCO_17 has 17", skeleton="COCO_17")
+    refuses(tmp_path, rig, "with 133 keypoints per person, but COCO_17 has 17", skeleton="COCO_17")
     with pytest.raises(
-        InputError, match="COCO_99: neither a file nor a known skeleton; give a TOML file, or one of"
+        InputError, match="COCO_99: this is neither a file nor a known skeleton; give a TOML file, or one of"
     ):
         read_detections(tmp_path, rig, "COCO_99")
 
@@ -447,7 +447,9 @@ def refuses(folder: Path, rig: Rig, *parts: str, skeleton: str | None = None) ->
 
 def test_unknown_numbers_of_keypoints(tmp_path, rig):
     openpose(tmp_path, {name: [[np.full((12, 3), 0.5) * 100]] for name in rig.names})
-    refuses(tmp_path, rig, "recognised as OpenPose's JSON with 12 keypoints a person, which is not known here")
+    refuses(
+        tmp_path, rig, "recognised as OpenPose's JSON with 12 keypoints per person, which is not a known layout"
+    )
     (tmp_path / "b").mkdir()
     coco(tmp_path / "b", {name: [[np.full((21, 3), 50.0)]] for name in rig.names})
     refuses(tmp_path / "b", rig, "COCO's keypoint results with 21 keypoints", "--skeleton", "26 (HALPE_26)")
@@ -460,12 +462,12 @@ def test_people_of_two_models(tmp_path, rig):
     mixed = [[people_of(COCO_17)["left"][0][0], people_of(HALPE_26)["left"][0][0]]]
     coco(tmp_path / "b", {"left": mixed, "right": mixed})
     refuses(
-        tmp_path / "b", rig, "recognised as COCO's keypoint results, with people of 17 and 26 keypoints; give the"
+        tmp_path / "b", rig, "recognised as COCO's keypoint results, but people have 17 and 26 keypoints; give the"
     )
 
 
 BAD_FILES = [
-    ('{"a": 1}', "recognised as JSON (an object), expected a list of people with image_id (COCO, AlphaPose)"),
+    ('{"a": 1}', "recognised as JSON (an object), but a list of people with image_id (COCO, AlphaPose)"),
     ("[{]", "line 1 column 3 is not JSON"),
     ('[{"image_id": 1}]', "[0].keypoints is missing; write the results again, in pixels"),
     ('[{"image_id": 1, "keypoints": [1, 2]}]', "[0].keypoints must hold x, y and score of each keypoint, got 2"),
@@ -476,20 +478,20 @@ BAD_FILES = [
     ),
     (
         '[{"frame_id": 0, "instances": [{"keypoints": [], "keypoint_scores": [1]}]}]',
-        "0 keypoints have 1 keypoint_sc",
+        "0 keypoints, but 1 keypoint_sc",
     ),
     ('[{"frame_id": -1, "instances": []}]', "[0].frame_id"),
     (
         '[{"image_id": 99999999999999, "keypoints": [1, 2, 3]}]',
-        "[0].image_id '99999999999999' is no frame's number",
+        "[0].image_id '99999999999999' is not a frame number",
     ),
     (
         '[{"image_id": -5, "keypoints": [1, 2, 3]}]',
-        "[0].image_id '-5' is no frame's number; write the results again",
+        "[0].image_id '-5' is not a frame number; write the results again",
     ),
     (
         '[{"image_id": "a/7.jpg", "keypoints": [1, 2, 3]}, {"image_id": "b/7.jpg", "keypoints": [1, 2, 3]}]',
-        "the pictures 'a/7.jpg' and 'b/7.jpg' are both frame 7; run AlphaPose again",
+        "the pictures 'a/7.jpg' and 'b/7.jpg' have the same frame number 7; run AlphaPose again",
     ),
     ('{"images": [{"id": [1]}], "annotations": []}', "images[0].id must be a whole number or text"),
     ('{"annotations": 3}', "the file must be a list, got 3"),
@@ -510,7 +512,7 @@ def test_mmpose_pictures_that_do_not_fit(tmp_path, rig):
     mmpose_pictures(tmp_path, people_of(COCO_17))
     file = tmp_path / "left" / "000001.json"
     file.write_text('[{"keypoints": [[1, 2]], "keypoint_scores": [1, 1]}]')
-    with pytest.raises(InputError, match=r"000001\.json: \[0\]: 1 keypoints have 2 keypoint_scores"):
+    with pytest.raises(InputError, match=r"000001\.json: \[0\]: there are 1 keypoints, but 2 keypoint_scores"):
         read_detections(tmp_path, rig)
 
 
@@ -529,7 +531,7 @@ def test_a_few_joints_far_outside_the_picture_are_left_out_and_said(tmp_path, ri
 def test_ids_of_pictures_that_are_no_frames(tmp_path, rig):
     coco(tmp_path, people_of(COCO_17))
     (tmp_path / "right.json").write_text(json.dumps([{"image_id": 900_100_200, "keypoints": [5.0, 5, 0.5] * 17}]))
-    refuses(tmp_path, rig, "whose frames would run from 0 to 900100200; number the pictures by their frames")
+    refuses(tmp_path, rig, "but its frames would run from 0 to 900100200; number the pictures by their frames")
 
 
 def test_nobody_anywhere(tmp_path, rig):
@@ -537,7 +539,7 @@ def test_nobody_anywhere(tmp_path, rig):
     assert [len(frame) for frame in read_detections(tmp_path, rig)] == [0, 0]
     (tmp_path / "b").mkdir()
     coco(tmp_path / "b", {name: [[]] for name in rig.names})
-    refuses(tmp_path / "b", rig, "recognised as COCO's keypoint results, where no camera lists a frame")
+    refuses(tmp_path / "b", rig, "recognised as COCO's keypoint results, but no camera has a frame")
 
 
 def test_a_format_of_the_user_s_own(tmp_path, rig):

@@ -68,7 +68,7 @@ def test_the_project_s_own_numbers_choose_frames(project):
     write_config(project, frames="[5, 400]")
     assert read_pose2sim_project(project).span(4) == range(2, 4)
     write_config(project, frames="[40, 60]")
-    with pytest.raises(InputError, match=r"frame_range is \[40, 60\], and the detections have frames 3 to 6"):
+    with pytest.raises(InputError, match=r"frame_range is \[40, 60\], but the detections have frames 3 to 6"):
         read_pose2sim_project(project).span(4)
 
 
@@ -121,15 +121,15 @@ def test_the_rate_is_the_video_s_where_the_project_says_auto(project):
 
 def test_what_is_missing_is_named_with_the_cure(project):
     shutil.rmtree(project / "pose")
-    assert "neither 2D detections (pose-sync pose pose-associated) nor videos here" in refusal(project)
+    assert "neither 2D detections (pose-sync pose pose-associated) nor videos" in refusal(project)
     (project / "videos").mkdir()
     (project / "videos" / "cam0.mp4").write_bytes(b"")
     said = refusal(project)
     assert f"shapepose-fg detect --project {project} --network NETWORK" in said
     (project / "calibration" / "rig.json").unlink()
-    assert "no calibration that is known here, only nothing" in refusal(project)
+    assert "no calibration in a known format, only nothing" in refusal(project)
     (project / "calibration").rmdir()
-    assert "no folder of the calibration here" in refusal(project)
+    assert "there is no calibration folder" in refusal(project)
     (project / "Config.toml").unlink()
     assert "Config.toml: there is no such file" in refusal(project)
     assert "there is no such folder" in refusal(project / "elsewhere")
@@ -138,7 +138,7 @@ def test_what_is_missing_is_named_with_the_cure(project):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rate": "'fast'"}, "frame_rate must be frames a second or 'auto', got 'fast'"),
+        ({"rate": "'fast'"}, "frame_rate must be a frame rate in Hz or 'auto', got 'fast'"),
         ({"rate": "true"}, "frame_rate must be"),
         ({"rate": "100000.5"}, "frame_rate must be"),
         ({"rate": "0.009"}, "frame_rate must be"),
@@ -207,7 +207,7 @@ def test_everybody_has_files_where_the_project_is_of_several(project, two_tracks
     names = [each.name for each in written.files if each.suffix == ".trc"]
     assert names == ["Walk_P0_3-6.trc", "Walk_P1_4-6.trc"]
     assert any("leaves out 1 frames" in each for each in written.notes)
-    assert any("also has Walk_0-9.trc of before" in each for each in written.notes)
+    assert any("also has Walk_0-9.trc of an earlier run" in each for each in written.notes)
     assert (project / "pose-3d" / "Walk_0-9.trc").read_text() == "old"
 
 
@@ -216,10 +216,14 @@ def test_times_that_c3d_cannot_have_are_a_note(project, two_tracks):
     late = replace(two_tracks, time_s=np.where(two_tracks.frame == 3, 1e9, two_tracks.time_s))
     written = write_pose2sim_files(late, "z", read_pose2sim_project(project))
     assert [each.name for each in written.files] == ["Walk_3-6.trc"]
-    assert len(written.notes) == 1 and written.notes[0].startswith("no C3D: people.npz: the times run over")
+    assert len(written.notes) == 1 and written.notes[0].startswith(
+        "C3D is not written: people.npz: the times cover"
+    )
     back = replace(two_tracks, time_s=-two_tracks.time_s)
     written = write_pose2sim_files(back, "z", read_pose2sim_project(project))
-    assert written.files == [] and written.notes[0].startswith("no TRC and no C3D: time_s does not rise")
+    assert written.files == [] and written.notes[0].startswith(
+        "TRC and C3D are not written: time_s does not increase"
+    )
 
 
 def test_c3d_of_high_frame_numbers(project, two_tracks):
@@ -228,12 +232,12 @@ def test_c3d_of_high_frame_numbers(project, two_tracks):
     written = write_pose2sim_files(late, "z", read_pose2sim_project(project))
     file = ezc3d.c3d(str(project / "pose-3d" / "Walk_70003-70006.c3d"))
     assert file["header"]["points"]["first_frame"] == 0
-    assert "counts its frames from 1, not 70004" in written.notes[0]
+    assert "numbers its frames from 1, not 70004" in written.notes[0]
 
 
 def test_nobody_is_a_note(project):
     written = write_pose2sim_files(Reconstruction.empty(BODY_25.joints), "z", read_pose2sim_project(project))
-    assert written.files == [] and "no people were found" in written.notes[0]
+    assert written.files == [] and "the result has no people" in written.notes[0]
 
 
 @pytest.mark.slow

@@ -153,7 +153,7 @@ def test_detections_are_read_as_lines_are(tmp_path, five_cameras):
 
 def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, file, five_cameras):
     whole = file.read_bytes()
-    with pytest.raises(InputError, match="there is no detection in it"):
+    with pytest.raises(InputError, match="there are no detections in it"):
         list(read_views(file, five_cameras, BODY_25, print))
     rng, damaged = np.random.default_rng(0), tmp_path / "damaged.mcap"
     for _ in range(60):

@@ -153,13 +153,13 @@ def test_refused_in_a_sentence(tmp_path, robot):
     bent = transform("map", "base", 0.0, MOUNT)
     bent["transforms"][0]["transform"]["rotation"]["w"] = 3.0
     cases = (
-        (two, f"{two}: frames that move in it are arm base; say which one, two.mcap#FRAME"),
-        (f"{robot}#hand", "frames that move in it are base; say which one, robot.mcap#FRAME"),
-        (write(tmp_path / "none.mcap", []), "frames that move in it are none; say which one, none.mcap#FRAME"),
+        (two, f"{two}: the moving frames in it are arm base; choose one with two.mcap#FRAME"),
+        (f"{robot}#hand", "the moving frames in it are base; choose one with robot.mcap#FRAME"),
+        (write(tmp_path / "none.mcap", []), "the moving frames in it are none; choose one with none.mcap#FRAME"),
         (write(tmp_path / "bent.mcap", [("/tf", 0.0, bent)]), "topic /tf, frame base: a pose must be finite"),
         (
             write(tmp_path / "once.mcap", messages[:1]),
-            "frame base: 2 poses are needed, known along base at the same time; record more",
+            "frame base: 2 poses are needed, with base known at the same time; record more",
         ),
     )
     for path, says in cases:
@@ -189,8 +189,8 @@ def test_views_come_with_the_pose_of_their_moment(tmp_path):
     # The last picture is after the last pose.
     assert len(moving) == 10 and len(views) == 21
     assert [each.partition(": ")[2] for each in sorted(told)] == [
-        "1 pictures of cam0 are left out; frame eye has no pose within 0.5 s",
-        "11 pictures of cam2 are left out; frame lift_tum has no pose within 0.5 s",
+        "1 pictures of cam0 are left out: frame eye has no pose within 0.5 s",
+        "11 pictures of cam2 are left out: frame lift_tum has no pose within 0.5 s",
     ]
     for n, (_, seen, time_s, pose, covariance) in enumerate(moving):
         between = ODOM[n] * gtsam.Pose3.Expmap(0.5 * gtsam.Pose3.Logmap(ODOM[n].between(ODOM[n + 1]))) * MOUNT

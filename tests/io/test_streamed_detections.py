@@ -131,7 +131,7 @@ def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
         (-60, "x1", "'x1' is not a finite number"),
         (-60, "nan", "'nan' is not a finite number"),
         (-60, "", "the file ends in frame"),
-        (0, "4 1", "numbers follow the last of the 1 frames"),
+        (0, "4 1", "numbers after the last of the 1 frames"),
     ],
 )
 def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, monkeypatch, place, word, sentence):

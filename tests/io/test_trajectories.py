@@ -52,9 +52,9 @@ def test_columns_in_any_order_with_covariances(tmp_path):
         (TUM + "11 1 2 nan 0 0 0 1\n", "line 4 must hold numbers, got 'nan'; write seconds and metres"),
         (TUM + "10.5 1 2 3 0 0 0 1\n", "line 4 must be later than the pose before; sort by time"),
         (TUM + "11 1 2 3 1 0 0 1\n", "line 4: the quaternion qx qy qz qw must have length 1, got 1.414; write"),
-        (TUM + "11 1e9 2 3 0 0 0 1\n", "line 4 is over 1e+06 m away; write metres"),
+        (TUM + "11 1e9 2 3 0 0 0 1\n", "line 4 is more than 1e+06 m away; write metres"),
         ("time_s x y z qx qy qz\n", "line 1: column qw is missing; name the columns time_s"),
-        ("time_s x y z qx qy qz qw speed\n", "line 1: column 'speed' is not known, or twice there; name"),
+        ("time_s x y z qx qy qz qw speed\n", "line 1: column 'speed' is unknown or occurs twice; name"),
         ("time_s x y z qx qy qz qw x_x\n", "line 1: the covariance lacks rx_rx; give rx_rx ry_ry"),
         (
             "time_s x y z qx qy qz qw rx_rx ry_ry rz_rz x_x y_y z_z\n" + "0 0 0 0 0 0 0 1 1 1 1 1 1 -1\n" * 1
@@ -110,9 +110,15 @@ def test_an_odometry_that_starts_at_zero_is_put_into_the_world(tmp_path, rig):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"trajectory": "../robot.tum"}, "trajectory ../robot.tum must lie beside the rig file or below; move it"),
+        (
+            {"trajectory": "../robot.tum"},
+            "trajectory ../robot.tum must be in the folder of the rig file or below; move it",
+        ),
         ({"trajectory": "nowhere.tum"}, "nowhere.tum: there is no such file"),
-        ({"wTc": np.eye(4).tolist()}, "give exactly one of wTc and cTw, or trajectory, with bTc"),
+        (
+            {"wTc": np.eye(4).tolist()},
+            "give exactly one of wTc and cTw, or, of a moving camera, trajectory and bTc",
+        ),
         ({"bTc": [[1, 2], [3, 4]]}, "bTc must hold 16 numbers, got 4; write the 4x4 carrier-from-camera"),
     ],
 )
@@ -135,7 +141,10 @@ def test_a_trajectory_of_a_camera_of_any_calibration(tmp_path, rig):
     for given, says in (
         (["cam9=a.tum"], "--trajectory cam9=a.tum: must name a camera and a file; write CAMERA=FILE with one of"),
         (["cam1"], "must name a camera and a file"),
-        (["cam0=a.tum", "cam1=a.tum"], "a camera has one trajectory of its own; say in a rig file"),
+        (
+            ["cam0=a.tum", "cam1=a.tum"],
+            "a camera can have one trajectory, and it belongs to this camera only; give the pose",
+        ),
     ):
         with pytest.raises(InputError) as refused:
             with_trajectories(still, given)

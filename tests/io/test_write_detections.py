@@ -202,7 +202,7 @@ def test_misuse_and_leftovers_are_refused(rig: Rig, recording: Recording, tmp_pa
     with pytest.raises(ValueError, match="z up"):
         write_association(recording, Rig(rig.cameras, up="y"), tmp_path)
     fisheye = replace(rig.cameras[0], distortion=np.zeros(4), lens="fisheye")
-    with pytest.raises(ValueError, match="five coefficients of distortion, camera left another lens"):
+    with pytest.raises(ValueError, match="five distortion coefficients, but camera left has another lens"):
         write_association(recording, replace(rig, cameras=(fisheye, *rig.cameras[1:])), tmp_path)
     with pytest.raises(ValueError, match="no frame"):
         write_association(Recording(BODY_25, []), rig, tmp_path)
@@ -210,5 +210,5 @@ def test_misuse_and_leftovers_are_refused(rig: Rig, recording: Recording, tmp_pa
     with pytest.raises(ValueError, match="only BODY_25"):
         write_openpose(Recording(other, recording.frames), rig, tmp_path)
     write_openpose(recording, rig, tmp_path)
-    with pytest.raises(InputError, match="would mix"):
+    with pytest.raises(InputError, match="frames of another recording"):
         write_openpose(recording, rig, tmp_path)

@@ -223,5 +223,9 @@ def test_a_preset_stands_for_itself(tmp_path):
     assert prepare(request, tmp_path).settings() == PAPER != PipelineConfig()
     assert prepare(replace(request, preset=None), tmp_path).settings() == PipelineConfig()
     both = prepare(replace(request, config=tmp_path / "mine.toml"), tmp_path)
-    with pytest.raises(InputError, match=r"--preset paper: not beside --config .*mine.toml; `shapepose-fg config"):
+    with pytest.raises(
+        InputError,
+        match=r"--preset paper and --config .*mine.toml: settings come from one of"
+        r" them; `shapepose-fg config",
+    ):
         both.settings()

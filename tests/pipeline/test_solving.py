@@ -137,7 +137,7 @@ def test_tracks_solves_anew_who_changed(scene, people, tmp_path, capsys):
     whole = (folder / "people.npz").read_bytes()
     first = int(people.person[0])
     assert run("tracks", folder, "split", first, 5, "--new", 40) == 0
-    assert f"done: split {first} 5 --new 40; solved anew: {first} 40" in capsys.readouterr().out
+    assert f"done: split {first} 5 --new 40; solved again: {first} 40" in capsys.readouterr().out
     split = Reconstruction.load(folder)
     others = ~np.isin(people.person, [first])
     np.testing.assert_array_equal(
@@ -157,7 +157,7 @@ def test_without_time_rows_do_not_depend_on_who_they_are(scene, people, tmp_path
     folder = saved(replace(people, run=run_json), scene, tmp_path / "results")
     first = int(people.person[0])
     assert run("tracks", folder, "split", first, 5) == 0
-    assert "joints and bodies stay as they were solved" in capsys.readouterr().out
+    assert "joints and bodies were not solved again" in capsys.readouterr().out
     relabelled = Reconstruction.load(folder).joints
     np.testing.assert_array_equal(np.sort(relabelled, axis=0), np.sort(people.joints, axis=0))
 
@@ -165,7 +165,7 @@ def test_without_time_rows_do_not_depend_on_who_they_are(scene, people, tmp_path
 def test_a_result_without_its_cameras_changes_identities_only(people, tmp_path, capsys):
     replace(people, rig=None).save(tmp_path / "results")
     assert run("tracks", tmp_path / "results", "split", int(people.person[0]), 5) == 0
-    assert "joints and bodies stay as they were solved" in capsys.readouterr().out
+    assert "joints and bodies were not solved again" in capsys.readouterr().out
 
 
 def test_the_setup_of_a_result(scene, people, tmp_path):

@@ -245,11 +245,11 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     first.send_signal(signal.SIGINT)
     _, said = first.communicate(timeout=60)
     assert first.returncode == 130
-    assert "frames are kept in" in said and "go on with --resume" in said and said.count("\n") == 1
+    assert "frames are stored in" in said and "continue with --resume" in said and said.count("\n") == 1
     left = {file.name: file.read_bytes() for file in (out / "parts").iterdir()}
     assert finished(command, "--output", str(out)) == 2
     said = capsys.readouterr().err
-    assert "a run was stopped here after " in said and "or begin anew with --restart" in said
+    assert "there is an interrupted run after " in said and "or start again with --restart" in said
     assert finished(command, "--output", str(out), "--resume", "--fps", "25") == 2
     said = capsys.readouterr().err
     assert "had another time" in said and said.count("\n") == 1
@@ -276,7 +276,7 @@ def test_a_run_does_not_go_on_with_other_cameras(command, tmp_path, capsys, monk
         assert finished(command, "--output", str(tmp_path), *before) == 143
     monkeypatch.setattr("shapepose_fg.pipeline.runs.manifest.Parts", lambda kept: _Done())
     capsys.readouterr()
-    for more, said in (((), "go on with --resume"), (("--resume",), "had another set of cameras")):
+    for more, said in (((), "continue with --resume"), (("--resume",), "had another set of cameras")):
         assert finished(command, "--output", str(tmp_path), *after, *more) == 2
         assert said in capsys.readouterr().err
 
@@ -314,13 +314,17 @@ def begun(tmp_path) -> Iterator[dict]:
 
 def test_a_run_goes_on_with_the_same_only(tmp_path, begun, monkeypatch):
     monkeypatch.setattr("shapepose_fg.pipeline.runs.manifest.Parts", lambda kept: _Done())
-    with pytest.raises(InputError, match=r"was stopped here after 8 frames; go on with --resume, or begin anew"):
+    with pytest.raises(
+        InputError,
+        match=r"there is an interrupted run after 8 frames; continue with --resume,"
+        r" or start again",
+    ):
         open_run(tmp_path, begun)
     open_run(tmp_path, begun, resume=True)
     for other, words in (
         ({"inputs": {"a.json": "2"}}, r"another inputs\.a\.json \(1 then, 2 now\)"),
         ({"configuration": {"windows": {"overlap_s": 0.5}}}, r"windows\.overlap_s \(0\.4 then, 0\.5 now\)"),
-        ({"program": "y" * 64}, r"another version of this program; start it as it was"),
+        ({"program": "y" * 64}, r"another version of this program; start it with the same options"),
     ):
         with pytest.raises(InputError, match=words):
             open_run(tmp_path, begun | other, resume=True)
@@ -360,14 +364,18 @@ def test_a_run_goes_on_with_the_people_that_it_began_with(tmp_path):
     np.testing.assert_array_equal(again.betas, first.betas)
     assert checksum_at_start(kept) == hashlib.sha256(stored(first)).hexdigest()
     file.write_bytes(stored(more))
-    with pytest.raises(InputError, match=r"shapes\.npz: this has changed since the run was stopped; begin anew"):
+    with pytest.raises(
+        InputError,
+        match=r"shapes\.npz: this file has changed since the run was interrupted; start"
+        r" again",
+    ):
         people_at_start(kept, file, must_not_load)
     # Stopped right behind its own writing: that is no change by somebody else, and who was known stays known.
     write_people(kept, file, more)
     assert file.read_bytes() == stored(more)
     assert people_at_start(kept, file, must_not_load).names.tolist() == ["0"]
     file.unlink()
-    with pytest.raises(InputError, match="this has changed"):
+    with pytest.raises(InputError, match="this file has changed"):
         people_at_start(kept, file, must_not_load)
 
 
@@ -394,7 +402,7 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "wheel.stl").write_text("mine")
     for options in ({}, {"resume": True}, {"restart": True}):
-        with pytest.raises(InputError, match="not of a run of this program"):
+        with pytest.raises(InputError, match="this is not a run of this program"):
             open_run(tmp_path, {}, **options)
     assert (tmp_path / "parts" / "wheel.stl").read_text() == "mine"
 
@@ -407,7 +415,7 @@ def test_a_damaged_part_is_named(scene, recording, tmp_path):
     assert kept.names("followed") == ["followed-000000"]
     part = tmp_path / "parts" / "part-000000.safetensors"
     part.write_bytes(part.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"part-000000\.safetensors: a part of an unfinished run cannot be read"):
+    with pytest.raises(InputError, match=r"part-000000\.safetensors: a part of an interrupted run cannot be read"):
         reconstruct_parts(InFolder(tmp_path / "parts"), Task(recording, scene.rig, CONFIG, cuts=CUTS))
 
 
@@ -434,7 +442,7 @@ def test_room_is_asked_for_before_the_work(dance, tmp_path, monkeypatch):
     # As parts and as results. Views miss joints, so that fewer people are expected than there are.
     assert 0.5 < needed / (2 * held) < 1.1
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(needed - 1))
-    with pytest.raises(InputError, match=r"about 2\.\d MB are needed here, and 2\.\d MB are free; make room"):
+    with pytest.raises(InputError, match=r"about 2\.\d MB of disk space are needed, and 2\.\d MB are free; free"):
         check_room(tmp_path, needed)
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(needed))
     check_room(tmp_path, needed)

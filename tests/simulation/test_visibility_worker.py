@@ -135,7 +135,7 @@ def test_ctrl_c_and_the_end_of_the_parent_end_everybody(how: signal.Signals, tmp
         run.kill()
     _, complaint = run.communicate(timeout=120)  # a guard against hanging, not a measure
     if how == signal.SIGINT:  # a killed parent's semaphores are cleaned up by Python, which says so
-        assert run.returncode == 130 and complaint == "stopped: nothing is left half written\n"
+        assert run.returncode == 130 and complaint == "stopped: no incomplete files are left\n"
     assert not (tmp_path / "detection").exists()
     patience = time.monotonic() + 60
     while any(alive(child) for child in children) and time.monotonic() < patience:

@@ -1,4 +1,6 @@
-"""`shapepose-fg batch`: all recordings of a table, on this machine's processes or those of a Dask cluster."""
+"""`shapepose-fg batch`: reconstructs all recordings of a table, on processes of this machine or of
+a Dask cluster.
+"""
 
 import time
 from contextlib import ExitStack
@@ -26,26 +28,30 @@ BATCH = "batch.json"
 @grouped
 def batch(
     running: RunOptions,
-    table: Path = argument("RECORDINGS.TOML", "The recordings: see docs/batch.md."),
-    output: Path = option(RESULT, "Folder for a folder of results of each recording, and batch.json.", REQUIRED),
-    at_once: int | None = option(RUN, "Recordings under way at a time; by default as many as keep all busy."),
+    table: Path = argument("RECORDINGS.TOML", "Table of the recordings (docs/batch.md)."),
+    output: Path = option(RESULT, "Folder for batch.json and a folder of results per recording.", REQUIRED),
+    at_once: int | None = option(
+        RUN, "Number of recordings processed at once; by default as many as keep all processes busy."
+    ),
 ) -> None:
-    """Reconstruct all recordings of a table: each as `reconstruct` would, to the byte, in one queue of work.
+    """Reconstruct all recordings of a table; each result has the same bytes as that of
+    `reconstruct`.
 
-    A recording that fails twice is left, and the others go on. Exit code 1 where one failed, 0 where none did.
+    After two failures, a recording is skipped, and the others continue. Exit code 1 if a recording
+    failed, otherwise 0.
     """
     from shapepose_fg.cli.batch.table import read_table
 
     running.check()
     if at_once is not None and not 1 <= at_once <= 64:
-        raise InputError(f"--at-once {at_once}: must be 1 to 64; leave it out for as many as keep all busy")
+        raise InputError(f"--at-once {at_once}: must be 1 to 64; leave it out to keep all processes busy")
     entries = read_table(table)
     with only_run_in(output, [BATCH]):
         _run(table, entries, output, running, at_once)
 
 
 def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
-    """The batch, in a folder that no other process writes to."""
+    """Run the batch in a folder that is locked for other processes."""
     from shapepose_fg.cli.batch.runner import BatchRunner, look_at_all
     from shapepose_fg.cli.batch.status import Bars, BatchStatus
     from shapepose_fg.pipeline.cluster import local_cluster, look_at
@@ -63,11 +69,11 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
                 scheduler = opened.enter_context(local_cluster(running.workers or cores(), dashboard=True))
             else:
                 scheduler = look_at(str(running.cluster))
-            # One leader keeps five processes busy where it follows people itself, and ten where it does not; and
-            # while one recording is read or written another fills the queue.
+            # A coordinator keeps five workers busy if it does the tracking itself, and ten
+            # otherwise. While one recording is being read or written, another one fills the queue.
             most = max(2, min(1 + scheduler.processes // 6, cores()))
             count = min(at_once or most, len(todo))
-            done = "" if len(todo) == len(entries) else f", {len(entries) - len(todo)} of them done before"
+            done = "" if len(todo) == len(entries) else f", {len(entries) - len(todo)} of them are already done"
             _say(scheduler, f"{len(entries)} recordings{done}", count, here=here)
             batch_status.write()
             runner = BatchRunner(entries, sizes, output, scheduler.address, count)
@@ -76,7 +82,7 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
                     runner.run(batch_status, Bars(shown, batch_status))
             except Stopped as stop:
                 done = len(batch_status.names("done"))
-                where = f"{done} of {len(entries)} recordings are done in {output}; go on with --resume"
+                where = f"{done} of {len(entries)} recordings are done in {output}; continue with --resume"
                 raise Stopped(stop.number, where) from None
     show(batch_status.summary(time.monotonic() - begin))
     print(f"written  {output / BATCH}")
@@ -89,15 +95,19 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
 def status_of(
     entries: "list[Entry]", output: Path, *, resume: bool, restart: bool
 ) -> "dict[str, RecordingStatus]":
-    """The status of every recording; with `restart`, or if its options have changed, it begins anew."""
+    """The status of every recording; with `restart`, or if its options have changed, it is
+    restarted from the beginning.
+    """
     from shapepose_fg.cli.batch.status import RecordingStatus, read_status
     from shapepose_fg.cli.batch.table import asked
 
     file = output / BATCH
     if file.exists() and not (resume or restart):
-        raise InputError(f"{file}: a batch was begun here; go on with --resume, or begin anew with --restart")
+        raise InputError(
+            f"{file}: this folder has a batch already; continue with --resume, or start again with --restart"
+        )
     if resume and not file.exists():
-        note(f"{output}: no batch was begun here; this one is")
+        note(f"{output}: there is no batch to resume; a new one is started")
     before = read_status(file) if resume and file.exists() else {}
     found: dict[str, RecordingStatus] = {}
     for entry in entries:
@@ -106,18 +116,18 @@ def status_of(
         there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN_FILE))
         changed = old.asked != wanted
         if changed:
-            note(f"{entry.name}: something else is wanted of it than before; it begins anew")
+            note(f"{entry.name}: its options in the table have changed; it is reconstructed again")
         is_done = not changed and old.status == "done" and there
         found[entry.name] = old if is_done else RecordingStatus(wanted, anew=changed or old.anew)
     return found
 
 
 def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None:
-    """Print what will be done, and where it can be followed."""
+    """Print what will be done, and where its progress is shown."""
     place = "here" if here else f"at {scheduler.address}"
     print(f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True)
     if scheduler.processes == 0:
-        note(f"no process has come to {scheduler.address} yet; the work waits for one (`dask worker`)")
+        note(f"no worker process has connected to {scheduler.address} yet; start one with `dask worker`")
     if scheduler.dashboard is not None:
         print(f"what every process does: {scheduler.dashboard}", flush=True)
     elif here:

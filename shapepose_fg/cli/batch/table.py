@@ -1,4 +1,4 @@
-"""recordings.toml: the recordings of an archive, and the options of each."""
+"""recordings.toml: reads the recordings of an archive, and the options of each."""
 
 import re
 from dataclasses import dataclass, fields, replace
@@ -26,18 +26,18 @@ class Entry:
     """One recording of the table."""
 
     name: str
-    """Name of the recording, and of the folder of its results."""
+    """Name of the recording, and of its results folder."""
     request: Request
     """Options of the recording."""
     after: str | None = None
-    """The recording whose people's shapes it starts with, and which it therefore waits for."""
+    """Name of an earlier recording with the same file of shapes, for which this one has to wait."""
 
 
 def read_table(path: Path) -> list[Entry]:
     """Read the recordings of a table, in its order.
 
-    Paths are relative to the table's folder and do not lead out of it, unless they are absolute. InputError that
-    names the file, the recording and the cure.
+    Paths are relative to the table's folder. They must not lead out of it, unless they are
+    absolute. InputError that names the file, the recording and the cure.
     """
     tables = read_toml(path)
     for key in tables.keys() - {"defaults", "recordings"}:
@@ -46,7 +46,7 @@ def read_table(path: Path) -> list[Entry]:
     recordings = _table(tables.get("recordings", {}), path, "recordings")
     if not 1 <= len(recordings) <= _MOST:
         raise InputError(
-            f"{path}: {len(recordings)} recordings; give 1 to {_MOST} of them, each as [recordings.NAME]"
+            f"{path}: the table has {len(recordings)} recordings; give 1 to {_MOST}, each as [recordings.NAME]"
         )
     _check_names(list(recordings), path)
     config_from(defaults, Request, path, place="defaults", cure=_CURE)
@@ -54,7 +54,7 @@ def read_table(path: Path) -> list[Entry]:
     for name, own in recordings.items():
         place = f"recordings.{name}"
         own = _table(own, path, place)
-        # When frames were taken is said in one way only.
+        # The times of frames are given by one option only.
         less = {"fps", "timestamps"} if own.keys() & {"fps", "timestamps"} else set()
         values = {key: value for key, value in defaults.items() if key not in less} | own
         request = config_from(values, Request, path, place=place, cure=_CURE)
@@ -69,22 +69,25 @@ def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
 
 
 def _check_names(names: list[str], path: Path) -> None:
-    """Refuse names that no folder can have, or that are equal on some systems."""
+    """InputError for names that are not valid for a folder, or that are equal on some file systems."""
     seen = {"batch.json": "batch.json"}
     for name in names:
         if _NAME.fullmatch(name) is None:
             raise InputError(
-                f"{path}: recordings.{name[:100]}: a name has up to 100 letters, digits, dots, - and _, and begins"
-                " with a letter or digit, because a folder is called so; rename it"
+                f"{path}: recordings.{name[:100]}: the name is also that of a folder, so it must have up to 100"
+                " letters, digits, dots, - and _, and begin with a letter or digit; rename it"
             )
         if name.lower() in seen:
             other = seen[name.lower()]
-            raise InputError(f"{path}: recordings.{name}: {other} has this name on some systems, too; rename it")
+            raise InputError(
+                f"{path}: recordings.{name}: some file systems do not distinguish this name from"
+                f" {other}; rename it"
+            )
         seen[name.lower()] = name
 
 
 def _located(request: Request, path: Path, place: str) -> Request:
-    """Return the request with its paths relative to the table's folder resolved."""
+    """Return the request with relative paths resolved against the table's folder."""
     given = {name: getattr(request, name) for name in _PATHS}
     if request.skeleton is not None and not layouts_called(request.skeleton):
         given["skeleton"] = Path(request.skeleton)
@@ -93,19 +96,19 @@ def _located(request: Request, path: Path, place: str) -> Request:
 
 
 def _inside(given: Path, path: Path, place: str) -> Path:
-    """A path relative to the table's folder, inside it; or an absolute one."""
+    """Resolve a path: relative to the table's folder and inside it, or absolute."""
     if "\0" in str(given):
-        raise InputError(f"{path}: {place}: no file has the name {str(given)[:80]!r}; correct it")
+        raise InputError(f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it")
     if not (is_inside(path.parent, given) or given.is_absolute()):
         raise InputError(
-            f"{path}: {place}: {given} leads out of the table's folder; if that is meant, make it absolute"
+            f"{path}: {place}: {given} is outside the table's folder; if this is intended, give an absolute path"
         )
-    return path.parent / given  # itself, where it is absolute
+    return path.parent / given  # an absolute path stays unchanged
 
 
 def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
-    """Return the entries such that those that share a file of shapes wait for each other, in the order of the
-    table.
+    """Set `after`, so that entries with the same file of shapes wait for each other, in the order
+    of the table.
     """
     last: dict[Path, str] = {}
     projects: dict[tuple[Path, str | None], str] = {}
@@ -116,8 +119,8 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
             other = projects.setdefault((project.resolve(), each.request.frames), each.name)
             if other != each.name:
                 raise InputError(
-                    f"{path}: recordings.{each.name}: {project} is that of {other}, too, and TRC of one would be"
-                    " written over those of the other; leave one out"
+                    f"{path}: recordings.{each.name}: {project} is also the project of {other}, and their TRC"
+                    " files would overwrite each other; remove one of them"
                 )
         if shapes is not None:
             each = replace(each, after=last.get(shapes.resolve()))
@@ -127,7 +130,7 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
 
 
 def asked(request: Request) -> dict[str, Any]:
-    """The options as plain values: equal for equal requests."""
+    """The options as plain values, which are equal for equal requests."""
     default, found = Request(), {}
     for name in (field.name for field in fields(request)):
         value = getattr(request, name)

@@ -15,10 +15,10 @@ from shapepose_fg.core.errors import InputError
 def reconstruct(
     request: Request,
     running: RunOptions,
-    cuts: str | None = option(TIME, "First frames after a cut: nothing carries over to them.", metavar="A,B"),
-    output: Path | None = option(RESULT, "Folder for people.npz and run.json; made if it is not there."),
-    overwrite: bool = option(RESULT, "Take the place of a finished result in --output.", False, "--overwrite"),
-    strict: bool = option(RESULT, "Exit code 1 where something looks wrong, for pipelines.", False, "--strict"),
+    cuts: str | None = option(TIME, "First frames after cuts; no track or motion crosses a cut.", metavar="A,B"),
+    output: Path | None = option(RESULT, "Folder for the results; created if missing."),
+    overwrite: bool = option(RESULT, "Replace a finished result in --output.", False, "--overwrite"),
+    strict: bool = option(RESULT, "Exit with code 1 if there are warnings.", False, "--strict"),
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     running.check()

@@ -33,33 +33,41 @@ if TYPE_CHECKING:
     from shapepose_fg.pipeline.config import PipelineConfig
 
 OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, CLOCKS, "report.html")
-"""The files in the folder of results."""
+"""The files of a results folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ProjectOptions, TimeOptions):
-    """One recording, and the options of `shapepose-fg reconstruct` for it, by their names."""
+    """The options of `shapepose-fg reconstruct` for one recording, by their names."""
 
-    project: Path | None = option(INPUT, "A Pose2Sim project: its cameras, detections, settings; adds TRC, C3D.")
-    preset: Preset | None = preset_option(None)
-    config: Path | None = option(RESULT, "Settings as TOML, all that `shapepose-fg config` prints or some.")
-    frames: str | None = frames_option()
-    body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in.")
-    trajectory: list[str] | None = option(
-        INPUT, "Poses of a camera that moves: TUM or CSV; may be given several times.", metavar="CAMERA=FILE"
+    project: Path | None = option(
+        INPUT, "Pose2Sim project: use its cameras, detections and settings; also write TRC and C3D."
     )
-    synchronise: bool = option(TIME, "Cameras were started by hand: find when, from the people.", False)
-    readout: float | None = option(TIME, "Seconds that rolling shutters take from first to last row.")
+    preset: Preset | None = preset_option(None)
+    config: Path | None = option(
+        RESULT, "File of settings, TOML: all or some of those that `shapepose-fg config` prints."
+    )
+    frames: str | None = frames_option()
+    body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in one.")
+    trajectory: list[str] | None = option(
+        INPUT, "Poses of a moving camera, TUM or CSV; may be repeated.", metavar="CAMERA=FILE"
+    )
+    synchronise: bool = option(TIME, "Estimate the start times of unsynchronised cameras from the people.", False)
+    readout: float | None = option(TIME, "Readout time of rolling shutters, first to last row, seconds.")
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
-    temporal: bool | None = option(TIME, "People over time, or frame by frame.", None, "--temporal/--no-temporal")
-    shapes: Path | None = option(RESULT, "File (.npz) of people's shapes: read where it is, kept up to date.")
-    chunk_frames: int | None = option(RUN, "Follow people side by side, too, in chunks of about so many frames.")
-    report: bool = option(RESULT, "Leave report.html, a page to look at.", True, "--report/--no-report")
-    check: bool = option(RESULT, "Whether cameras and detections fit.", True, "--check/--no-check")
+    temporal: bool | None = option(
+        TIME, "Solve people over time, or frame by frame.", None, "--temporal/--no-temporal"
+    )
+    shapes: Path | None = option(RESULT, "File (.npz) of people's body shapes; read if it exists, and updated.")
+    chunk_frames: int | None = option(RUN, "Track people in parallel, too, in chunks of about this many frames.")
+    report: bool = option(RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report")
+    check: bool = option(RESULT, "Check whether cameras and detections fit.", True, "--check/--no-check")
 
     def rig(self) -> "Rig":
-        """The cameras, with `readout` for rolling shutters where the calibration has none."""
+        """The cameras, with the option `readout` for rolling shutters, if the calibration does not
+        define it.
+        """
         from shapepose_fg.core.camera import LONGEST_READOUT_S
 
         found = super().rig()
@@ -83,7 +91,7 @@ class Prepared:
     request: Request
     """The request; cameras, detections and times are those of the project if there is one."""
     project: "Pose2SimProject | None"
-    """The project that it belongs to; None where there is none."""
+    """The project to which it belongs; None if there is none."""
     calibration: Path
     """Path of the calibration."""
     detections: Path
@@ -93,41 +101,45 @@ class Prepared:
 
     @property
     def skeleton(self) -> "str | DeclaredJoints | None":
-        """The detector's joints as the user states, else as the project does."""
+        """The detector's joints as given by the user, otherwise by the project."""
         declared = None if self.project is None else self.project.joints
         return self.request.skeleton or declared
 
     def settings(self) -> "PipelineConfig":
-        """The settings; InputError where they contradict other options."""
+        """The settings; InputError if they contradict other options."""
         from shapepose_fg.io.config import read_config
         from shapepose_fg.pipeline.config import PipelineConfig
 
         asked = self.request
         if asked.config is not None and asked.preset is not None:
-            cure = f"`shapepose-fg config --preset {asked.preset}` writes settings to begin with"
-            raise InputError(f"--preset {asked.preset}: not beside --config {asked.config}; {cure}")
+            cure = f"`shapepose-fg config --preset {asked.preset}` writes its settings into a file to edit"
+            raise InputError(
+                f"--preset {asked.preset} and --config {asked.config}: settings come from one of them; {cure}"
+            )
         preset = Preset.ACCURATE if asked.preset is None else asked.preset
         found = preset.settings() if asked.config is None else read_config(asked.config, PipelineConfig)
         found = found if asked.temporal is None else replace(found, temporal=asked.temporal)
         if asked.shapes is not None and not found.temporal:
-            raise InputError("--shapes: a person's shape is known over time only; leave it out")
+            raise InputError("--shapes: shapes need people over time; leave out --no-temporal, or --shapes")
         if asked.chunk_frames is not None and not (found.temporal and asked.chunk_frames >= found.batch_frames):
             raise InputError(
                 f"--chunk-frames {asked.chunk_frames}: must be {found.batch_frames} (batch_frames) or more, and"
-                " needs people over time"
+                " people over time are needed"
             )
         if self.project is not None and not found.temporal:
             raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
         return found
 
     def span(self, count: int, first: int = 0) -> range:
-        """The wanted frames of a recording of `count`, in which nobody is seen before the `first`."""
+        """The wanted frames of a recording of `count` frames, in which no one is detected before
+        frame `first`.
+        """
         if self.project is not None and self.request.frames is None:
             return self.project.span(count)
         return frame_range(self.request.frames, count, first)
 
     def cuts(self, count: int) -> tuple[int, ...]:
-        """The cuts; InputError where a recording of `count` frames cannot have them."""
+        """The cuts; InputError if they are invalid for a recording of `count` frames."""
         from shapepose_fg.core.frame_times import check_cuts
 
         try:
@@ -142,8 +154,8 @@ class Prepared:
 def prepare(request: Request, output: Path | None, tell: Callable[..., None] = note) -> Prepared:
     """Find a request's paths, and check its options, before any large file is read.
 
-    `tell` receives notes on how a project's files were interpreted. InputError where something is missing or
-    wrong.
+    `tell` receives notes on how a project's files were interpreted. InputError if something is
+    missing or wrong.
     """
     from shapepose_fg.io.recording import times_beside
 
@@ -157,10 +169,10 @@ def prepare(request: Request, output: Path | None, tell: Callable[..., None] = n
     calibration, detections, output = (cast(Path, place) for place in places.values())
     check_fps(request.fps)
     if request.synchronise and request.timestamps is not None:
-        raise InputError("--synchronise and --timestamps: when frames were taken is sought, or known; give one")
+        raise InputError("--synchronise and --timestamps: times are either estimated or given; give one of them")
     request = replace(request, timestamps=times_beside(detections, request.fps, request.timestamps))
     if request.synchronise and request.fps is None and request.timestamps is None:
-        raise InputError("--fps: missing; say how many frames a second the cameras took")
+        raise InputError("--fps: missing; give the frame rate of the cameras")
     if request.frames is not None:
         ends(request.frames)
     return Prepared(request, project, calibration, detections, output)

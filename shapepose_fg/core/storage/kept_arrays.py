@@ -1,4 +1,6 @@
-"""Named sets of arrays that are kept during a run: in memory, or as files that survive the process."""
+"""Named sets of arrays that are stored during a run: in memory, or in files that survive the
+process.
+"""
 
 import hashlib
 import json
@@ -20,36 +22,37 @@ from shapepose_fg.core.storage.schema import Column, checked_columns
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
-ANEW = "begin that run anew with --restart"
-"""Cure for a damaged set."""
+ANEW = "start that run again with --restart"
+"""Cure in error messages about a damaged set."""
 _SAID = {"about", "arrays", "sha256"}
-"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all this."""
+"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all
+metadata."""
 _ALIGNED = 64
 """Alignment of arrays, bytes."""
 
 
 class KeptArrays:
-    """Sets of arrays, each under a name, with plain values about it; kept in memory.
+    """Sets of arrays by name, each with plain values about it; stored in memory.
 
-    The memory of a set that is dropped is returned to the system at once.
+    When a set is dropped, its memory is returned to the system immediately.
     """
 
     lasting = False
-    """Whether the arrays outlive this process."""
+    """Whether the arrays survive this process."""
 
     def __init__(self) -> None:
         self._sets: dict[str, tuple[Arrays, Any]] = {}
 
     def names(self, prefix: str) -> list[str]:
-        """Names of the sets that begin with `prefix`, in order."""
+        """Names of the sets that begin with `prefix`, sorted."""
         return sorted(name for name in self._sets if name.startswith(prefix))
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
-        """Keep a set, whole or not at all; one of the same name is replaced."""
+        """Store a set atomically; replaces one of the same name."""
         self._sets[name] = (_mapped(arrays), about)
 
     def drop(self, name: str) -> None:
-        """Remove a set, if there is one."""
+        """Remove a set, if it exists."""
         self._sets.pop(name, None)
 
     def about(self, name: str) -> Any:
@@ -57,19 +60,19 @@ class KeptArrays:
         return self._sets[name][1]
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
-        """Rows of an array of a set."""
+        """Rows of one array of a set."""
         return self._sets[name][0][key][rows]
 
     def keys(self, name: str) -> list[str]:
-        """Which arrays a set has."""
+        """Names of the arrays of a set."""
         return list(self._sets[name][0])
 
     def place(self, name: str) -> str:
-        """Description of the place of a set."""
+        """Description of where a set is stored, for messages."""
         return name
 
     def columns(self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
-        """Arrays of a set; InputError where one is not as its column says, or not of these `sizes`."""
+        """Arrays of a set; InputError if one does not match its column, or these `sizes`."""
         with naming(self.place(name), ANEW):
             return checked_columns(columns, {key: self.array(name, key) for key in columns}, sizes)
 
@@ -78,8 +81,8 @@ InMemory = KeptArrays
 
 
 def _mapped(arrays: Arrays) -> Arrays:
-    """Copies in a memory mapping of their own, which is released at once; the allocator's memory would stay in
-    use.
+    """Copies of arrays in a separate memory mapping, which is released immediately when they are
+    deleted; memory of the allocator would remain in use.
     """
     starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values())]).tolist()
     if starts[-1] == 0:
@@ -93,18 +96,18 @@ def _mapped(arrays: Arrays) -> Arrays:
 
 
 class InFolder(KeptArrays):
-    """Arrays kept in a folder, one safetensors file per set: the format holds no code and gives single arrays and
-    rows.
+    """Arrays stored in a folder, one safetensors file per set: the format contains no code and
+    allows reading single arrays and rows.
 
-    A file is on the disk when `keep` returns. It has a digest of each array, and one of these digests, its name
-    and its run: what is read is checked once, and again when the file has changed. InputError names a damaged
-    file.
+    When `keep` returns, the file is on disk. It has a digest of each array, and one of all these
+    digests, its name and its run. An array is verified when it is first read, and again if the file
+    has changed. InputError names a damaged file.
     """
 
     lasting = True
 
     def __init__(self, folder: Path, run: str = "") -> None:
-        """`run` is the run that they belong to: files of another one are refused."""
+        """`run` identifies the run of the arrays: files of another run are refused."""
         self.folder, self.run = folder, run
         self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
@@ -140,14 +143,14 @@ class InFolder(KeptArrays):
         return self.folder / f"{name}{_SUFFIX}"
 
     def _seal(self, name: str, said: Mapping[str, str]) -> str:
-        """The digest of all metadata of a file; its arrays have their own digests in it."""
+        """Digest of all metadata of a file, which include the digests of its arrays."""
         return hashlib.sha256(json.dumps([self.run, name, said["about"], said["arrays"]]).encode()).hexdigest()
 
     @contextmanager
     def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
-        """Open a file of arrays, whose metadata, and the array `key`, are verified by their digests.
+        """Open a file of arrays; its metadata and the array `key` are verified by their digests.
 
-        Damage, found now or when it is read, is an InputError.
+        InputError if it is damaged, now or when it is read.
         """
         file = self._file(name)
         try:
@@ -164,18 +167,18 @@ class InFolder(KeptArrays):
                 if right and key is not None and self._checked.get((name, key)) != stamp:
                     right = json.loads(said["arrays"])[key] == _digest(key, content.get_tensor(key))
                 if not right:
-                    raise ValueError("it is not as it was written, or of another run")
+                    raise ValueError("its content has changed, or it belongs to another run")
                 self._checked[name, None] = self._checked[name, key] = stamp
                 yield content
         except InputError:
             raise
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
             reason = str(error) or type(error).__name__
-            raise InputError(f"{file}: a part of an unfinished run cannot be read ({reason}); {ANEW}") from None
+            raise InputError(f"{file}: a part of an interrupted run cannot be read ({reason}); {ANEW}") from None
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:
-    """Digest of an array: of its name, type, shape and bytes."""
+    """Digest of an array: its name, type, shape and bytes."""
     digest = hashlib.sha256(json.dumps([key, array.dtype.str, array.shape]).encode())
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()

@@ -1,4 +1,6 @@
-"""COLMAP's text model: cameras.txt and images.txt. Camera from world, without a unit and an up axis."""
+"""COLMAP's text model: cameras.txt and images.txt. Poses are camera from world; unit and up axis
+are not defined.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +18,8 @@ from shapepose_fg.io.validation import is_number
 FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")
 HALF_PIXEL = 0.5
-"""COLMAP's (0, 0) is the corner of the first pixel; ours is its centre."""
+"""Offset of pixel coordinates: COLMAP's (0, 0) is the corner of the first pixel, ours is its
+centre."""
 MODELS: dict[str, tuple[str, Lens]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "perspective"),
     "PINHOLE": ("fx fy cx cy", "perspective"),
@@ -28,31 +31,36 @@ MODELS: dict[str, tuple[str, Lens]] = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
 }
-"""COLMAP's camera models that OpenCV has, and their parameters: distortion coefficients in OpenCV's order."""
+"""COLMAP's camera models that OpenCV supports, with their parameters (distortion coefficients in
+OpenCV's order) and lens model."""
 _CURES = {
-    "unit": "pass --unit (a model is to no scale until colmap model_aligner or the cameras' known distances"
-    " gave it one)",
+    "unit": "pass --unit (a model has no scale until colmap model_aligner or known distances between cameras"
+    " determine one)",
     "up": "pass --up with the axis of the model that points up",
 }
 
 
 def _read(content: Content) -> WrittenRig | None:
-    """A camera per image, in the order of images.txt; named after the image, or its folder."""
+    """A camera per image, in the order of images.txt; named after the image or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
     names = [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
     if content.syntax not in ("folder", "text") or not set(names) & {*FILES, *_BINARY}:
         return None
     for name, binary in zip(FILES, _BINARY, strict=True):
         if not (folder / name).is_file():
-            cure = "copy it there too"
+            cure = "copy it into the same folder"
             if (folder / binary).is_file():
-                cure = f"{binary} is COLMAP's binary: run colmap model_converter --output_type TXT"
-            raise InputError(f"{folder / name}: this half of COLMAP's model is missing; {cure}")
+                cure = (
+                    f"{binary} is COLMAP's binary format: convert it with colmap model_converter --output_type TXT"
+                )
+            raise InputError(f"{folder / name}: this file of COLMAP's model is missing; {cure}")
     return WrittenRig(_images(folder / FILES[1], _lenses(folder / FILES[0])), None, None, _CURES)
 
 
 def _lenses(path: Path) -> dict[str, WrittenCamera]:
-    """The cameras of cameras.txt, without poses, by their id: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
+    """The cameras of cameras.txt by id, without poses; a line is CAMERA_ID, MODEL, WIDTH, HEIGHT,
+    PARAMS[].
+    """
     lenses = {}
     for number, line in enumerate(read_text(path, most=LARGE).splitlines(), 1):
         words = line.split()
@@ -62,7 +70,7 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
         model = words[1] if len(words) > 1 else ""
         if model not in MODELS:
             known = " ".join(MODELS)
-            raise InputError(f"{place}: camera model {model or 'missing'} is not read; use one of {known}")
+            raise InputError(f"{place}: camera model {model or 'missing'} is not supported; use one of {known}")
         parameters, lens = MODELS[model]
         names = parameters.split()
         width, height, *values = _numbers(words[2:], 2 + len(names), place)
@@ -75,7 +83,9 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
 
 
 def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]:
-    """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
+    """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each line is followed by a
+    line of points.
+    """
     every = enumerate(read_text(path, most=LARGE).splitlines(), 1)
     lines = iter([(number, line) for number, line in every if line[:1] != "#"])
     rows = []
@@ -84,8 +94,10 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
             rows.append((number, line.split(maxsplit=9)))
             points, text = next(lines, (0, ""))
             if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
-                problem = f"line {points}: must hold the points of the image before it, three numbers each"
-                raise InputError(f"{path}: {problem}; leave an empty line there where it has none")
+                problem = (
+                    f"line {points}: must hold the points of the image in the line before, three numbers each"
+                )
+                raise InputError(f"{path}: {problem}; leave an empty line if it has none")
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
     cameras = []
     for (number, words), name in zip(rows, names, strict=True):
@@ -99,7 +111,9 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
 
 
 def _names(files: Sequence[str]) -> list[str]:
-    """Names of cameras from names of images: the folders where these are unique, else the files."""
+    """Names of cameras from file names of images: the folders if these are unique, otherwise the
+    files.
+    """
     folders = [str(PurePosixPath(file).parent) for file in files]
     if "." not in folders and len(set(folders)) == len(folders):
         return folders
@@ -108,7 +122,7 @@ def _names(files: Sequence[str]) -> list[str]:
 
 def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(f"{place}: must hold {count} finite numbers, got {len(words)} words; export it again")
+        raise InputError(f"{place}: must hold {count} finite numbers, got {len(words)} values; export it again")
     return [float(word) for word in words]
 
 

@@ -1,4 +1,6 @@
-"""OpenCV's FileStorage (its multi-view calibration, a node per camera, EasyMocap's), and ROS' camera_info."""
+"""OpenCV's FileStorage (multi-view calibration, a node per camera, EasyMocap), and ROS camera_info
+files.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,25 +18,25 @@ from shapepose_fg.io.calibration.written import Format, Node, WrittenCamera, Wri
 _FISHEYE = 1
 """OpenCV's CALIB_MODEL_FISHEYE."""
 _MOST = 2**20
-"""Maximum number of numbers of all cameras together."""
+"""Maximum number of values of all cameras together."""
 _ASK = {
-    "unit": "pass --unit, that of the board's squares",
-    "up": "pass --up (a board's z points up or down where it lay; -y of a level first camera)",
+    "unit": "pass --unit, the unit of the board's squares",
+    "up": "pass --up (z or -z if the board lay on the floor; -y if the first camera was level)",
 }
 _ONE_CAMERA = "give the calibration of the whole rig, intrinsics and poses"
-_AGAIN = {"": "save it with OpenCV's calibration again"}
+_AGAIN = {"": "save it with OpenCV's calibration tool again"}
 _STORAGE = {"": "write it with OpenCV's FileStorage"}
 _EASYMOCAP = {"": "write it with EasyMocap again"}
 
 _STEREO = {"": "save it as OpenCV's stereo_calib sample does"}
-_HALF = "this is half of OpenCV's stereo calibration"
-_STEREO_UP = "pass the axis of the first camera that points up with --up; it is -y where that stood level"
+_HALF = "this is only one file of OpenCV's stereo calibration"
+_STEREO_UP = "pass the axis of the first camera that points up with --up; it is -y if that camera was level"
 _SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
 _MATRICES = ("m", "k", "cameramatrix", "camera_matrix", "mtx", "intrinsic", "intrinsic_matrix")
 _BENDS = ("d", "distcoeffs", "dist_coeffs", "distortion_coefficients", "distortion", "dist", "distcoeff")
-"""Names of the distortion of a stereo pair's cameras, in small letters."""
+"""Lower-case names of the distortion coefficients of a stereo pair."""
 _GAP = ("none", "null", "")
-"""Names by which EasyMocap fills places in its list of cameras."""
+"""Names that EasyMocap uses for empty places in its list of cameras."""
 
 INTRINSIC, TURN, SHIFT = (
     "camera_matrix K intrinsic_matrix",
@@ -44,7 +46,7 @@ INTRINSIC, TURN, SHIFT = (
 BEND = "distortion_coefficients dist_coeffs distortion_vector dist D"
 _SIZE = "image_width img_width width", "image_height img_height height"
 POSE = "camera_pose_matrix"
-"""Name of MC-Calib's world from camera."""
+"""MC-Calib's name of the world-from-camera matrix."""
 
 
 def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
@@ -53,8 +55,8 @@ def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
 
 
 def _read_multiview(content: Content) -> WrittenRig | None:
-    """The file that OpenCV's multiview_calibration.py saves: camera from the first camera, in the unit of the
-    board.
+    """File saved by OpenCV's multiview_calibration.py: poses from the first camera, in the unit of
+    the board.
     """
     if content.syntax != "OpenCV" or not {"Rs", "Ts", "Ks"} <= content.value.keys():
         return None
@@ -62,17 +64,20 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     flat = nodes.needed("Ks", most=_MOST)
     count = len(flat) // 9
     if count == 0 or len(flat) != 9 * count:
-        raise nodes.refuse("Ks", "must hold 9 numbers for each camera")
+        raise nodes.refuse("Ks", "must hold 9 numbers per camera")
     Ks = flat.reshape(count, 3, 3)
     Rs, Ts = nodes.needed("Rs", 9 * count, 3 * count).reshape(count, -1), nodes.needed("Ts", 3 * count)
     sizes = nodes.needed("image_sizes", 2 * count).reshape(count, 2)
     models, ids = nodes.numbers("models", count), content.value.get("cam_ids")
     fisheye = np.zeros(count, dtype=bool) if models is None else models == _FISHEYE
     numbers = nodes.needed("distortions", most=_MOST)
-    # The coefficients stand one after the other: four of a fisheye, equally many of every other camera.
+    # All coefficients are in one list: four per fisheye camera, and an equal number for each other
+    # camera.
     plain = (len(numbers) - 4 * fisheye.sum()) / max(1, (~fisheye).sum())
     if plain != int(plain) or plain < 0:
-        raise nodes.refuse("distortions", f"must hold equally many numbers for every camera, got {len(numbers)}")
+        raise nodes.refuse(
+            "distortions", f"must hold the same number of values for every camera, got {len(numbers)}"
+        )
     ends = np.cumsum(np.where(fisheye, 4, int(plain)))
     names = ids.split(",") if isinstance(ids, str) else []
     names = names if len(names) == count else [str(index) for index in range(count)]
@@ -87,10 +92,12 @@ def _read_multiview(content: Content) -> WrittenRig | None:
 
 
 def _read_stereo(content: Content) -> WrittenRig | None:
-    """Two cameras as OpenCV's stereo sample saves them: M1 D1 M2 D2, and R T from the first to the second.
+    """Two cameras as saved by OpenCV's stereo sample: M1 D1 M2 D2, and R T from the first to the
+    second.
 
-    In one file, or in intrinsics.yml and extrinsics.yml; M may be K or cameraMatrix, 1 and 2 left and right.
-    The world is the first camera, in the unit of the board.
+    They are in one file, or in intrinsics.yml and extrinsics.yml. M may be called K or
+    cameraMatrix; 1 and 2 may be left and right. The world frame is the first camera, in the unit of
+    the board.
     """
     values, places = dict[str, Any](), [content.path]
     if content.syntax in ("OpenCV", "YAML", "JSON") and isinstance(content.value, dict):
@@ -117,18 +124,18 @@ def _read_stereo(content: Content) -> WrittenRig | None:
     for side, wTc in zip(sides, (np.eye(4), node.pose("r", "t")), strict=True):
         K, bend = (_of_side(values, names, side) or names[0] + side for names in (_MATRICES, _BENDS))
         cameras.append(node.camera(side, [K], wTc, size, [bend]))
-    note = f"OpenCV's stereo calibration: cameras are called {sides[0]} and {sides[1]}"
+    note = f"OpenCV's stereo calibration: the cameras are named {sides[0]} and {sides[1]}"
     return WrittenRig(cameras, None, None, _ASK | {"up": _STEREO_UP}, notes=[note])
 
 
 def _of_side(values: Mapping[str, Any], names: Sequence[str], side: str) -> str | None:
-    """The key of one of `names` for a side of a stereo pair: m1, m_1, or 1_m."""
+    """The key of one of `names` for one side of a stereo pair: m1, m_1, or 1_m."""
     keys = (key for name in names for key in (f"{name}{side}", f"{name}_{side}", f"{side}_{name}"))
     return next((key for key in keys if values.get(key) is not None), None)
 
 
 def _read_nodes(content: Content) -> WrittenRig | None:
-    """Cameras with a node, or a file, each, of MC-Calib or written by hand: K, distortion, size and pose."""
+    """One node or file per camera (MC-Calib or hand-written): K, distortion, size and pose."""
     nodes = content.value if content.syntax == "OpenCV" else {}
     if content.syntax == "folder":
         files = _loaded(content, ".yml .yaml .xml").values()
@@ -144,7 +151,7 @@ def _read_nodes(content: Content) -> WrittenRig | None:
         if node.named(POSE) is not None:
             wTc = node.pose_of_matrix(POSE)
         elif node.named(TURN) is None or node.named(SHIFT) is None:
-            raise InputError(f"{node.place}: R and T are missing, the camera's pose; {_ONE_CAMERA}")
+            raise InputError(f"{node.place}: R and T, the camera's pose, are missing; {_ONE_CAMERA}")
         else:
             wTc = node.pose(TURN, SHIFT)
         fisheye = values.get("distortion_type") == 1 or values.get("fisheye") in (1, "true")
@@ -153,9 +160,9 @@ def _read_nodes(content: Content) -> WrittenRig | None:
     if len(cameras) == 0:
         named = " ".join(list(content.value)[:5]) or "nothing"
         if Node(content.value, "").named(INTRINSIC) is not None:
-            what = "these are the intrinsics of one camera, as OpenCV's calibration saves them"
-            raise InputError(f"{content.path}: {what}; {_ONE_CAMERA}, such as a file per camera with R and T, too")
-        raise InputError(f"{content.path}: no camera with a pose here, only {named}; {_ONE_CAMERA}")
+            what = "this file has the intrinsics of one camera only"
+            raise InputError(f"{content.path}: {what}; {_ONE_CAMERA}, for example a file per camera with R and T")
+        raise InputError(f"{content.path}: there is no camera with a pose, only {named}; {_ONE_CAMERA}")
     return WrittenRig(cameras, None, None, _ASK)
 
 
@@ -165,7 +172,9 @@ def _named(inner: Node, name: str) -> bool:
 
 
 def _read_easymocap(content: Content) -> WrittenRig | None:
-    """EasyMocap's intri.yml and extri.yml, metres, z up: the cameras in the order of the names in the first."""
+    """EasyMocap's intri.yml and extri.yml, metres, z up; the cameras in the order of `names` in
+    intri.yml.
+    """
     paths = content.value if content.syntax == "folder" else [content.path]
     halves_of = [path for path in paths if re.search(r"(intri|extri).*\.ya?ml$", path.name)]
     values = [content.value] if content.syntax == "OpenCV" else []
@@ -180,18 +189,18 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
         one.with_name(one.name.replace("intri", "extri")),
     ):
         if not path.is_file():
-            raise InputError(f"{path}: this half of EasyMocap's calibration is missing; put both into one folder")
+            raise InputError(f"{path}: this file of EasyMocap's calibration is missing; put both into one folder")
         value = load(path).value
         halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
     inner, outer = halves
     names = inner.values.get("names")
     if not isinstance(names, list) or not all(isinstance(name, str | int | None) for name in names):
         raise inner.refuse("names", "must be a list of the cameras' names")
-    # EasyMocap leaves a gap between cameras by that name, and passes over it.
+    # EasyMocap marks gaps in its list of cameras with this name, and ignores them.
     wanted = [str(name) for name in names if str(name).lower() not in _GAP or _named(inner, str(name))]
     cameras = []
     for number, name in enumerate(wanted, 1):
-        # EasyMocap writes K_<name>; Pose2Sim's writer numbers them from 1.
+        # EasyMocap writes K_<name>; Pose2Sim's writer numbers the cameras from 1.
         def tagged(kind: str, name: str = name, number: int = number) -> list[str]:
             return [f"{kind}_{name}", f"{kind}_{number}"]
 
@@ -208,26 +217,26 @@ _LENSES: dict[str, Lens] = {
     **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "perspective"),
     **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
-"""ROS' distortion models that OpenCV has."""
+"""ROS distortion models that OpenCV supports."""
 _POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
 
 
 def is_info(value: Any) -> bool:
-    """Whether this is a file of ROS' camera_calibration, or an echoed CameraInfo message."""
+    """Whether the content is a file of ROS camera_calibration, or an echoed CameraInfo message."""
     known = isinstance(value, dict)
     return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
 
 
 def _read_ros(content: Content) -> WrittenRig | None:
-    """The cameras in the order of their files' names, metres, z up (REP 103).
+    """ROS camera files, sorted by name; metres, z up (REP 103).
 
-    `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or TransformStamped: the
-    camera's optical frame in the world, so world from camera.
+    `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or
+    TransformStamped: the pose of the camera's optical frame in the world (world from camera).
     """
     if content.syntax == "YAML" and (is_info(content.value) or message_of(content.value) is not None):
         what = "the intrinsics" if is_info(content.value) else "the pose"
         cure = "give the folder with <camera>.yaml and <camera>_pose.yaml of every camera"
-        raise InputError(f"{content.path}: this is {what} of one camera of ROS; {cure}")
+        raise InputError(f"{content.path}: this file has {what} of one camera of ROS only; {cure}")
     files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
     values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
     if not any(map(is_info, values.values())):
@@ -245,9 +254,10 @@ def _read_ros(content: Content) -> WrittenRig | None:
         model = str(value.get("distortion_model", ""))
         if model not in _LENSES:
             raise InputError(
-                f"{path}: distortion_model {model} is not read; use plumb_bob, rational_polynomial or equidistant"
+                f"{path}: distortion_model {model} is not supported; use plumb_bob, rational_polynomial or"
+                " equidistant"
             )
-        # A matrix is a list of numbers, or has one under `data`.
+        # A matrix is a list of values, or an object with the list under `data`.
         plain = {key: each.get("data") if isinstance(each, dict) else each for key, each in value.items()}
         node = Node(plain, str(path), {"": "run the calibration again"})
         size = "image_width width", "image_height height"
@@ -257,15 +267,15 @@ def _read_ros(content: Content) -> WrittenRig | None:
 
 
 def _ros_pose(path: Path, value: Any) -> Array:
-    """World from camera, of a message with translation and rotation."""
+    """World from camera, from a message with translation and rotation."""
     message = message_of(value)
     if message is None:
-        raise InputError(f"{path}: neither a camera_info nor a pose of ROS; {_POSE_CURE}")
+        raise InputError(f"{path}: this is neither a camera_info nor a pose of ROS; {_POSE_CURE}")
     child = str(value.get("child_frame_id", ""))
     if child and "optical" not in child:
         raise InputError(
-            f"{path}: child_frame_id {child} is no optical frame (z forward, x right, y down); give the pose of"
-            f" {child}_optical_frame, or whatever the camera's optical frame is called"
+            f"{path}: child_frame_id {child} is not an optical frame (x right, y down, z forward); give the"
+            f" pose of the optical frame, such as {child}_optical_frame"
         )
 
     def of(part: Any, word: str, axes: str) -> list[float]:
@@ -277,7 +287,7 @@ def _ros_pose(path: Path, value: Any) -> Array:
 
 
 def message_of(value: Any) -> tuple[Any, Any] | None:
-    """Translation and rotation of a pose, for any depth of stamped messages."""
+    """Translation and rotation of a pose message, nested in stamped messages of any depth."""
     if isinstance(value, dict) and isinstance(value.get("transforms"), list):
         value = value["transforms"][0] if len(value["transforms"]) == 1 else None
     while isinstance(value, dict):

@@ -1,4 +1,6 @@
-"""Reads calibration files as a `Rig`: recognises the format, and asks for what the file does not state."""
+"""Reads calibration files as a `Rig`: recognises the format, and names values that the user must
+give because the file does not define them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,17 +22,17 @@ from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
-"""All known formats; the first one that recognises a file reads it."""
+"""All known formats, in the order in which they are tried."""
 
 _MISSING = {
     "unit": "pass --unit m, cm or mm",
     "up": "pass --up with the axis that points up (x -x y -y z -z)",
-    "image_size": "pass --image-size WIDTHxHEIGHT, the pictures that were calibrated, in pixels",
+    "image_size": "pass --image-size WIDTHxHEIGHT, the size of the calibrated pictures in pixels",
 }
-"""Information that the user can give, and how, in the order of the sentence."""
+"""Values that the user can give, and the option for each, in the order of the error message."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of numbers like 1e300, which are refused
+@np.errstate(over="ignore", invalid="ignore")  # from numbers such as 1e300, which are refused
 def read_rig(
     path: str | Path,
     *,
@@ -42,11 +44,12 @@ def read_rig(
 ) -> Rig:
     """Read the cameras of a calibration file or folder; the format is recognised by the content.
 
-    The formats are `FORMATS`; docs/conventions.md lists their units and up axes. `up` and `unit` override the
-    file. `image_size` (width, height) is for formats that do not state the size of the pictures. `cameras` are the
-    names of those to read, all by default, and `without` of those to leave out. Information that neither the file
-    nor the caller gives is an InputError: one sentence that names the file, the key and the cure. `notes` of the
-    rig say what was left out.
+    The formats are `FORMATS`; docs/conventions.md lists their units and up axes. `up` and `unit`
+    override the file. `image_size` (width, height) is for formats that do not state the size of the
+    pictures. `cameras` are names of the cameras to read, all by default; `without` are names of
+    cameras to leave out. InputError, one sentence that names the file, the key and the cure, if a
+    required value is given neither by the file nor by the caller. `notes` of the rig list what was
+    left out.
     """
     path = Path(path)
     for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
@@ -55,8 +58,8 @@ def read_rig(
     content = load(path)
     if content.syntax == "pickle":
         raise InputError(
-            f"{path}: this is a Python pickle, as OpenCap writes it, and could run any program when it is opened;"
-            " write it as a rig file where you trust it, as docs/conventions.md shows"
+            f"{path}: this is a Python pickle (as OpenCap writes), which could run any program when opened; if"
+            " you trust it, convert it to a rig file as in docs/conventions.md"
         )
     if (known := recognised(content)) is None:
         raise InputError(_unknown(content))
@@ -64,13 +67,13 @@ def read_rig(
     with naming(path):
         wanted = choose([camera.name for camera in written.cameras], cameras, without)
     unwanted = [camera.name for camera in written.cameras if camera.name not in wanted]
-    asked = [f"camera {listing(unwanted)} is left out, as asked"] if unwanted else []
+    asked = [f"camera {listing(unwanted)} is left out as requested"] if unwanted else []
     kept = [camera for camera in written.cameras if camera.name in wanted]
     written = replace(written, cameras=kept, notes=[*written.notes, *asked])
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:
-        raise InputError(f"{path}: {form.name} says itself how large the pictures are; leave --image-size out")
+        raise InputError(f"{path}: this format ({form.name}) contains the picture sizes; leave out --image-size")
     given = {"unit": unit, "up": up, "image_size": image_size if sizes_missing else True}
     missing = [name for name, value in given.items() if value is None]
     if up is None or unit is None or missing:
@@ -86,13 +89,15 @@ def read_rig(
 
 
 def recognised(content: Content) -> tuple[Format, WrittenRig] | None:
-    """The first format that has this content, and the cameras; None where it is none. InputError where damaged."""
+    """The first format that recognises the content, and its cameras; None for an unknown format.
+    InputError if damaged.
+    """
     read = ((each, each.read(content)) for each in FORMATS)
     return next(((form, written) for form, written in read if written is not None), None)
 
 
 def carried(rig: Rig) -> Rig:
-    """The rig with each moving camera at the start of its trajectory."""
+    """The rig with the pose of each moving camera set to the start of its trajectory."""
     if not rig.moves:
         return rig
     first = {each.name: each.wTb[0] for each in rig.trajectories}
@@ -101,9 +106,10 @@ def carried(rig: Rig) -> Rig:
 
 
 def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
-    """The rig with cameras that move as in `given`, `CAMERA=FILE` each: the file has the camera's own poses.
+    """The rig with moving cameras as in `given`, a list of `CAMERA=FILE`: the file has the poses of
+    the camera itself.
 
-    The calibration's poses of these cameras are ignored. InputError where a file cannot be used.
+    The calibrated poses of these cameras are ignored. InputError if a file cannot be used.
     """
     cameras, trajectories = {each.name: each for each in rig.cameras}, list(rig.trajectories)
     for each in given:
@@ -112,8 +118,11 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
             cure = f"write CAMERA=FILE with one of {listing(list(rig.names))}"
             raise InputError(f"--trajectory {each[:80]}: must name a camera and a file; {cure}")
         if cameras[name].carrier or any(file == other.partition("=")[2] for other in given if other is not each):
-            cure = 'say in a rig file with "trajectory" and "bTc" how each camera stands on its carrier'
-            raise InputError(f"--trajectory {each[:80]}: a camera has one trajectory of its own; {cure}")
+            cure = 'give the pose of each camera on its carrier in a rig file, with "trajectory" and "bTc"'
+            raise InputError(
+                f"--trajectory {each[:80]}: a camera can have one trajectory, and it belongs to"
+                f" this camera only; {cure}"
+            )
         trajectories.append(read_trajectory(file, name))
         cameras[name] = replace(cameras[name], carrier=name, bTc=np.eye(4))
     with naming("--trajectory"):
@@ -122,7 +131,7 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
 
 @np.errstate(over="ignore", invalid="ignore")
 def is_calibration(path: Path) -> bool:
-    """Whether a file or folder has one of the formats, though it may be damaged."""
+    """Whether a file or folder has one of the formats; it may be damaged."""
     try:
         content = load(path)
     except InputError:
@@ -134,12 +143,14 @@ def is_calibration(path: Path) -> bool:
 
 
 def _unknown(content: Content) -> str:
-    """A sentence on what was found instead of a calibration, and on the known formats."""
+    """A sentence about the actual content of a path that is no calibration, and about the known
+    formats.
+    """
     value = content.value
     if content.syntax == "folder":
         return (
             f"{content.path}: this is a folder; give the file inside it, or the folder with the files of"
-            f" EasyMocap, COLMAP or ROS; here is {listing([path.name for path in value])}"
+            f" EasyMocap, COLMAP or ROS; it contains {listing([path.name for path in value])}"
         )
     about = f"<{value.tag}>" if hasattr(value, "tag") else describe(value)
     if isinstance(value, dict):
@@ -147,6 +158,6 @@ def _unknown(content: Content) -> str:
     found = content.syntax if content.syntax == "text" else f"{content.syntax} ({about})"
     known = ", ".join(form.name for form in FORMATS)
     return (
-        f"{content.path}: recognised as {found}, but this is not a calibration that is known here; give one of"
+        f"{content.path}: recognised as {found}, but this is not a known calibration format; give one of"
         f" {known} (docs/conventions.md)"
     )

@@ -1,4 +1,4 @@
-"""Detections of one camera in one picture as a line of JSON: OpenPose's frame, with camera and time."""
+"""Reads the detections of one picture from a line of JSON: OpenPose's format, with camera and time."""
 
 from typing import Annotated, Any
 
@@ -17,8 +17,8 @@ from shapepose_fg.io.detections.view_streams import undistorted
 from shapepose_fg.io.validation import validated
 
 _CURE = (
-    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and of a'
-    ' camera that moves "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
+    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and for a'
+    ' moving camera "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
 )
 _Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
 _Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
@@ -37,10 +37,11 @@ class _Line(BaseModel, strict=True, extra="allow"):
 
 
 def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[Any, ...] | None:
-    """The arguments of `OnlineReconstructor.push_view`: camera, undistorted detections, time in seconds, and pose
-    with covariance, None where the line has none. Joints far outside the picture are left out.
+    """The arguments of `OnlineReconstructor.push_view`: camera, undistorted detections, time in
+    seconds, and pose with covariance, None if the line has none. Joints far outside the picture are
+    left out.
 
-    None where the camera is one of `Rig.unwanted`. InputError naming the `place` of an invalid line.
+    None if the camera is one of `Rig.unwanted`. InputError, naming `place`, for an invalid line.
     """
     line = validated(_Line, parse_json(text.strip(), place), place, _CURE)
     if line.camera in rig.unwanted:
@@ -57,8 +58,8 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
 def view_of(
     camera: str, time_s: float, flat: list[list[float]], place: str, rig: Rig, skeleton: Skeleton
 ) -> tuple[str, Detections, float]:
-    """Return a camera's name, its detections and their time, from keypoints in a flat list of x, y, score, pixels
-    of the picture.
+    """Camera name, detections and time for keypoints in flat lists of x, y, score (pixels of the
+    picture), one list per person.
     """
     if camera not in rig.names:
         raise InputError(f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}")
@@ -66,11 +67,11 @@ def view_of(
     if any(len(each) != 3 * K for each in flat):
         wrong = next(len(each) for each in flat if len(each) != 3 * K)
         raise InputError(
-            f"{place}: {3 * K} numbers a person were expected, of {skeleton.name}, got {wrong}; {_CURE}"
+            f"{place}: {3 * K} numbers per person are expected for {skeleton.name}, got {wrong}; {_CURE}"
         )
     keypoints = np.array(flat, dtype=np.float64).reshape(len(flat), K, 3)
     if np.nanmax(keypoints[..., 2], initial=0.0) > OVERSHOOT:
-        raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; divide them")
+        raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; rescale them")
     frame = np.zeros(len(flat), dtype=np.intp)
     view = joints_of_people(frame, keypoints, lambda score: np.minimum(score, 1.0), skeleton)
     seen = undistorted(view, place, rig.cameras[rig.names.index(camera)]).seen

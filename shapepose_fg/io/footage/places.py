@@ -7,17 +7,18 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.camera_names import listing, told_by_parts
 
 VIDEOS = frozenset(".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .ts .mts .m2ts .wmv".split())
-"""Endings of videos."""
+"""File extensions of videos."""
 PICTURES = frozenset(".jpg .jpeg .png .bmp .tif .tiff .webp".split())
-"""Endings of pictures."""
+"""File extensions of pictures."""
 _INNER = ("videos", "images", "video", "image")
-"""Folders of footage in other programs' projects."""
+"""Names of subfolders with footage in other programs' projects."""
 
 
 def per_camera(
     option: str, given: Sequence[str], cameras: Sequence[str], *, one_for_all: bool = False
 ) -> list[str | None]:
-    """(V,) the value of an option for each camera: CAMERA=VALUE, or where allowed one VALUE for all.
+    """(V,) the value of an option for each camera: CAMERA=VALUE, or if `one_for_all` is set one
+    VALUE for all.
 
     InputError for unknown cameras, and for duplicates.
     """
@@ -53,8 +54,8 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
     for name, path in named.items():
         if path is None:
             raise InputError(
-                f"--videos: nothing is given for camera {name}; add --videos {name}=PATH, or take the camera out"
-                " of the calibration"
+                f"--videos: there is no footage for camera {name}; add --videos {name}=PATH, or leave the"
+                " camera out with --without"
             )
         if not Path(path).exists():
             raise InputError(f"{path}: there is no such file or folder; check the path")
@@ -62,8 +63,8 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
 
 
 def names_of_footage(given: Sequence[str]) -> list[str]:
-    """Names of cameras from the arguments of `find_footage` alone: a folder's videos, or else its other
-    footage, or the names before `=`. InputError where there is nothing.
+    """Names of cameras from the arguments of `find_footage`: the names before `=`, or the videos of
+    a folder, or its other footage if it has no videos. InputError if there are none.
     """
     if len(given) > 1 or ("=" in given[0] and not Path(given[0]).exists()):
         return [text.partition("=")[0] for text in given]
@@ -72,12 +73,12 @@ def names_of_footage(given: Sequence[str]) -> list[str]:
     offered = [each for each in entries if not each.name.startswith(".") and _is_footage(each)]
     videos = [each for each in offered if each.suffix.lower() in VIDEOS] or offered
     if len(videos) == 0:
-        raise InputError(f"{folder}: no videos or pictures here; give the folder with those of all cameras")
+        raise InputError(f"{folder}: there are no videos or pictures; give the folder with those of all cameras")
     return [each.name if each.is_dir() else each.stem for each in videos]
 
 
 def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """The entries of a folder for each camera, by their names: videos, pictures, and folders that hold
+    """The entries of a folder for each camera, by their names: videos, pictures, and folders with
     pictures.
     """
     if folder.is_file():
@@ -85,7 +86,7 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
             f"{folder}: this is one file; give the folder with the footage of all cameras, or CAMERA=PATH for each"
         )
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; check the path of the videos")
+        raise InputError(f"{folder}: there is no such folder; check the path")
     entries = [each for each in sorted(folder.iterdir()) if not each.name.startswith(".")]
     offered = [each for each in entries if _is_footage(each)]
     names = [each.name if each.is_dir() else each.stem for each in offered]
@@ -93,9 +94,7 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
     for camera, found in zip(cameras, exact, strict=True):
         if len(found) > 1:
             what = " and ".join(path.name for path in found)
-            raise InputError(
-                f"{folder}: {what} could all be camera {camera}'s; give --videos {camera}=PATH for each"
-            )
+            raise InputError(f"{folder}: {what} all match camera {camera}; give --videos {camera}=PATH for each")
     if all(exact):
         return [found[0] for found in exact], []
     if not any(exact):
@@ -108,7 +107,7 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
     missing = next(camera for camera, found in zip(cameras, exact, strict=True) if len(found) == 0)
     holds = listing([path.name for path in offered], "no video, picture or folder of pictures")
     cure = f"name a video or a folder of pictures after each camera, or give --videos {missing}=PATH for each"
-    raise InputError(f"{folder}: nothing here is named after camera {missing}, it holds {holds}; {cure}")
+    raise InputError(f"{folder}: nothing in it is named after camera {missing}; it contains {holds}; {cure}")
 
 
 def _is_footage(path: Path) -> bool:

@@ -32,7 +32,7 @@ def test_amass_posed_by_the_body_model_stands_where_it_stood(job, true_bodies):
     names = [path.name.removesuffix("_amass.npz") for path in written.files]
     # The hole of one frame without a body is filled, the eight frames out of sight are not.
     assert names == ["person_3_frames_100-123", "person_7_frames_100-107", "person_7_frames_116-123"]
-    assert any("betas are those of the open body" in note for note in written.notes)
+    assert any("betas are those of the built-in body" in note for note in written.notes)
     body = BodyModel.default()
     for path in written.files:
         with np.load(path, allow_pickle=False) as file:
@@ -252,7 +252,7 @@ def test_glb_keeps_millimetres_far_from_the_origin(job, true_bodies, tmp_path):
     people = job.take.people
     away = replace(people, joints=people.joints + place, transl=people.transl + place)
     written = write_glb(replace(job, take=replace(job.take, people=away), folder=tmp_path))
-    (note,) = [each for each in written.notes if "coordinates are from" in each]
+    (note,) = [each for each in written.notes if "coordinates are relative to" in each]
     far = Glb(written.files[0])
     origin = np.array(far.file.scenes[0].extras["origin_m"])
     assert " ".join(f"{each:.0f}" for each in origin) in note
@@ -318,7 +318,9 @@ def test_several_shapes_become_one_and_it_is_said_how_far_that_is_off(result, ar
     assert 0.01 < motion.spread_m < 0.1
     same = motion_of(Take.of(alone, "z"), 0, arrays, np.eye(3))
     assert same is not None and same.spread_m < 1e-9
-    said = f"several shapes, and the mean of them in the file: joints are up to {1e3 * motion.spread_m:.0f} mm"
+    said = (
+        f"several body shapes; the file has their mean, which moves joints by up to {1e3 * motion.spread_m:.0f} mm"
+    )
     for write in (write_amass, write_bvh, write_glb):
         assert any(said in note for note in write(Job(take, tmp_path)).notes)
         assert not any("several shapes" in note for note in write(Job(Take.of(alone, "z"), tmp_path)).notes)

@@ -39,7 +39,7 @@ def test_several_formats_in_one_call(copied, capsys):
     files = [line.rsplit(os.sep, 1)[1] for line in printed.out.splitlines()]
     assert files[:3] == ["person_3.trc", "person_7.trc", "joints.csv"] and len(files) == 6
     assert sorted(path.name for path in (copied / "export").iterdir()) == sorted(files)
-    assert "note: amass: betas are those of the open body" in printed.err
+    assert "note: amass: betas are those of the built-in body" in printed.err
 
 
 def test_options(copied, tmp_path, capsys):
@@ -54,14 +54,14 @@ def test_options(copied, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fbx"], "format fbx: there is none of this name; there are amass trc c3d bvh glb csv parquet mcap rrd"),
+        (["fbx"], "format fbx: must be one of amass trc c3d bvh glb csv parquet mcap rrd"),
         (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
         (["trc", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
         (["parquet", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
         (["trc", "--person", "4"], "has no such person; it has 3 7"),
-        (["trc", "--fps", "0"], "--fps 0: must be a number of frames a second"),
-        (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must be seconds"),
+        (["trc", "--fps", "0"], "--fps 0: must be 0.01 to 100000 Hz"),
+        (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must be 0 to 3600 seconds"),
         (["glb", "--body", "gone.npz"], "gone.npz"),
     ],
 )
@@ -93,7 +93,7 @@ def test_frames_that_stand_alone_go_into_tables_only(result, copied, capsys):
     replace(result, run=result.run | {"configuration": {"temporal": False}}).save(copied)
     assert run("export", copied, "csv", "trc") == 2
     assert (
-        "people cannot be followed; reconstruct with --temporal, or export csv or rrd" in capsys.readouterr().err
+        "frame and has no identities; reconstruct with --temporal, or export csv or rrd" in capsys.readouterr().err
     )
     assert run("export", copied, "csv") == 0
 

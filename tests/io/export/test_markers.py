@@ -111,7 +111,7 @@ def test_c3d_keeps_millimetres_far_from_the_origin(job, result, tmp_path):
     truth = joints + place[[1, 2, 0]]
     np.testing.assert_allclose(np.swapaxes(points, 0, 1) + origin, truth, atol=1e-4)
     listed = " ".join(f"{each:.0f}" for each in origin)
-    assert [note for note in written.notes if f"c3d: coordinates are from {listed} m of the world" in note]
+    assert [note for note in written.notes if f"c3d: coordinates are relative to {listed} m " in note]
     assert write_c3d(job).notes == [] or not any("coordinates" in note for note in write_c3d(job).notes)
 
 
@@ -151,7 +151,7 @@ def test_c3d_is_cut_where_its_numbers_end(tmp_path):
     x = np.concatenate([file["data"]["points"][2, 0] for file in files])
     np.testing.assert_allclose(x, np.arange(65_536), rtol=1e-6)
     assert len(written.notes) == 1
-    assert "person_3_frames_65535-65535.c3d counts its frames from 1, not 65536" in written.notes[0]
+    assert "person_3_frames_65535-65535.c3d numbers its frames from 1, not 65536" in written.notes[0]
 
 
 @pytest.mark.parametrize(("first", "header"), [(65_533, 65_533), (65_534, 0), (70_000, 0)])
@@ -167,7 +167,7 @@ def test_c3d_s_first_frame_does_not_wrap_around(tmp_path, first, header):
 def test_times_that_no_file_of_one_rate_holds_are_one_sentence(tmp_path, write):
     take = moving(3, 0)
     odd = replace(take, times_s=np.array([0, 0.01, 1e9]))
-    with pytest.raises(InputError, match=r"people\.npz: the times run over 1000000000 s"):
+    with pytest.raises(InputError, match=r"people\.npz: the times cover 1000000000 s"):
         write(Job(odd, tmp_path))
 
 

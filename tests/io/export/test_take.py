@@ -56,7 +56,7 @@ def test_frames_nearer_than_a_step_are_counted(result):
 
 def test_times_in_another_unit_are_refused(result):
     odd = replace(result, time_s=np.where(result.frame > 120, result.time_s + 1e9, result.time_s))
-    with pytest.raises(ValueError, match="give --fps, or part of it with --frames"):
+    with pytest.raises(ValueError, match="give --fps, or a part with --frames"):
         Take.of(odd, "z").at_one_rate()
 
 
@@ -77,7 +77,7 @@ def test_seen_only_leaves_inferred_joints_out(result):
         ({"run": {"configuration": {"temporal": False}}}, "this result is frame by frame"),
         ({"person": "same"}, "has two rows of frame 100"),
         ({"time_s": "unknown"}, "give --fps"),
-        ({"time_s": "falling"}, "does not rise"),
+        ({"time_s": "falling"}, "does not increase"),
     ],
 )
 def test_a_result_without_a_timeline_is_refused(result, change, words):
@@ -94,7 +94,7 @@ def test_old_files_do_not_say_what_was_seen(result):
 
 
 def test_nobody_is_nothing_to_export():
-    with pytest.raises(ValueError, match="no people were found"):
+    with pytest.raises(ValueError, match="the result has no people"):
         Take.of(Reconstruction.empty(), "z")
 
 
@@ -102,7 +102,9 @@ def test_the_up_axis_comes_from_the_cameras_or_is_asked_for(saved, result, tmp_p
     assert read_take(saved).up == "z"
     assert read_take(saved, up="-y").up == "-y"
     result.save(tmp_path)
-    with pytest.raises(InputError, match=r"cameras\.json: it is not there .* give --up"):
+    with pytest.raises(
+        InputError, match=r"cameras\.json: this file is missing, and it contains the up axis; give --up"
+    ):
         read_take(tmp_path)
     with pytest.raises(InputError, match="--up w: must be one of"):
         read_take(tmp_path, up="w")  # pyright: ignore[reportArgumentType]

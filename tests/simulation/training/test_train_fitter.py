@@ -148,7 +148,7 @@ def test_whatever_has_the_body_uses_the_weights_and_says_so_before_there_are_any
     write_simulated(scene, simulate(scene, seed=0), short, "openpose")
     common = ("reconstruct", "--calibration", "rig.json", "--detections", "openpose", "--fps", 25)
     assert run(*common, "--body", "second.npz", "--output", "plain") == 0
-    assert "shapepose-fg train-fitter --body second.npz trains a better one" in capsys.readouterr().err
+    assert "shapepose-fg train-fitter --body second.npz trains a better fitter" in capsys.readouterr().err
     assert train("--body", "second.npz", "--iterations", 1) == 0
     capsys.readouterr()
     assert run(*common, "--body", "second.npz", "--output", "learned") == 0
@@ -187,10 +187,13 @@ def test_a_network_in_another_body_s_words_says_the_same_of_the_same_body():
     [
         (["--body", "gone.npz"], "gone.npz: there is no such file"),
         (["--body", "notes.txt"], "notes.txt: "),
-        (["--body", "own.npz"], "own.npz: this body has weights, it ships with the package; give --output"),
+        (["--body", "own.npz"], "own.npz: this body model has weights in the package; give --output"),
         (["--body", "second.npz", "--motions", "gone"], "gone: there is no such"),
         (["--body", "second.npz", "--motions", "empty"], "empty: holds no recordings"),
-        (["--body", "second.npz", "--motions", "few"], "few: no validation subjects in it; add motions of more"),
+        (
+            ["--body", "second.npz", "--motions", "few"],
+            "few: there are no validation subjects; add motions of more",
+        ),
         (["--body", "second.npz", "--output", "notes.txt/w"], "notes.txt: results cannot be written here"),
         (
             ["--body", "second.npz", "--output", "empty"],
