@@ -273,8 +273,8 @@ def test_who_is_lost_says_so_in_one_line_with_the_cause(recording, pipeline, tmp
     monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", dropping)
     assert run(*recording, "--fps", "25", "--no-check") == 0
     assert (
-        "lost 2 rows dropped: there too briefly (frames 3-4); two cameras see 4.0 people a frame, and 2.0 are"
-        " found: 0.2 s are too little to be sure of everybody; give more frames, or --no-temporal"
+        "lost 2 rows dropped: there too briefly (frames 3-4); two cameras see 4.0 people per frame, but 2.0 are"
+        " found: 0.2 s are too short to confirm all people; give more frames, or --no-temporal"
     ) in " ".join(capsys.readouterr().out.split())
 
 

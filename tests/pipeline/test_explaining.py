@@ -199,7 +199,7 @@ def with_turned(rig, view: int, degrees: float):
 
 def turned_by(found: Explanation) -> tuple[float, float]:
     """Degrees by which the finding says that a camera is off, and their sigma."""
-    turn, sigma = re.search(r"turned by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words).groups()
+    turn, sigma = re.search(r"rotated by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words).groups()
     return float(turn), float(sigma)
 
 
@@ -267,9 +267,9 @@ def test_the_command_says_the_same(people, scene, tmp_path, capsys):
 
 
 def test_who_is_not_there_is_said(people, scene):
-    with pytest.raises(InputError, match="person 77: is not in the result"):
+    with pytest.raises(InputError, match="person 77: not in the result"):
         explain(people, scene.rig, person=77, joint="LElbow", frame=5)
-    with pytest.raises(InputError, match="joint Tail: the result has none of that name"):
+    with pytest.raises(InputError, match="joint Tail: the result has no joint of this name"):
         explain(people, scene.rig, person=int(people.person[0]), joint="Tail", frame=int(people.frame[0]))
     with pytest.raises(InputError, match="is not in frame 99"):
         explain(people, scene.rig, person=int(people.person[0]), joint="LElbow", frame=99)

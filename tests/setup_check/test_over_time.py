@@ -142,7 +142,7 @@ def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, ro
         replace(report, findings=(), warnings=(), trust=Trust()), alone, turned, room, range(20)
     )
     (said,) = [each for each in checked.warnings if each.startswith(f"{name}: ")]
-    assert "belong to nobody who was found" in said and "check-calibration" in said
+    assert "are not assigned to any person" in said and "check-calibration" in said
     use = checked.cameras[2]
     assert use.used + sum(use.unused.values()) == use.offered
     others = [each for view, each in enumerate(checked.cameras) if view != 2]
