@@ -239,7 +239,7 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     """
     own = people.rows(rows)
     if own.observations is None:
-        raise ValueError("what moving cameras saw is not known: keep observations.npz, or give no rig")
+        raise ValueError("the measurements of moving cameras are missing: keep observations.npz, or give no rig")
     seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
     views = Views.of(rig, seen.time_s)
     assert views.carried is not None
@@ -315,7 +315,7 @@ def surface_distance(
     chosen = np.argsort(-weight, kind="stable")[:4]
     chosen = chosen[known[chosen]]
     if len(chosen) == 0:
-        raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a place")
+        raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a position")
     share = weight[chosen] / max(weight[chosen].sum(), 1e-300)
     both = marginal(people, *(JointAt(person, names[j], frame) for j in chosen.tolist()))
     along = (share[:, None] * normal).ravel()
@@ -365,7 +365,7 @@ def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
     """Row and number of a joint that has a place."""
     row, names = _row(people, asked.person, asked.frame), people.joint_names.tolist()
     if asked.joint not in names:
-        raise ValueError(f"joint {asked.joint}: there is none of that name, but {' '.join(names)}")
+        raise ValueError(f"joint {asked.joint}: there is no joint of this name; there are {' '.join(names)}")
     joint = names.index(asked.joint)
     if not (np.isfinite(people.joints[row, joint]).all() and np.isfinite(people.covariance[row, joint]).all()):
         raise NotDetermined(
@@ -381,7 +381,7 @@ def _missing(people: Reconstruction, row: int, joint: int) -> str:
         return f"the row's status is {people.status[row]}{body}"
     used = table.view_names[table.used[row, joint]].tolist()
     views = {0: "no camera's detection was used", 1: f"only camera {' '.join(used)} saw it"}
-    return views.get(len(used), f"cameras {', '.join(used)} do not place it") + body
+    return views.get(len(used), f"cameras {', '.join(used)} do not determine it") + body
 
 
 def _reached(probability: float, rising: Array, limits: Array) -> Array:

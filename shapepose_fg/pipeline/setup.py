@@ -34,7 +34,7 @@ UNSEEN_S = 0.3
 """Longest gap without detections over which the tracker's predictions cover such joints, s."""
 _ON_TRIAL = 0.5
 """Share of the required probability that is enough in single frames before a body is fitted."""
-_FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
+_FALSE_POSITIVE = "hardly any detections of their own, or at the position of another person"
 """Reason for dropping people when detections are reassociated."""
 
 

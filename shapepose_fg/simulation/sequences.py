@@ -325,7 +325,7 @@ def _dances(
         drawn = [takes[index] for index in rng.permutation(len(takes))]
         segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]
         if len(segments) == 0:
-            raise ValueError("in none of these salsa takes the two dance together: give the whole file")
+            raise ValueError("there is no salsa take in which the two dance together: give the whole file")
         yield from segments
 
 
@@ -355,7 +355,7 @@ def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
 def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
     """`count` clips, none twice before all were drawn once."""
     if count > 0 and len(clips) == 0:
-        raise ValueError("no one but the dancers stands or walks in these recordings: give the whole file")
+        raise ValueError("there are no standing or walking people in these recordings: give the whole file")
     rounds = -(-count // max(len(clips), 1))
     return [clips[index] for _ in range(rounds) for index in rng.permutation(len(clips))][:count]
 

@@ -192,7 +192,7 @@ def test_another_program_on_a_worker_is_noticed(monkeypatch):
         ({**own, "numpy": "1.0"}, r"its process tcp://b:2 has another version of numpy \(1\.0 there, .* here\)"),
         (
             {**own, "shapepose-fg itself": "x"},
-            "has another version of shapepose-fg itself; install the same there",
+            "has another version of shapepose-fg itself; install the same version there",
         ),
         (ModuleNotFoundError("No module named 'shapepose_fg'"), r"cannot run this program \(No module named"),
     ):

@@ -306,9 +306,9 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--fps", "0"], "--fps 0: must be 0.01 to 100000 Hz, such as 25"),
         (["--readout", "20"], "--readout 20: must be 0 to 0.1 seconds, such as 0.02"),
         (["--fps", "nan"], "--fps nan: must be 0.01 to 100000 Hz"),
-        (["--cuts", "3,2"], "--cuts 3,2: must be rising frame numbers between 1 and 4, such as 300,600"),
-        (["--cuts", "5"], "--cuts 5: must be rising frame numbers between 1 and 4"),
-        (["--cuts", "a"], "--cuts a: must be rising frame numbers"),
+        (["--cuts", "3,2"], "--cuts 3,2: must be increasing frame numbers between 1 and 4, such as 300,600"),
+        (["--cuts", "5"], "--cuts 5: must be increasing frame numbers between 1 and 4"),
+        (["--cuts", "a"], "--cuts a: must be increasing frame numbers"),
         (["--timestamps", "/nothing.txt"], "/nothing.txt: there is no such file; check the path"),
         (["--timestamps", __file__, "--fps", "25"], "--fps and --timestamps: both determine the times of frames"),
         (["--shapes", "s.npz", "--no-temporal"], "--shapes: shapes need people over time"),
@@ -619,7 +619,7 @@ def test_some_of_the_cameras(three, pipeline, tmp_path, choice):
         ([], 'the detections of camera "behind" are missing'),
         (["--without", "behnid"], "there is no camera 'behnid'; there are left right behind"),
         (["--cameras", "left"], "at least 2 cameras are needed"),
-        (["--cameras", ""], "no camera is chosen"),
+        (["--cameras", ""], "no camera is selected"),
     ],
 )
 def test_cameras_that_cannot_be_chosen(three, capsys, choice, sentence):

@@ -205,5 +205,5 @@ def test_a_socket_listens_on_this_machine_only_unless_told_otherwise():
     with listen("tcp://:0") as own, listen("tcp://0.0.0.0:0") as everybody:
         assert own.getsockname()[0] == "127.0.0.1" and everybody.getsockname()[0] == "0.0.0.0"
     for wrong in ("tcp://", "tcp://:70000", "tcp://:5000/way", "tcp://no.such.host.invalid:5000"):
-        with pytest.raises(InputError, match="cannot be listened on"):
+        with pytest.raises(InputError, match="cannot be opened"):
             listen(wrong)

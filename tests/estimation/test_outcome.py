@@ -132,14 +132,14 @@ def test_a_joint_with_a_factor_of_one_s_own_ran_away_after_a_metre():
     here = window([0.0], [False, False, False])
     here.touched = np.array([True, True, False])
     first = np.array([[[1.01, 0, 0], [0.99, 0, 0], [5.0, 0, 0]]])
-    assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "ran away from its views"}
+    assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "diverged from its views"}
 
 
 def test_what_nothing_determines_and_what_the_solver_says():
     here = window([0.0], [False, False])
     covariance = np.full((1, 2, 3, 3), np.nan)
     covariance[0, 1] = I3
-    assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "nothing determines it: its system is singular"}
+    assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "undetermined: its system is singular"}
     here.failure = "the solver left the finite numbers"
     solution = solved([0.0, np.nan])
     assert reasons(solution, here, covariance) == {0: here.failure}, "who is not placed has no problem"

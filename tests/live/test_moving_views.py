@@ -142,7 +142,7 @@ def test_misuse_is_refused(made, start):
         live.push_view("cam2", own, 0.0, np.eye(3))
     with pytest.raises(ValueError, match="rotations must be orthonormal"):
         live.push_view("cam2", own, 0.0, 2 * np.eye(4))
-    with pytest.raises(ValueError, match="cam2 moves: give a pose with what it sees at 99 s"):
+    with pytest.raises(ValueError, match="camera cam2 moves; give a pose with its view at 99 s"):
         live.push_view("cam2", own, 99.0)
 
 

@@ -115,7 +115,7 @@ def test_a_swap_is_mended_and_only_who_was_in_it_is_solved(scene, people):
 
 
 def test_without_observations_it_is_said(scene, people):
-    with pytest.raises(ValueError, match="rows without observations cannot be solved anew"):
+    with pytest.raises(ValueError, match="rows without observations cannot be solved again"):
         solve(replace(people, observations=None), scene)
 
 
