@@ -1,7 +1,8 @@
-"""Whether an order of joints fits people: how far joints lie from each other, against how far a body's do.
+"""Tests of joint orders: distances between joints, compared with those of a body.
 
-Distances between joints of a person are compared with those of bodies in many poses from many sides. They are
-relative to the person's own size, so neither a unit nor a calibration is needed, and in space as in a picture.
+Distances between a person's joints are compared with those of bodies in many poses and views. They
+are relative to the person's size, so that neither unit nor calibration is needed, in 3D and in
+images alike.
 """
 
 from collections.abc import Sequence
@@ -16,33 +17,34 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Index
 
 _POSES = 1500
-"""Bodies that are drawn: means and sigmas of distances are then known to 3 per cent."""
+"""Number of sampled bodies; means and standard deviations of distances are then known to 3 %."""
 _NOISE_M = 0.015
-"""Error of a joint along each axis, m: a good detector's."""
+"""Standard deviation of a joint along each axis, m, as of a good detector."""
 _OUTLIER, _OUTLIER_SIGMA = 0.1, 1.0
-"""Share of distances that are not a body's, and the sigma of their logarithm: a detector puts a joint that it does
-not find anywhere on the person."""
+"""Share of outlier distances, and standard deviation of their logarithm: a detector places joints
+that it does not find anywhere on the person."""
 _NEAREST = 0.02
-"""Least distance that counts, as a part of the mean distance: joints in one pixel are no nearer."""
+"""Minimum distance, as a share of the mean distance; limits the effect of joints in one pixel."""
 LIKE_A_BODY = -1.0
-"""Least fit in pictures of what looks like a body at all, nats a pair; gowned people at a table have -1."""
+"""Minimum fit in images of anything like a body, nats per pair; gowned people at a
+table have -1."""
 _LEAST_PAIRS = 20
-"""With fewer distances a person does not tell an order: seven joints."""
+"""Minimum number of distances for a person to be informative: seven joints."""
 
 
 @dataclass(frozen=True)
 class _Distances:
-    """Logarithms of distances between `BODY_POINTS`, relative to the mean over all pairs of a body."""
+    """Log-distances between `BODY_POINTS`, relative to the mean over all pairs of a body."""
 
     mean: Array
-    """(P, P)."""
+    """(P, P) mean over poses, builds and views."""
     sigma: Array
-    """(P, P) standard deviation over poses, builds and sides."""
+    """(P, P) standard deviation over poses, builds and views."""
 
 
 @cache
 def _distances(dimensions: int) -> _Distances:
-    """Those in space (3), or in pictures of upright cameras (2)."""
+    """Statistics of distances in 3D (3), or in images of upright cameras (2)."""
     rng = np.random.default_rng(0)
     betas, pose = np.clip(rng.normal(size=(_POSES, 10)), -2, 2), PosePrior.default().sample(rng, _POSES)
     body = BodyModel.default().with_keypoints(BODY_POINTS)
@@ -65,10 +67,12 @@ def _distances(dimensions: int) -> _Distances:
 
 
 def fit_of_order(people: Array, points: Sequence[str]) -> Array:
-    """(N,) how well people (N, K, 2 or 3), NaN where not seen, fit if their joints are the `points` (K).
+    """(N,) fit of people (N, K, 2 or 3), NaN where not seen, under the order `points` (K) of their
+    joints.
 
-    It is the mean log likelihood of their distances, nats a pair; NaN where too few joints are seen. A point that
-    is not of `BODY_POINTS` may be anywhere. Right orders have more than -0.5, mostly, and others -1 to -2.
+    It is the mean log-likelihood of their distances, nats per pair; NaN if too few joints are seen.
+    A point not in `BODY_POINTS` may be anywhere. Correct orders mostly have more than -0.5, others
+    -1 to -2.
     """
     first, second = np.triu_indices(len(points), 1)
     logs = _logs(people, first, second)
@@ -84,10 +88,12 @@ def fit_of_order(people: Array, points: Sequence[str]) -> Array:
 
 
 def exchanges(people: Array, points: Sequence[str], groups: Sequence[Sequence[tuple[int, int]]]) -> list[int]:
-    """The order in which people (N, K, 2 or 3) fit a body better, found from the order of the `points` (K) on.
+    """Improve the order `points` (K) of the joints of people (N, K, 2 or 3): the order that fits a
+    body better.
 
-    Entry k is the place of the joint that `points[k]` should be. Each step exchanges two joints, or one of the
-    `groups` of pairs of joints, whichever gains most; it is `range(K)` where none gains.
+    Entry k is the index of the joint that should be `points[k]`. Each step exchanges two joints, or
+    one of the `groups` of pairs of joints, whichever gains most; the result is `range(K)` if
+    nothing gains.
     """
     count = len(points)
     place = np.array([BODY_POINTS.index(point) for point in points])
@@ -96,7 +102,8 @@ def exchanges(people: Array, points: Sequence[str], groups: Sequence[Sequence[tu
     mean, sigma = distances.mean[np.ix_(place, place)], distances.sigma[np.ix_(place, place)]
     logs = _logs(people, first, second)
     logs = logs - _mean(logs - mean[first, second])[:, None]
-    # What joints k and m of the file say if they are a and b of the body, mean over people: (k, m, a, b).
+    # Mean log-likelihood over people if joints k and m of the file are a and b of the body: (k, m,
+    # a, b).
     worth = np.zeros((count, count, count, count))
     for n, (k, m) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
         seen = logs[np.isfinite(logs[:, n]), n]
@@ -130,21 +137,21 @@ def _exchanged(order: Index, pairs: Sequence[tuple[int, int]]) -> Index:
 
 
 def _logs(people: Array, first: Index, second: Index) -> Array:
-    """(N, M) logarithms of the distances of M pairs of joints, NaN where one was not seen."""
+    """(N, M) logarithms of the distances of M pairs of joints, NaN if either joint is not seen."""
     apart = np.linalg.norm(people[:, first] - people[:, second], axis=-1)
     least = np.exp(_mean(np.log(np.where(apart > 0, apart, np.nan))))
     return np.log(np.maximum(apart, _NEAREST * np.nan_to_num(least, nan=1.0)[:, None]))
 
 
 def _mean(values: Array) -> Array:
-    """(N,) means over the finite ones of each row (N, M); NaN where there is none."""
+    """(N,) mean of the finite values in each row (N, M); NaN if there are none."""
     there = np.isfinite(values)
     total, count = np.where(there, values, 0.0).sum(axis=1), there.sum(axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _log_density(off: Array, sigma: Array) -> Array:
-    """The log density of deviations of logarithms: Gaussian, and some anywhere."""
+    """Log-density of deviations of log-distances: a Gaussian with a wide outlier component."""
     inside = (1 - _OUTLIER) / sigma * np.exp(-0.5 * (off / sigma) ** 2)
     outside = _OUTLIER / _OUTLIER_SIGMA * np.exp(-0.5 * (off / _OUTLIER_SIGMA) ** 2)
     return np.log(np.maximum((inside + outside) / np.sqrt(2 * np.pi), 1e-6))

@@ -12,4 +12,4 @@ Mask = NDArray[np.bool_]
 Real = NDArray[np.floating]
 """Real numbers of any precision."""
 Whole = NDArray[np.integer]
-"""Whole numbers of any size."""
+"""Integers of any size."""

@@ -6,11 +6,13 @@ from shapepose_fg.core.arrays import Array, Index
 
 
 def least_cost_pairs(cost: Array) -> tuple[Index, Index]:
-    """Rows, rising, and columns of the pairs, each row or column once, whose costs (R, C) have the least sum.
+    """One-to-one pairs with the least total cost: row and column indices of the costs (R, C), rows
+    ascending.
 
-    As many pairs as can be. ValueError where costs are not finite.
+    There are min(R, C) pairs. ValueError if costs are not finite.
     """
-    # That of scipy.optimize loads for another quarter of a second; tracks are joined with this one, too.
+    # scipy.optimize's solver takes a quarter of a second longer to import; `tracking` uses this
+    # one, too.
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
@@ -18,6 +20,6 @@ def least_cost_pairs(cost: Array) -> tuple[Index, Index]:
         raise ValueError("costs must be finite")
     if cost.size == 0:
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    # A cost of 0 would be no pair; what all costs have in common decides nothing.
+    # A cost of 0 would mean "no edge". A constant added to all costs does not change the solution.
     rows, columns = min_weight_full_bipartite_matching(csr_array(cost - cost.min() + 1.0))
     return rows.astype(np.intp), columns.astype(np.intp)

@@ -1,4 +1,4 @@
-"""Settings with bounds, which are declared in the type of a field and checked whenever a setting is created."""
+"""Settings with bounds: declared in the type of a field, and checked whenever settings are created."""
 
 from functools import cache
 from typing import Annotated, Any, get_type_hints
@@ -36,7 +36,7 @@ class Settings:
 
 
 def range_of(kind: type, name: str) -> str | None:
-    """The bounds of a field in words, such as "above 0, at most 10"; None where it has none."""
+    """The bounds of a field in words, such as "above 0, at most 10"; None if it has none."""
     interval = _intervals(kind).get(name) if issubclass(kind, Settings) else None
     if interval is None:
         return None
@@ -46,7 +46,7 @@ def range_of(kind: type, name: str) -> str | None:
 
 @cache
 def _intervals(kind: type) -> dict[str, Interval]:
-    """The bounds of each field that has some."""
+    """The bounds of each field that has bounds."""
     found = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         for each in getattr(hint, "__metadata__", ()):
@@ -56,7 +56,7 @@ def _intervals(kind: type) -> dict[str, Interval]:
 
 
 def _problem(interval: Interval, value: Any) -> str | None:
-    """The bound that a value violates, in words; None where it is within. NaN is within no bounds."""
+    """The bound that a value violates, in words; None if it is within. NaN violates all bounds."""
     low, high = interval.gt if interval.ge is None else interval.ge, interval.le
     inside = low < value <= high if interval.ge is None else low <= value <= high
     if inside:

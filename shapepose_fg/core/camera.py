@@ -1,4 +1,4 @@
-"""Pinhole cameras in the world, rigs of them, and their views over time."""
+"""Pinhole cameras in the world, rigs of cameras, and their views over time."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,11 +15,12 @@ from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distort
 from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
-"""A world axis, as a calibration names the direction that is up."""
+"""A world axis, used to name the up direction of a calibration."""
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST_PIXELS, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 200
-"""No picture, room, lens or name is as large; what is computed of larger numbers overflows."""
+"""Upper bounds of the size of a picture, pixels, of distortion coefficients, and of the length of a
+name. Real values are smaller; larger ones would cause overflows."""
 LONGEST_READOUT_S = 0.1
 """Longest readout time that is accepted, s: rolling shutters take 5 to 30 ms."""
 
@@ -40,12 +41,12 @@ class Camera:
     """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2 p1 p2 k3,
     or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
     lens: Lens = "perspective"
-    """Which of OpenCV's families the coefficients belong to."""
+    """Lens model of OpenCV to which the coefficients belong."""
     readout_s: float = 0.0
     """Time that a rolling shutter takes from the first row of a picture to the last, s; a picture's time is
     that of its middle row."""
     carrier: str = ""
-    """The name of the trajectory that carries the camera; empty for a camera that stands still."""
+    """The name of the trajectory that carries the camera; empty for a fixed camera."""
     bTc: Array = field(default_factory=lambda: np.eye(4))
     """(4, 4) carrier-from-camera pose, metres; `wTc` is the pose at the start of the trajectory."""
 
@@ -95,8 +96,8 @@ class Camera:
     ) -> "Camera":
         """Make a camera from a camera-from-world matrix `cTw` (3, 4) or (4, 4): [R | t], metres.
 
-        The rotation is projected on the nearest orthonormal one, so that the few printed digits of a
-        calibration do not become a scale. `distortion` may leave out coefficients at its end.
+        The rotation is replaced by the nearest orthonormal one, so that rounding in a calibration
+        file does not act as a scale. Trailing coefficients may be missing in `distortion`.
         """
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
@@ -128,13 +129,15 @@ class Camera:
     def undistort(self, xy: Array) -> Array:
         """Map measured pixels (N, 2) to the pixels of the same camera without distortion.
 
-        NaN where there is no such pixel: beyond what the lens's polynomial reaches, or at 90 degrees and more
-        from the axis of a fisheye.
+        NaN if there is no such pixel: beyond the range in which the distortion polynomial can be
+        inverted, or 90 degrees and more from the axis of a fisheye.
         """
         return undistorted(np.asarray(xy, dtype=np.float64), self.K, self.distortion, self.lens)
 
     def distort(self, xy: Array) -> Array:
-        """Map undistorted pixels (N, 2) to the pixels that the real lens gives (inverse of `undistort`)."""
+        """Map undistorted pixels (N, 2) to distorted pixels, as in the original pictures (inverse
+        of `undistort`).
+        """
         return distorted(np.asarray(xy, dtype=np.float64), self.K, self.distortion, self.lens)
 
 
@@ -147,15 +150,18 @@ class Rig:
     up: Axis
     """Which axis of the world points up."""
     dark: tuple[int, ...] = ()
-    """Views without a picture in the frame for which the rig was made; nobody is expected to be seen there."""
+    """Views without a picture in the frame for which the rig was made; no detections are expected
+    there."""
     doubted: tuple[int, ...] = ()
     """Views that contradict each other in the frame for which the rig was made; it is unknown which is wrong."""
     trajectories: tuple[Trajectory, ...] = ()
     """Trajectories of the carriers of moving cameras; two cameras on one robot share its trajectory."""
     notes: tuple[str, ...] = field(default=(), compare=False)
-    """Notes, a sentence each, on what a reader left out of the calibration file or assumed."""
+    """Notes of the reader, a sentence each, on ignored parts of the calibration file and on
+    assumptions."""
     unwanted: tuple[str, ...] = field(default=(), compare=False)
-    """Names of cameras that `only` left out: their detections are skipped, while an unknown camera is an error."""
+    """Names of cameras that `only` left out: their detections are ignored, whereas detections of an
+    unknown camera are an error."""
 
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
@@ -176,7 +182,7 @@ class Rig:
     def only(self, names: Iterable[str]) -> "Rig":
         """A rig with the cameras of these names, in this rig's order.
 
-        Trajectories that carry none of them are left out. ValueError where there is no such camera.
+        Trajectories that carry none of these cameras are left out. ValueError for an unknown name.
         """
         names = choose(self.names, only=list(names))
         views = [view for view, name in enumerate(self.names) if name in names]
@@ -197,7 +203,7 @@ class Rig:
         return replace(self, cameras=tuple(cameras))
 
     def without(self, names: Iterable[str]) -> "Rig":
-        """A rig with all cameras but those of these names; ValueError where there is no such camera."""
+        """A rig with all cameras but those of these names; ValueError for an unknown name."""
         return self.only(choose(self.names, without=list(names)))
 
     @property
@@ -207,13 +213,13 @@ class Rig:
 
     @cached_property
     def carrier(self) -> Index:
-        """(V,) index of the trajectory of each view; -1 for a camera that stands still."""
+        """(V,) index of the trajectory of each view; -1 for a fixed camera."""
         known = [each.name for each in self.trajectories]
         return np.array([known.index(each.carrier) if each.carrier else -1 for each in self.cameras], np.intp)
 
     def poses(self, time_s: Array) -> Array:
-        """(..., V, 4, 4) world from camera at times (..., V), seconds; the nearest pose where a trajectory has
-        none.
+        """(..., V, 4, 4) world from camera at times (..., V), seconds; outside of a trajectory, its
+        nearest pose.
         """
         wTc = np.empty((*time_s.shape, 4, 4))
         for view, (camera, number) in enumerate(zip(self.cameras, self.carrier.tolist(), strict=True)):
@@ -224,7 +230,7 @@ class Rig:
         return wTc
 
     def at(self, time_s: Array) -> "Rig":
-        """The rig at times `time_s` (V,), seconds; a rig whose cameras stand still is returned as it is."""
+        """The rig at times `time_s` (V,), seconds; a rig of fixed cameras is returned unchanged."""
         if not self.moves:
             return self
         cameras = [
@@ -251,7 +257,8 @@ class Rig:
     @cached_property
     def cTw(self) -> Array:
         """(V, 3, 4) camera-from-world matrices."""
-        # The order in memory is that of a copy in another process, so that both round alike.
+        # This memory order is also that of a copy in another process, so that rounding errors are
+        # equal.
         return np.ascontiguousarray(np.stack([camera.cTw for camera in self.cameras]))
 
     @property
@@ -279,7 +286,7 @@ class Rig:
     def project(self, points_world: Array) -> tuple[Array, Array]:
         """Project `points_world` (..., 3) into every view: undistorted pixels (V, ..., 2), depths (V, ...).
 
-        NaN pixels where the depth is not positive.
+        Pixels are NaN if the depth is not positive.
         """
         shape = points_world.shape[:-1]
         flat = points_world.reshape(-1, 3)
@@ -300,9 +307,10 @@ class Rig:
 
 
 def choose(known: Sequence[str], only: Sequence[str] | None = None, without: Sequence[str] = ()) -> list[str]:
-    """The names of cameras among those `known` that are in `only` (None: all) and not in `without`.
+    """Select names of cameras: those of `known` that are in `only` (None: all) and not in
+    `without`.
 
-    ValueError that lists the known ones where a name is not among them, or no camera remains.
+    ValueError, which lists the known names, if a name is unknown or no camera remains.
     """
     for name in [*(only or []), *without]:
         if name not in known:
@@ -319,15 +327,16 @@ class Views:
     """The cameras of N rows (people, frames or both); moving cameras have a pose for each row."""
 
     K: Array
-    """(V, 3, 3) intrinsic matrices of cameras that are the same for all rows, or (N, V, 3, 3), pixels."""
+    """(V, 3, 3) intrinsic matrices, pixels, if they are the same for all rows; otherwise (N, V, 3,
+    3)."""
     cTw: Array
-    """(V, 3, 4) camera from world of cameras that stand still, or (N, V, 3, 4), metres."""
+    """(V, 3, 4) camera from world, metres, for fixed cameras; otherwise (N, V, 3, 4)."""
     image_sizes: Array | float = np.inf
-    """(V, 2) width and height, pixels; infinite where they are not known."""
+    """(V, 2) width and height, pixels; infinite if unknown."""
     readout_s: Array | float = 0.0
     """(V,) time from the first row of a picture to the last, seconds."""
     carried: Carried | None = None
-    """Poses of the carriers of moving cameras, row by row; None where all cameras stand still."""
+    """Poses of the carriers of moving cameras, row by row; None if all cameras are fixed."""
 
     def __post_init__(self) -> None:
         K, cTw = self.K, self.cTw
@@ -342,7 +351,7 @@ class Views:
     def of(cls, rig: Rig, time_s: Array | None = None) -> "Views":
         """The cameras of a rig; for moving cameras at `time_s` (N, V), seconds, the times of each row's views.
 
-        ValueError where cameras move and no times are given.
+        ValueError if cameras move and no times are given.
         """
         readout_s = np.array([camera.readout_s for camera in rig.cameras])
         if not rig.moves:
@@ -359,7 +368,7 @@ class Views:
 
     @property
     def rows_known(self) -> int | None:
-        """N where cameras are given row by row; None where all rows have the same."""
+        """N if cameras differ from row to row; None if all rows have the same cameras."""
         lengths = [len(array) for array in (self.K, self.cTw) if array.ndim == 4]
         return lengths[0] if lengths else None
 
@@ -370,15 +379,17 @@ class Views:
 
     @cached_property
     def projection(self) -> Array:
-        """(1, V, 3, 4) or (N, V, 3, 4) projection matrices K [R | t]: from points to pixels times depth, and
-        depth.
+        """(1, V, 3, 4) or (N, V, 3, 4) projection matrices K [R | t]: they map points to (depth
+        times pixels, depth).
         """
         both = self.K @ self.cTw
         return np.ascontiguousarray(both.reshape(-1, *both.shape[-3:]))
 
     @cached_property
     def focal(self) -> Array:
-        """(1, V) or (N, V) focal lengths as in `focal_px`, with as many rows as `projection` has."""
+        """(1, V) or (N, V) focal lengths as in `focal_px`, with the same number of rows as
+        `projection`.
+        """
         return np.array(np.broadcast_to(self.focal_px, self.projection.shape[:2]), order="C")
 
     def rows(self, index: Index) -> "Views":
@@ -397,12 +408,14 @@ class Views:
     def project(self, points: Array) -> tuple[Array, Array, Array]:
         """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J, 3), metres.
 
-        Undistorted pixels; they and the derivatives are NaN where the depth is not positive.
+        Pixels are undistorted. Pixels and derivatives are NaN if the depth is not positive.
         """
         return self.project_apart(points[:, :, None])
 
     def project_apart(self, points: Array) -> tuple[Array, Array, Array]:
-        """Project `points` (N, J, V, 3) that differ from view to view; returns what `project` returns."""
+        """Project `points` (N, J, V, 3), metres, with a different point for each view; returns the
+        same as `project`.
+        """
         K, cTw = (array[:, None] if array.ndim == 4 else array for array in (self.K, self.cTw))
         return project_with_jacobian(points, K, cTw)
 

@@ -1,9 +1,10 @@
 """Functions over rows, joints and frames, compiled by Numba once per machine and cached (`core/kept_kernels.py`).
 
-A kernel takes whole arrays of the types that it names (C-contiguous; for others it is compiled again) and writes
-into arrays that it is given, so that one call from Python serves many rows. Kernels and parts of any file may call
-each other. Anything else that a kernel uses from another file, such as a number, must not change (or must change
-its name).
+A kernel takes whole arrays of the declared types (C-contiguous; for other types it is compiled
+again) and writes its results into arrays that are passed to it, so that one call from Python
+processes many rows. Kernels and parts of any file may call each other. Anything else that a kernel
+uses from another file, such as a constant, is compiled in: if its value changes, it needs a new
+name.
 """
 
 import logging
@@ -31,11 +32,12 @@ _lock = RLock()
 
 
 def kernel(*kinds: str | type) -> Callable[[F], F]:
-    """The function, compiled for arguments of these `kinds`. Sums may be taken in another order, NaN and infinity
-    are kept.
+    """Compile a function for arguments of these `kinds`. Sums may be reordered; NaN and infinity
+    are preserved.
 
-    A letter is the type of numbers (f float64, i intp, b bool, s float32, w int32, u uint8) and a digit how many
-    axes the array has, 0 for a number: "f2 i1 f0". A NamedTuple class has `kinds` of its own.
+    In a kind, the letter is the type of the numbers (f float64, i intp, b bool, s float32, w int32,
+    u uint8) and the digit the number of axes of the array, 0 for a scalar: "f2 i1 f0". A NamedTuple
+    class has its own `kinds`.
     """
 
     def compiled(function: F) -> F:
@@ -47,7 +49,9 @@ def kernel(*kinds: str | type) -> Callable[[F], F]:
 
 
 def part(function: F) -> F:
-    """A function that kernels call and Python cannot; it is compiled with them, in less time than a kernel."""
+    """A function that only kernels can call. It is compiled together with them, in less time than a
+    kernel.
+    """
     return cast(F, _njit(no_cpython_wrapper=True, forceinline=True)(function))
 
 
@@ -59,7 +63,7 @@ class Kernel:
         self.py_func, self.kinds = function, kinds
         self.name = f"{function.__module__}:{function.__qualname__}"
         self.loaded: Any = None
-        """Numba's function, once the kernel was called."""
+        """Numba's function; None before the first call."""
 
     def __call__(self, *arguments: Any) -> Any:
         return (self.loaded or self.load())(*arguments)
@@ -68,8 +72,8 @@ class Kernel:
         return self.py_func.__qualname__
 
     def load(self) -> Any:
-        """Read or compile the kernel for the types that it names, with all others that are missing; returns
-        `loaded`.
+        """Read the kernel from the cache, or compile it together with all other missing kernels;
+        returns `loaded`.
         """
         with _lock:
             if NUMBA.DISABLE_JIT:
@@ -87,7 +91,9 @@ class Kernel:
         return folder is not None and (folder / self.py_func.__qualname__).exists()
 
     def _read_or_compile(self) -> Any:
-        """Numba's function with its cache; None where nothing can be cached. A damaged cache is removed."""
+        """Numba's function with its cache; None if the cache cannot be used. A damaged cache is
+        removed.
+        """
         for _ in range(2):
             folder = module_folder(self.py_func.__module__)
             if folder is None:
@@ -98,10 +104,10 @@ class Kernel:
                 self._compile(function)
                 (folder / self.py_func.__qualname__).touch()
                 return function
-            except Exception as error:  # whatever unpickling a damaged file raises; or the disk is full
+            except Exception as error:  # of unpickling a damaged file, or a full disk
                 logging.getLogger(__name__).debug("%s: %r", folder, error)
                 if function is not None and signature(self) in function.overloads:
-                    return function  # compiled, but not kept
+                    return function  # compiled, but not cached
                 shutil.rmtree(folder, ignore_errors=True)
                 module_folder.cache_clear()
         return None
@@ -122,7 +128,7 @@ def _njit(**options: Any) -> Any:
 
 
 def signature(kernel: Any) -> tuple[Any, ...]:
-    """The types of a kernel's arguments, as Numba has them."""
+    """The types of a kernel's arguments, as Numba types."""
 
     def types(kinds: Sequence[str | type]) -> tuple[Any, ...]:
         return tuple(

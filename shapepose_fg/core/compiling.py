@@ -15,20 +15,22 @@ from typing import Any
 from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
 _BYTES_S = 1300
-"""Bytes of Python code that an average machine compiles in a second."""
+"""Bytes of Python bytecode that an average machine compiles in a second."""
 _WORTH_S = 3.0
 """Compile time below which kernels are compiled in this process, s: starting a process takes a second."""
 _MOST = 8
-"""Maximum number of processes: the longest kernel takes an eighth of the whole time."""
+"""Maximum number of processes: the longest kernel takes an eighth of the total time, so more
+processes give no speed-up."""
 
 _tried = False
-"""Whether this process has compiled the missing kernels; any that are missing later are compiled when called."""
+"""Whether this process has compiled the missing kernels; kernels that are missing later are
+compiled when they are called."""
 
 
 def compile_beside(kernels: Sequence[Any]) -> None:
     """Compile those of the kernels that are not cached, in as many processes as there are cores; once per process.
 
-    Waits for another process that compiles.
+    If another process is compiling, waits for it.
     """
     global _tried
     if _tried:
@@ -55,8 +57,8 @@ def compile_beside(kernels: Sequence[Any]) -> None:
 
 
 def _share_out(kernels: Sequence[Any], count: int) -> None:
-    """Compile by `count` processes, each of which takes the largest group that is left: a module's kernels, which
-    have parts in common, or one of them where a module is large.
+    """Compile with `count` processes. Each repeatedly takes the largest remaining group: the
+    kernels of a module, which share parts, or a single kernel of a large module.
     """
     modules: dict[str, list[Any]] = {}
     for each in kernels:
@@ -65,11 +67,11 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
     groups = [p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])]
     groups.sort(key=_work, reverse=True)
     words = [",".join(each.name for each in group) for group in groups]
-    # The same packages as here, whatever lies in the working folder.
+    # The same packages as in this process, whatever is in the working directory.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)}
     command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", *words]
     started = list[subprocess.Popen[Any]]()
-    numbers, to = os.pipe()  # of groups, two bytes each, which all processes read
+    numbers, to = os.pipe()  # pipe of group numbers, two bytes each, from which all processes read
     try:
         os.write(to, b"".join(n.to_bytes(2) for n in range(len(groups))))
         os.close(to)
@@ -78,7 +80,7 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
             started.append(subprocess.Popen(command, env=environment, stdin=numbers, **quiet))
         for each in started:
             each.wait()
-    except OSError as error:  # without processes kernels are compiled where they are called
+    except OSError as error:  # without processes, kernels are compiled when they are called
         logging.getLogger(__name__).debug("%r", error)
     finally:
         os.close(numbers)
@@ -88,8 +90,8 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
 
 
 def main() -> None:
-    """Compile groups of kernels that the command line names, as a process of `compile_beside`: those whose numbers
-    it reads from standard input.
+    """Entry point of a process of `compile_beside`: the command line names groups of kernels, and
+    standard input has the numbers of the groups that this process compiles.
     """
     global _tried
     _tried = True
@@ -102,7 +104,9 @@ def main() -> None:
 
 @contextmanager
 def saying(what: str) -> Iterator[None]:
-    """Log `what` if the block takes a second: as a warning, which Python shows where no logs are set up."""
+    """Log `what` if the block takes more than a second; as a warning, which Python prints even if
+    logging is not configured.
+    """
     timer = Timer(1.0, logging.getLogger(__name__).warning, [what])
     timer.daemon = True
     if what:
@@ -115,13 +119,13 @@ def saying(what: str) -> Iterator[None]:
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """Wait until no other process compiles."""
+    """Wait until no other process is compiling."""
     from filelock import FileLock
 
     place = kept_folder()
     lock = None if place is None else FileLock(place / "compiling.lock")
     waiting = saying("waiting for another process that compiles the functions for this machine")
-    with waiting, suppress(OSError, NotImplementedError):  # file systems that have no locks, or are full
+    with waiting, suppress(OSError, NotImplementedError):  # some file systems have no locks, or are full
         if lock is not None:
             lock.acquire()
     try:
@@ -132,12 +136,12 @@ def _alone() -> Iterator[None]:
 
 
 def _work(kernels: Sequence[Any]) -> int:
-    """Bytes of Python code to compile for kernels: a measure of the time that it takes."""
+    """Bytes of bytecode of the kernels and all that they call: a measure of the compile time."""
     return sum(len(each.__code__.co_code) for kernel in kernels for each in _pieces(kernel.py_func))
 
 
 def _pieces(function: Any) -> set[Any]:
-    """A function and all kernels and parts that it calls, or these do."""
+    """A function and all kernels and parts that it calls, directly or indirectly."""
     known, waiting = {function}, [function]
     while waiting:
         one = waiting.pop()

@@ -1,8 +1,9 @@
-"""Decompositions of matrices without arbitrary signs: the same numbers on every processor, up to rounding.
+"""Decompositions of matrices without arbitrary signs: equal results on every processor, up to
+rounding.
 
-LAPACK returns eigenvectors and singular vectors with signs, and bases of repeated values, that depend on the
-processor's kernels. They must not reach a result or a random draw, so that only this module and `factors` call
-`eigh`, `svd` and `qr`.
+LAPACK returns eigenvectors and singular vectors with signs, and bases of repeated values, that
+depend on the processor's kernels. Results and random draws must not depend on them. Therefore only
+this module and `factors` call `eigh`, `svd` and `qr`.
 """
 
 import numpy as np
@@ -10,10 +11,10 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 
 ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of R Rᵀ from the identity: calibrations are printed with four to six digits."""
+"""Tolerance for R Rᵀ minus the identity: calibration files have four to six digits."""
 _SIDE = np.sqrt([2.0, 3.0, 5.0])
-"""Reference direction: axes point to its side, and no axis of a symmetrical arrangement is at right angles to
-it."""
+"""Reference direction for the signs of axes. It is not perpendicular to any axis of a symmetrical
+arrangement."""
 
 
 def is_rotation(R: Array) -> bool:
@@ -22,7 +23,7 @@ def is_rotation(R: Array) -> bool:
 
 
 def rigid(R: Array, t: Array) -> Array:
-    """(..., 4, 4) matrices that rotate by R (..., 3, 3), then move by t (..., 3)."""
+    """(..., 4, 4) rigid transformations with rotations R (..., 3, 3) and translations t (..., 3)."""
     found = np.zeros((*np.shape(t)[:-1], 4, 4))
     found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = R, t, 1.0
     return found
@@ -35,7 +36,7 @@ def symmetric_root(matrix: Array) -> Array:
 
 
 def raise_eigenvalues(matrix: Array, least: float) -> Array:
-    """Matrices (..., n, n) whose symmetric parts have had eigenvalues below `least` raised to it."""
+    """Matrices (..., n, n): the symmetric part, with eigenvalues below `least` raised to it."""
     values, vectors = np.linalg.eigh((matrix + matrix.mT) / 2)
     return (vectors * np.maximum(values, least)[..., None, :]) @ vectors.mT
 
@@ -43,8 +44,9 @@ def raise_eigenvalues(matrix: Array, least: float) -> Array:
 def principal_axes(covariance: Array) -> tuple[Array, Array]:
     """Variances (..., 3) along the principal axes, ascending, and the axes as columns of rotations (..., 3, 3).
 
-    The second and third axis point to the side of (√2, √3, √5), the first makes the matrix a rotation. Axes of
-    equal variances are not unique: use them only for what is the same for each choice.
+    The second and third axis have a positive component along (√2, √3, √5); the sign of the first
+    makes the matrix a rotation. Axes of equal variances are not unique: use them only for results
+    that do not depend on the choice.
     """
     variances, axes = np.linalg.eigh(covariance)
     axes = axes * np.where(np.einsum("i,...ia->...a", _SIDE, axes) < 0, -1.0, 1.0)[..., None, :]
@@ -60,7 +62,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def basis_across(axis: Array) -> Array:
-    """(2, 3) orthonormal directions at right angles to a unit vector `axis` (3,) (Duff et al. 2017)."""
+    """(2, 3) orthonormal directions perpendicular to a unit vector `axis` (3,) (Duff et al. 2017)."""
     x, y, z = axis
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)

@@ -25,14 +25,17 @@ class Detections:
     confidence: Array
     """(D,) the detector's score, 0 to 1."""
     pairs: Index
-    """(E, 2) two candidates of one view that a limb of the skeleton joins, first joint of the limb first."""
+    """(E, 2) pairs of candidates of one view that are connected by a limb, the limb's first joint
+    first."""
     affinity: Array
-    """(E,) how well the image supports that the two belong to one person; a pair not listed has 0."""
+    """(E,) affinity of each pair: support of the image that both belong to one person; 0 for pairs
+    that are not listed."""
     place: Index = None  # type: ignore[assignment]
-    """(D,) index of each candidate among those of its view in the recording, independent of later filtering;
-    counted here where it is not given."""
+    """(D,) index of each candidate among those of its view in the recording, independent of later
+    filtering; by default counted in these detections."""
     mirrored: Array = None  # type: ignore[assignment]
-    """(D,) how probably each is of the other side of the body (`tracking/sides.py`); 0 where it is not given."""
+    """(D,) probability that the candidate belongs to the other side of the body
+    (`tracking/sides.py`); 0 by default."""
 
     def __post_init__(self) -> None:
         count = len(self.view)
@@ -77,8 +80,8 @@ class Detections:
 
     @cached_property
     def ties(self) -> tuple[Index, Index, Array]:
-        """(D + 1,) where the pairs of each candidate begin, (2 E,) their other ends and (2 E,) their
-        affinities.
+        """Pairs by candidate, in CSR form: (D + 1,) offsets, (2 E,) the other candidate of each
+        pair, and (2 E,) affinities.
         """
         ends = self.pairs.ravel()
         by_end = np.argsort(ends, kind="stable")
@@ -87,11 +90,13 @@ class Detections:
         return begin, other, np.repeat(np.require(self.affinity, float), 2)[by_end]
 
     def only(self, keep: Mask) -> "Detections":
-        """The candidates of the mask `keep` (D,), and the affinities between them."""
+        """The candidates selected by the mask `keep` (D,), and the affinities between them."""
         return self.rows(np.flatnonzero(keep))
 
     def rows(self, index: Index) -> "Detections":
-        """The candidates `index` (K,), each once, in that order, and the affinities between them."""
+        """The candidates `index` (K,), without repetitions, in that order, and the affinities
+        between them.
+        """
         place = np.full(len(self), -1, dtype=np.intp)
         place[index] = np.arange(len(index))
         pairs = place[self.pairs]
@@ -109,7 +114,7 @@ class Detections:
 
     @classmethod
     def joined(cls, parts: Sequence["Detections"]) -> "Detections":
-        """The candidates of one or more parts, one part after the other, with the affinities of each."""
+        """Concatenate the candidates of one or more parts, with the affinities within each part."""
         names = ("view", "joint", "xy", "confidence", "affinity", "place", "mirrored")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         starts = np.cumsum([0, *(len(part) for part in parts)])
@@ -118,13 +123,13 @@ class Detections:
 
     @classmethod
     def empty(cls) -> "Detections":
-        """A frame in which no view saw anything."""
+        """A frame without detections."""
         none = np.zeros(0, dtype=np.intp)
         return cls(none, none, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), dtype=np.intp), np.zeros(0))
 
 
 def _place_in_view(view: Index) -> Index:
-    """(D,) the place of each detection among those of the same view."""
+    """(D,) index of each detection among those of the same view."""
     order = np.argsort(view, kind="stable")
     place = np.empty(len(view), dtype=np.intp)
     place[order] = np.arange(len(view)) - np.searchsorted(view[order], view[order])
@@ -148,9 +153,11 @@ class Input:
 
 
 class DetectionSequence(Protocol):
-    """Frames of detections, in order: what readers and the simulator give and the pipeline takes.
+    """Frames of detections, in order: the type that readers and the simulator return, and that the
+    pipeline takes.
 
-    Any object with these members serves; a list of `Detections` in a `Recording` is the simplest.
+    Any object with these members can be used; a list of `Detections` in a `Recording` is the
+    simplest.
     """
 
     @property
@@ -184,7 +191,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class DerivedFrames:
-    """A recording that is derived from another, frame by frame: the base of those that leave something out."""
+    """Base of recordings that are derived frame by frame from another one, for example with some
+    detections left out.
+    """
 
     frames: DetectionSequence
     """The original recording."""

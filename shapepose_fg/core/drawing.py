@@ -1,4 +1,4 @@
-"""What all visualisations share: a colour per person, bones between joints, and simplified surfaces."""
+"""Shared by all visualisations: a colour per person, bones between joints, and simplified surfaces."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,16 @@ room."""
 
 
 def colour_of(person: int) -> tuple[float, float, float]:
-    """Red, green and blue of an identity, 0 to 1 in sRGB: the same in all files of a result."""
+    """Colour of an identity, the same in all files of a result: red, green and blue, 0 to 1 in
+    sRGB.
+    """
     red, green, blue = (int(PALETTE[person % len(PALETTE)][at : at + 2], 16) / 255 for at in (1, 3, 5))
     return red, green, blue
 
 
 def bones_of(joint_names: tuple[str, ...]) -> Index:
-    """(B, 2) pairs of joints to connect with lines: each joint of BODY_25 and the nearest existing one towards
-    the hip.
+    """(B, 2) pairs of joint indices to connect by lines. Each joint of BODY_25 is connected with
+    the nearest available joint towards the hip.
     """
     rows = zip(BODY_25.joints, BODY_25.parents, strict=True)
     parents = {name: BODY_25.joints[parent] for name, parent in rows if parent >= 0} | {"Head": "Neck"}
@@ -49,12 +51,12 @@ def vertex_normals(vertices: Real, faces: Whole) -> Array:
 def thinned(
     vertices: Array, faces: Whole, cell_m: float = CELL_M, corner: Array | float = 0.0
 ) -> tuple[Index, NDArray[np.int32], Index]:
-    """Simplify a mesh: indices (M,) of the vertices that stay, triangles (G, 3) of these, and the one for each
-    vertex (N,).
+    """Simplify a mesh by vertex clustering (Rossignac and Borrel 1993).
 
-    Of the vertices in a cell of a grid, from its `corner` on, the one nearest to their mean stands for all of
-    them; triangles that become lines or occur twice are removed (Rossignac and Borrel 1993). All stay if `cell_m`
-    is 0.
+    Returns indices (M,) of the vertices that remain, triangles (G, 3) of these, and for each vertex
+    (N,) the one that represents it. The grid has cells of `cell_m`, metres, and starts at `corner`.
+    In each cell, the vertex nearest to the mean represents all; triangles that become degenerate or
+    duplicate are removed. With `cell_m` 0 all remain.
     """
     if cell_m <= 0:
         every = np.arange(len(vertices))
@@ -67,7 +69,7 @@ def thinned(
     kept = order[np.r_[0, np.cumsum(count)[:-1]]]
     merged = cell[faces]
     whole = (merged != np.roll(merged, 1, axis=1)).all(axis=1)
-    # A triangle is the same whichever vertex comes first.
+    # The same triangle may start at any of its vertices.
     first = np.argmin(merged, axis=1)[:, None]
     turned = np.take_along_axis(merged, (first + np.arange(3)) % 3, axis=1)
     return kept, np.unique(turned[whole], axis=0).astype(np.int32), cell

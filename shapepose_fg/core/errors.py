@@ -1,4 +1,4 @@
-"""The exception whose message is written for the user: what is wrong with the input, where, and how to correct
+"""Exceptions with messages for the user: what is wrong with the input, where, and how to correct
 it.
 """
 
@@ -8,7 +8,8 @@ from importlib import import_module
 from types import ModuleType
 
 _LONGEST = 1000
-"""Maximum number of characters in a message: a file may hold a text of any length in place of a number."""
+"""Maximum number of characters in a message: a file may have a text of any length in place of a
+number."""
 
 
 class InputError(ValueError):
@@ -31,11 +32,13 @@ class NotDetermined(ValueError):
 
 
 class WorkLost(RuntimeError):
-    """A process ended before its work, which is not done; what was done before it is kept."""
+    """A process ended before its work was done; earlier work is kept."""
 
 
 def failure(error: BaseException) -> str | None:
-    """An error of the system, of memory or of a lost process, as the beginning of a sentence; None for others."""
+    """The beginning of a sentence about an operating-system error, a lack of memory or a lost
+    process; None for other errors.
+    """
     if isinstance(error, OSError):
         return f"{f'{error.filename}: ' if error.filename is not None else ''}{error.strerror or error}"
     if isinstance(error, MemoryError) or "allocate memory" in str(error):  # some libraries raise a RuntimeError
@@ -45,7 +48,9 @@ def failure(error: BaseException) -> str | None:
 
 @contextmanager
 def naming(place: object, cure: str = "") -> Iterator[None]:
-    """A ValueError inside the block is an InputError that names its place, with the `cure` at its end."""
+    """Context manager: a ValueError inside the block becomes an InputError that names `place`, with
+    `cure` at its end.
+    """
     try:
         yield
     except InputError:
@@ -55,7 +60,7 @@ def naming(place: object, cure: str = "") -> Iterator[None]:
 
 
 def optional(module: str, extra: str) -> ModuleType:
-    """A package of an extra; InputError with the command where it is not installed."""
+    """A package of an extra; InputError with the install command if it is missing."""
     try:
         return import_module(module)
     except ImportError:

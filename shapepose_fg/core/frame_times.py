@@ -13,13 +13,14 @@ from shapepose_fg.core.arrays import Array
 LEAST_FPS, MOST_FPS = 1e-3, 1e6
 """Lowest and highest accepted frame rate, Hz."""
 ASSUMED_FPS = 30.0
-"""Frame rate that is assumed where none is given, Hz."""
+"""Frame rate that is assumed if none is given, Hz."""
 
 
 def exact_rate(rate: float, apart: float) -> float:
-    """The exact frame rate that cameras have within `apart` of `rate`; `rate` itself where there is none.
+    """The usual frame rate of cameras within `apart` of `rate`, Hz; `rate` itself if there is none.
 
-    The nearest whole number or 1000 / 1001 of one (NTSC), else a fraction with a denominator of up to 10.
+    The candidates are the nearest integer, 1000 / 1001 of an integer (NTSC), or a fraction with a
+    denominator of up to 10.
     """
     whole, ntsc = Fraction(round(rate)), Fraction(1000 * round(1.001 * rate), 1001)
     nearest = min(whole, ntsc, key=lambda each: abs(each - Fraction(rate)))
@@ -28,16 +29,17 @@ def exact_rate(rate: float, apart: float) -> float:
 
 
 def typed_rate(fps: float) -> float:
-    """The exact rate for one that a user or a file gives with a few digits: 29.97 is 30000 / 1001."""
+    """The exact rate for a rate given with a few digits, Hz: 29.97 becomes 30000 / 1001."""
     return exact_rate(fps, 2e-6 * fps)
 
 
 def rate_of(time_s: Array) -> float:
-    """Frame rate of frames at rising times (T,), T at least 2; exact where times are rounded, or jitter.
+    """Frame rate, Hz, of frames at increasing times (T,), T at least 2; exact if times are rounded,
+    or jitter.
 
-    A step that is twice the median is counted as a dropped frame, and so on. The rate is as uncertain as the times
-    are off the line through them; where they are off by more than a quarter of a step, the median step gives the
-    rate.
+    A step of twice the median counts as one dropped frame, and so on. The rate is fitted by a line;
+    its uncertainty follows from the deviations of the times from this line. If these exceed a
+    quarter of a step, the median step gives the rate.
     """
     time_s = time_s - time_s[0]
     steps, lasts = np.diff(time_s), float(time_s[-1])
@@ -51,20 +53,22 @@ def rate_of(time_s: Array) -> float:
 
 
 LEAST_STEP_S = 1e-5
-"""Shortest time between two frames, s: the motion over less is singular."""
+"""Shortest time between two frames, s: over shorter times the motion model is numerically singular."""
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """The times of T frames; frame numbers count from 0 in the file, as in `Reconstruction.frame`."""
+    """The times of T frames; frames are numbered from 0 in the file, as in `Reconstruction.frame`."""
 
     time_s: Array
-    """(T,) seconds; or (T, V), a column for each camera, where they are not synchronised."""
+    """(T,) seconds; or (T, V), a column for each camera, if they are not synchronised."""
     source: str = "given"
     """Source of the times: "assumed", "fps", "given", or the name of a file."""
 
     def __post_init__(self) -> None:
-        """Check that times are finite and rise; ValueError naming the first frame that does not."""
+        """Check that times are finite and increasing; ValueError naming the first frame that does
+        not.
+        """
         time_s = np.asarray(self.time_s, dtype=np.float64)
         if time_s.ndim not in (1, 2):
             raise ValueError(f"time_s must be (T,) or (T, V), got {time_s.shape}")
@@ -93,14 +97,14 @@ class FrameTimes:
 
     @classmethod
     def assumed(cls, frames: int) -> "FrameTimes":
-        """Times of `frames` frames at 30 Hz, for recordings that state no rate; run.json says that it was
-        assumed.
+        """Times of `frames` frames at 30 Hz, for recordings without a known rate; run.json marks it
+        as assumed.
         """
         return cls(np.arange(frames) / ASSUMED_FPS, source="assumed")
 
     @property
     def frame_s(self) -> Array:
-        """(T,) the time of each frame: the mean over its cameras where each has its own."""
+        """(T,) the time of each frame: the mean over its cameras, if each has its own."""
         return self.time_s if self.time_s.ndim == 1 else self.time_s.mean(axis=1)
 
     def of_views(self, views: int) -> Array:
@@ -108,7 +112,9 @@ class FrameTimes:
         return self.time_s if self.time_s.ndim == 2 else np.repeat(self.time_s[:, None], views, axis=1)
 
     def check(self, frames: int, views: int) -> None:
-        """ValueError where these are not the times of a recording of `frames` frames and `views` cameras."""
+        """ValueError if the shape is not that of a recording of `frames` frames and `views`
+        cameras.
+        """
         if len(self) != frames:
             raise ValueError(f"times are needed for each of the {frames} frames, got {len(self)}")
         if self.time_s.ndim == 2 and self.time_s.shape[1] != views:
@@ -121,7 +127,7 @@ class FrameTimes:
 
 
 def rate_words(run: Mapping[str, Any]) -> str:
-    """The rate in a result's `run` in words, and whether it was assumed; empty where there is none."""
+    """The rate in a result's `run` in words, and whether it was assumed; empty if unknown."""
     told = run.get("time") or {}
     if told.get("fps") is None:
         return ""
@@ -130,9 +136,9 @@ def rate_words(run: Mapping[str, Any]) -> str:
 
 
 def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
-    """`cuts` if they are frames 1 to `frames` - 1 in rising order; ValueError otherwise.
+    """`cuts` if they are increasing frame numbers from 1 to `frames` - 1; ValueError otherwise.
 
-    A cut is the first frame of what follows it: nothing carries over from the frame before.
+    A cut is the number of the first frame after it. No track or motion continues over a cut.
     """
     numbers = np.asarray(cuts)
     whole = numbers.ndim == 1 and (numbers.size == 0 or numbers.dtype.kind in "iu")
@@ -142,14 +148,14 @@ def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
 
 
 def segments(frames: range, cuts: Sequence[int]) -> list[range]:
-    """`frames` from one cut to the next; cuts outside of them do not matter."""
+    """Split `frames` at the cuts; cuts outside of them are ignored."""
     inside = [cut for cut in cuts if frames.start < cut < frames.stop]
     edges = [frames.start, *inside, frames.stop]
     return [range(start, stop) for start, stop in pairwise(edges) if stop > start]
 
 
 def spans_of(frames: Iterable[int]) -> list[range]:
-    """Group frames into ranges of consecutive ones."""
+    """Group frame numbers into ranges of consecutive ones."""
     ordered = sorted(set(frames))
     edges = [0, *(at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1), len(ordered)]
     return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges) if b > a]

@@ -1,4 +1,4 @@
-"""Names of joints in other programs, and the points of the body that they mean."""
+"""Names of joints in other programs, and the body points that they stand for."""
 
 import re
 from collections.abc import Sequence
@@ -32,7 +32,9 @@ are not COCO's and MMPose's: the number of keypoints distinguishes them."""
 
 
 def layouts_called(name: str) -> list[Skeleton]:
-    """The skeletons that a program may mean by a layout's `name`; none where it is not known."""
+    """The known skeletons that a layout's `name` may stand for in any program; empty for an unknown
+    name.
+    """
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
     return [
         skeleton
@@ -57,7 +59,7 @@ _SIDED = {
     "foot": "foot forefoot",
     "hand": "hand",
 }
-"""Joints on both sides: the body's name without its side, and its names in other programs."""
+"""Joints on both sides of the body: our name without the side, and the names in other programs."""
 _MIDDLE = {
     "Nose": "nose",
     "Neck": "neck neckbase baseneck shoulder shoulders thorax sternum spineshoulder",
@@ -68,7 +70,7 @@ _MIDDLE = {
     "spine2": "spine2 spine torso spinemid",
     "spine3": "spine3 chest spinechest",
 }
-"""Joints in the middle: the body's name, and its names in other programs."""
+"""Joints on the midline of the body: our name, and the names in other programs."""
 _PART_OF_SIDE = {word: part for part, words in _SIDED.items() for word in words.split()}
 _BONES = {
     **dict.fromkeys(("upleg", "thigh", "upperleg"), "Hip"),
@@ -76,25 +78,27 @@ _BONES = {
     **dict.fromkeys(("arm", "upperarm"), "Shoulder"),
     **dict.fromkeys(("forearm", "lowerarm"), "Elbow"),
 }
-"""Joints by the bones that begin there, after which Apple and Mixamo name them."""
+"""Joints named after the bone that starts there, as by Apple and Mixamo."""
 _LEFT_OUT = {"mid", "middle", "center", "centre", "joint", "jc", "c", "of", "the", "keypoint", "landmark"}
-"""Words that are ignored: a joint without a side is in the middle."""
+"""Words that are ignored in names; a joint without a side is on the midline."""
 _SIDES = {"l": "L", "left": "L", "r": "R", "right": "R"}
 
 
 def _words(name: str) -> list[str]:
-    """The words of a name in small letters: l and hip of `LHip`, left and hip of `left_hip` and `leftHip`."""
+    """The words of a name in lower case: l and hip for `LHip`, left and hip for `left_hip` and
+    `leftHip`.
+    """
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
 
 
 def _side_and_part(words: Sequence[str]) -> tuple[str, str]:
-    """The side that the words of a joint's name say, L, R or none, and the others as one word."""
+    """Split a joint's words into its side ("L", "R" or "") and the remaining words, joined."""
     words = [word for word in words if word not in _LEFT_OUT]
     sides = [word for word in words if word in _SIDES]
     if len(sides) == 1:
         return _SIDES[sides[0]], "".join(word for word in words if word not in _SIDES and word != "1")
     plain = "".join(words)
-    for side in ("left", "right", "l", "r"):  # lshoulder, shoulderleft
+    for side in ("left", "right", "l", "r"):  # as in lshoulder, shoulderleft
         for rest in (plain.removeprefix(side), plain.removesuffix(side) if len(side) > 1 else plain):
             if rest != plain and rest in _PART_OF_SIDE:
                 return _SIDES[side], rest
@@ -102,22 +106,22 @@ def _side_and_part(words: Sequence[str]) -> tuple[str, str]:
 
 
 def body_points(names: Sequence[str]) -> list[str]:
-    """The point of the body that each of a file's joint `names` means, "" for those that mean none.
+    """The body point of each of a file's joint `names`; "" for names without one.
 
-    Case, separators and the position of the side do not count. An ambiguous name depends on the others: a foot is
-    the ankle where no ankle is named, and a head the top of the head where no top is. Bones mean the joint at
-    which they begin where a thigh is named.
+    Case, separators and the position of the side are ignored. Ambiguous names are resolved by the
+    others: "foot" is the ankle if no ankle is named, and "head" is the top of the head if no top is
+    named. Bone names stand for the joint at which the bone starts, if a thigh is named.
     """
     short = (name[:LONGEST_NAME] for name in names)
     every = [_words(re.sub(r"\(.*?\)", "", name) or name) for name in short]
     while len(every) > 1 and min(map(len, every)) > 1 and len({words[0] for words in every}) == 1:
         if every[0][0] in _SIDES:
             break
-        every = [words[1:] for words in every]  # what all begin with is the person's or the model's name
+        every = [words[1:] for words in every]  # a prefix of all names is the name of the person or model
     split = [_side_and_part(words) for words in every]
     parts = {part for _, part in split}
     middle = {word: part for part, words in _MIDDLE.items() for word in words.split()}
-    if parts & {"thorax", "sternum", "spineshoulder"}:  # Human3.6M's, MPII's: what is called neck is the upper end
+    if parts & {"thorax", "sternum", "spineshoulder"}:  # in Human3.6M and MPII, "neck" is its upper end
         middle |= {"neckbase": "head", "neck": "neck"}
     else:
         middle |= {"neckbase": "Neck"}
@@ -129,7 +133,7 @@ def body_points(names: Sequence[str]) -> list[str]:
     sided |= _BONES if parts & {"upleg", "thigh", "upperleg"} else {}
     sided |= {"shoulder": "collar"} if parts & {"upleg", "thigh"} and parts & {"arm", "upperarm"} else {}
     found, used = list[str](), set[str]()
-    own = {"Head", "head"} <= set(names)  # the body's own names, which differ by their case alone
+    own = {"Head", "head"} <= set(names)  # our own names "Head" and "head" differ only in case
     for name, (side, part) in zip(names, split, strict=True):
         point = name if own and name in ("Head", "head") else middle.get(part, "")
         if side:
@@ -142,9 +146,10 @@ def body_points(names: Sequence[str]) -> list[str]:
 
 
 def skeleton_of_names(names: Sequence[str]) -> tuple[Skeleton, list[str]]:
-    """The skeleton of a file that names its joints, and those of the `names` that are passed over.
+    """The skeleton of a file that names its joints, and the `names` that are ignored.
 
-    It is a known one where that has the same order. ValueError where joints that a person needs are missing.
+    A known skeleton is returned if it has the same order. ValueError if required joints are
+    missing.
     """
     points = body_points(names)
     passed = [name for name, point in zip(names, points, strict=True) if not point]
@@ -153,14 +158,14 @@ def skeleton_of_names(names: Sequence[str]) -> tuple[Skeleton, list[str]]:
 
 
 def keypoint_names(skeleton: Skeleton) -> list[str]:
-    """The joint of each keypoint that a detector writes, "" where it is passed over."""
+    """The joint of each keypoint in a detector's files, "" if it is ignored."""
     if skeleton.keypoints is None:
         return list(skeleton.joints)
     return ["" if joint < 0 else skeleton.joints[joint] for joint in skeleton.keypoints]
 
 
 def mirrored(name: str) -> str:
-    """The joint of the other side of the body, by its name."""
+    """Name of the corresponding joint on the other side of the body."""
     for sides in (("left", "right"), ("Left", "Right"), ("L", "R")):
         for one, other in (sides, sides[::-1]):
             if name.startswith(one):

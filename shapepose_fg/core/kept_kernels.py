@@ -1,8 +1,9 @@
 """The cache of compiled functions between runs.
 
-Numba caches compiled functions beside their source, as long as that file is the same. Here each module with
-kernels has a folder, named by a digest of its source and of all sources that its kernels call, which has a copy of
-the source that Numba uses. The cache is therefore never stale, and all installations of a user share it.
+Numba caches compiled functions next to their source file, and discards them if this file changes.
+Here each module with kernels has a cache folder with a copy of its source, next to which Numba
+caches. The folder is named by a digest of the sources of the module and of everything that its
+kernels call. The cache is therefore never stale, and is shared by all installations of a user.
 """
 
 import atexit
@@ -31,7 +32,8 @@ OPTIONS: dict[str, Any] = {
 NUMBA: Any = cast(Any, numba).config
 """Numba's own settings, from its environment variables."""
 _GIVEN = "SHAPEPOSE_FG_KERNELS"
-"""Environment variable that names a process's temporary folder to the processes that it starts."""
+"""Environment variable by which a process passes the path of its temporary folder to its child
+processes."""
 _SPACE = 50_000_000
 """Minimum free space on the disk, bytes: ten times the size of all kernels."""
 _VERSIONS = 16
@@ -48,8 +50,8 @@ def wanted_folder() -> Path:
 
 @cache
 def kept_folder() -> Path | None:
-    """The folder that is used for compiled functions: the wanted one; where it cannot be written, a temporary
-    folder of this process and its children; None where nothing can be written.
+    """The folder that is used for compiled functions: the wanted one; if it is not writable, a
+    temporary folder of this process and its children; None if neither can be written.
     """
     wanted = wanted_folder()
     if given := os.environ.get(_GIVEN):
@@ -78,7 +80,7 @@ def _can_keep(place: Path) -> bool:
 
 @cache
 def module_folder(module: str) -> Path | None:
-    """The folder of a module's kernels, with a copy of its source; None where nothing can be written."""
+    """The folder of a module's kernels, with a copy of its source; None if nothing can be written."""
     place, source = kept_folder(), Path(sys.modules[module].__file__ or "")
     if place is None:
         return None
@@ -87,12 +89,12 @@ def module_folder(module: str) -> Path | None:
         return folder
     fresh, elsewhere = place / f"{uuid.uuid4()}", wanted_folder() / folder.name
     try:
-        if elsewhere.exists():  # it can be read, but not written
+        if elsewhere.exists():  # readable, but not writable
             shutil.copytree(elsewhere, fresh, copy_function=os.symlink)
         else:
             fresh.mkdir()
             (fresh / source.name).write_bytes(source.read_bytes())
-            os.utime(fresh / source.name, (0, 0))  # older versions of Numba look at the time, not at the content
+            os.utime(fresh / source.name, (0, 0))  # older versions of Numba check the time, not the content
         if not folder.exists():
             fresh.rename(folder)
         _remove_old(place, module)
@@ -110,7 +112,9 @@ def _remove_old(place: Path, module: str) -> None:
 
 
 def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
-    """`njit(function)` for a function whose source is the copy in `folder`, which Numba's cache is then beside."""
+    """Apply `njit` to a copy of `function` from the source file in `folder`, next to which Numba's
+    cache then is.
+    """
     code = function.__code__.replace(co_filename=str(folder / Path(function.__code__.co_filename).name))
     copy = FunctionType(code, function.__globals__, function.__name__, function.__defaults__)
     copy.__qualname__ = function.__qualname__
@@ -123,7 +127,9 @@ def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
 
 @cache
 def _digest(module: str) -> str:
-    """Digest of the sources of a module's kernels, of the versions of Numba and Python, and of the processor."""
+    """Digest of the sources of a module's kernels, the versions of Numba and Python, and the
+    processor type.
+    """
     given = NUMBA.CPU_FEATURES
     features = get_host_cpu_features().flatten() if given is None else given
     options = sorted(f"{name}={sorted(each) if isinstance(each, set) else each}" for name, each in OPTIONS.items())
@@ -142,7 +148,7 @@ def _digest(module: str) -> str:
 
 @cache
 def _sources(module: str) -> frozenset[str]:
-    """Files of a module and of all modules that its kernels and parts are from."""
+    """Source files of a module and of all modules from which its kernels call kernels or parts."""
     inside = (getattr(each, "py_func", None) for each in vars(sys.modules[module]).values())
     others = {each.__module__ for each in inside if each is not None} - {module}
     return frozenset({str(sys.modules[module].__file__)}).union(*map(_sources, others))

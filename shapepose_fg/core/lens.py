@@ -13,15 +13,14 @@ Lens = Literal["perspective", "fisheye"]
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
 """Numbers of coefficients that OpenCV's functions accept, for each kind of lens."""
 _UNDONE_PX = 0.5
-"""Maximum error of distorting an undistorted point again, pixels. Beyond it, the lens's polynomial does not
-reach the point and it has no undistorted place. Where there is one, OpenCV's iteration ends within 1e-6 px of
-it."""
+"""Maximum error when an undistorted point is distorted again, pixels. Above it, the distortion
+cannot be inverted at this point. If it can, OpenCV's iteration ends within 1e-6 px."""
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-"""Steps and accuracy, in normalised coordinates, of the iteration that inverts a distortion."""
+"""Number of iterations and accuracy, in normalised coordinates, for inverting a distortion."""
 
 
 def undistorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:
-    """`Camera.undistort`: pixels (N, 2) without what the lens does; NaN where there are none."""
+    """See `Camera.undistort`: undistorted pixels (N, 2); NaN if there are none."""
     if len(xy) == 0 or not _bends(distortion, lens):
         return xy
     rays = _normalised(xy, K).reshape(-1, 1, 2)
@@ -35,7 +34,7 @@ def undistorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:
 
 
 def distorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:
-    """`Camera.distort`: pixels (N, 2) as the lens gives them."""
+    """See `Camera.distort`: distorted pixels (N, 2)."""
     if len(xy) == 0 or not _bends(distortion, lens):
         return xy
     rays = _normalised(xy, K)
@@ -49,7 +48,9 @@ def distorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:
 
 
 def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective") -> Array:
-    """`coefficients` with zeros up to the next number that OpenCV takes; ValueError where there are too many."""
+    """`coefficients` padded with zeros to the next number that OpenCV accepts; ValueError if there
+    are too many.
+    """
     given = np.asarray(coefficients, dtype=np.float64)
     for count in COEFFICIENTS[lens]:
         if len(given) <= count:
@@ -58,11 +59,13 @@ def padded_distortion(coefficients: Sequence[float], lens: Lens = "perspective")
 
 
 def _bends(distortion: Array, lens: Lens) -> bool:
-    """Whether the lens moves any pixel: a fisheye does without a coefficient too."""
+    """Whether the lens moves any pixel; a fisheye does even if all coefficients are zero."""
     return lens == "fisheye" or bool(distortion.any())
 
 
 def _normalised(xy: Array, K: Array) -> Array:
-    """Normalised image coordinates (N, 2) of pixels (N, 2); OpenCV's own functions pass over a skew in K."""
+    """Normalised image coordinates (N, 2) of pixels (N, 2); unlike OpenCV's functions, with the
+    skew in K.
+    """
     inverse = np.linalg.inv(K)
     return np.ascontiguousarray(xy @ inverse[:2, :2].T + inverse[:2, 2])

@@ -1,4 +1,6 @@
-"""Synchronised frame sets: groups the pictures of several cameras by time, at most half a frame apart."""
+"""Synchronised frame sets: groups of pictures of several cameras at the same time, at most half a
+frame apart.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +23,8 @@ class CameraClock:
     name: str
     """The camera's name."""
     time: Array
-    """(N,) times of its frames on the common clock, rising; seconds, or frames where there is no clock."""
+    """(N,) increasing times of its frames on the common clock; seconds, or frames if there is no
+    clock."""
     period: float
     """Time from one frame to the next, in the same unit."""
 
@@ -31,12 +34,12 @@ class Moments:
     """The synchronised frame sets of a recording: one picture of each camera per set."""
 
     picture: Index
-    """(T, V) index of each camera's picture; -1 where it has none within half a frame."""
+    """(T, V) index of each camera's picture; -1 if it has none within half a frame."""
     time_s: Array | None
-    """(T, V) times of these pictures, seconds; the time of the set where there is no picture, or NaN where it
-    is not known when cameras began. None without a clock."""
+    """(T, V) times of these pictures, seconds; for a missing picture, the time of the set, or NaN
+    if start times are unknown. None without a clock."""
     notes: tuple[str, ...]
-    """Notes on what was left out, and on how far the pictures of a set are apart in time."""
+    """Notes on pictures that were left out, and on the time differences within a set."""
 
     def __len__(self) -> int:
         return len(self.picture)
@@ -50,9 +53,9 @@ class Moments:
 def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --start") -> Moments:
     """Group the pictures of all cameras into synchronised frame sets.
 
-    The sets follow the slowest camera (of several the one with most frames), from where the last camera starts to
-    where the first one ends. A picture belongs to one set. InputError, which ends with the `cure`, where there are
-    none.
+    The sets have the times of the slowest camera (among equally slow ones, of that with most
+    frames), from the start of the last camera to the end of the first one. A picture belongs to one
+    set only. InputError, ending with the `cure`, if there are no sets.
     """
     first = max(each.time[0] - each.period / 2 for each in clocks)
     last = min(each.time[-1] + each.period / 2 for each in clocks)
@@ -96,10 +99,11 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
 
 
 def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
-    """Group pictures by number, each camera's counted from its own first, because start times are not known.
+    """Group pictures by number, counted from each camera's own first picture, because start times
+    are unknown.
 
-    Only pictures between those of the slowest camera are left out: frame t of a camera is the picture nearest to t
-    of its periods after the camera's own first.
+    Frame t of a camera is the picture nearest to t periods of the slowest camera after its own
+    first picture. Only pictures between these are left out.
     """
     slowest = max(each.period for each in clocks)
     places = []
@@ -125,25 +129,25 @@ def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
 
 
 def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:
-    """(T,) index of the frame nearest to each time, -1 where it is more than half a frame away; and the
-    distance in time.
+    """(T,) index of the frame nearest to each time, -1 if it is more than half a frame away; and
+    the distance in time.
     """
     after = np.clip(np.searchsorted(clock.time, moment), 0, len(clock.time) - 1)
     before = np.maximum(after - 1, 0)
     nearer = np.abs(clock.time[before] - moment) <= np.abs(clock.time[after] - moment)
     place = np.where(nearer, before, after)
     off = np.abs(clock.time[place] - moment)
-    # Times in files are rounded to a microsecond or so.
+    # Times in files are rounded to about a microsecond.
     place = np.where(off <= clock.period / 2 * (1 + 1e-3) + 1e-9, place, -1)
-    # Of two moments that are half a frame from one picture, which drifting rates have, the nearer takes it.
+    # With drifting rates, a picture may be half a frame from two sets: the nearer one gets it.
     twice = np.flatnonzero((place[1:] == place[:-1]) & (place[1:] >= 0))
     place[np.where(off[twice] <= off[twice + 1], twice + 1, twice)] = -1
     return place, off
 
 
 def _left_out(clock: CameraClock, place: Index, moment: float) -> str:
-    """The number of frames that a camera took before and after the sets, in words; sets are `moment` apart."""
+    """Text about the frames that a camera took before and after the sets, which are `moment` apart."""
     used = place[place >= 0]
     ends = [(int(used[0]), "start"), (int(len(clock.time) - 1 - used[-1]), "end")] if len(used) > 0 else []
-    # A faster camera always has frames between the moments.
+    # A faster camera always has frames between the sets.
     return " and ".join(f"{n} at the {end}" for n, end in ends if n > 0 and n * clock.period >= 0.99 * moment)

@@ -1,4 +1,4 @@
-"""Notes of a run for run.json, window by window: times, evidence, dropped people, joints that were not solved."""
+"""Notes of a run for run.json, window by window: times, evidence, dropped people, unsolved joints."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,9 +22,9 @@ class Problem:
     frame: int
     """The frame."""
     joint: int
-    """Index of the joint in the skeleton."""
+    """Index of the joint."""
     reason: str
-    """What happened, in words."""
+    """Description of the problem."""
 
 
 _Count = Annotated[int, Field(ge=0, lt=2**53)]
@@ -43,23 +43,24 @@ class Notes:
     seconds: dict[str, _Number] = field(default_factory=dict)
     """Time per stage, s, summed over all processes."""
     evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
-    """Sum of the evidence (`Observations.evidence`) of each track's rows, and the number of these rows."""
+    """By track: sum of the evidence (`Observations.evidence`) of its rows, and number of these
+    rows."""
     probable: dict[str, _Count] = field(default_factory=dict)
-    """Number of rows of single frames by their probability, in tenths rounded down."""
+    """For frame-by-frame results: number of rows by probability, rounded down to tenths."""
     dropped: _Frames = field(default_factory=dict)
-    """Frames in which people were dropped, by reason; one entry per person and frame."""
+    """Frames in which people were dropped, by reason; one entry per dropped person."""
     thinned_frames: _Frames = field(default_factory=dict)
-    """Frames in which detections, points or candidates were left out because there were too many, by what was
-    left out."""
+    """Frames in which there were too many detections, points or candidates and some were left out,
+    by kind."""
     repeated_pictures: _Frames = field(default_factory=dict)
     """Frames in which a camera, by its name, repeated the previous picture."""
     problems: list[Problem] = field(default_factory=list)
-    """Problems that were met."""
+    """Problems with joints."""
     factors: dict[str, tuple[_Count, _Count]] = field(default_factory=dict)
-    """Number of factors that each of the user's functions made, and number of them that were inactive."""
+    """By user function: number of factors that it made, and number of these that were inactive."""
 
     def add(self, other: "Notes") -> None:
-        """Add the notes of the frames that follow."""
+        """Add the notes of later frames."""
         self.frames += other.frames
         both: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
         for mine, more in both:
@@ -77,12 +78,12 @@ class Notes:
             self.factors[name] = before[0] + counts[0], before[1] + counts[1]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; `from_dict` reads them back."""
+        """Plain values for JSON; `from_dict` is the inverse."""
         return {**vars(self), "problems": [asdict(each) for each in self.problems]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Notes":
-        """The notes from the result of `as_dict`; ValueError where `values` are something else."""
+        """Make notes from the result of `as_dict`; ValueError for other values."""
         try:
             return TypeAdapter(cls).validate_python(values)
         except ValidationError as error:
@@ -100,11 +101,15 @@ class Notebook:
         self._searched: int | None = None
 
     def search(self, frame: int) -> None:
-        """Set the frame to which notes on thinning belong: the one in which new people are searched for."""
+        """Set the frame to which notes on thinning belong: the one in which new people are being
+        searched for.
+        """
         self._searched = frame
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
-        """Note down that some of a frame's detections, points or candidates were too many and left out."""
+        """Note that some detections, points or candidates of a frame were left out because there
+        were too many.
+        """
         frame = next((each for each in (frame, self._frame, self._searched) if each is not None), None)
         if is_thinned and frame is not None:
             noted = self._notes.thinned_frames.setdefault(what, [])
@@ -116,26 +121,30 @@ class Notebook:
             self._notes.repeated_pictures.setdefault(camera, []).append(frame)
 
     def drop(self, reason: str, count: int) -> None:
-        """Note people of the present frame who were dropped: false positives, or seen by too little.
+        """Note that people of the current frame were dropped: false positives, or too few
+        detections.
 
-        Over time there is no present frame: blocks of frames are read, each many times.
+        With tracking there is no current frame, because blocks of frames are read several times:
+        see `drop_in`.
         """
         if self._frame is not None:
             self.drop_in(reason, [self._frame] * count)
 
     def drop_in(self, reason: str, frames: Sequence[int]) -> None:
-        """Note that a person was dropped in all of these frames."""
+        """Note that a person was dropped in all `frames`."""
         self._notes.dropped.setdefault(reason, []).extend(frames)
 
     def watched(self, given: Sequence[Input]) -> Iterator[Input]:
-        """Yield the frames; notes that are taken before the next one are about the frame yielded last."""
+        """Yield the frames, and set the current frame for the notes that are taken until the next
+        one.
+        """
         for each in given:
             self._frame = each.frame
             yield each
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of a block to a stage, without that of stages inside it."""
+        """Add the time of the block to a stage, without that of stages inside it."""
         start, outside, self._inner = time.perf_counter(), self._inner, 0.0
         yield
         whole = time.perf_counter() - start

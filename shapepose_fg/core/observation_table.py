@@ -1,4 +1,4 @@
-"""What each row of a result was solved from: detections, residuals and gates per joint and view."""
+"""The measurements of each row of a result: detections, residuals and gates per joint and view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -30,11 +30,12 @@ class Gate(IntEnum):
     TOO_FAR = 2
     """Farther than rho_2D from the projected joint (delta_ij = 0 in Eq. 2)."""
     CONTRADICTS_BODY = 3
-    """Views agree on a place that contradicts the rest of the body: their detections belong to another person."""
+    """Several views agree on a position that contradicts the rest of the body: the detections
+    belong to another person."""
     BEHIND_CAMERA = 4
     """The joint is behind this camera, or nearer than 0.2 m."""
     NOT_PLACED = 5
-    """The joint itself could not be placed: there is nothing to compare the detection with."""
+    """The joint has no position, so the detection cannot be compared with it."""
 
 
 @dataclass(frozen=True)
@@ -50,26 +51,28 @@ class ObservationTable(Table):
     view_names: Annotated[NDArray[np.str_], Column("V", np.str_)]
     """(V,) names of the cameras."""
     candidate: Annotated[NDArray[np.int32], Column("N J V", np.int32)]
-    """(N, J, V) index of the detection among those of its view in this frame; -1 for none, or where not
-    recorded."""
+    """(N, J, V) index of the detection among those of its view in this frame; -1 for none, or if
+    not recorded."""
     xy: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
-    """(N, J, V, 2) where the detection lies, undistorted pixels; NaN where there is none."""
+    """(N, J, V, 2) detection, undistorted pixels; NaN if there is none."""
     confidence: Annotated[NDArray[np.float32], Column("N J V", np.float32)]
-    """(N, J, V) the detector's score, 0 to 1; 0 where there is none."""
+    """(N, J, V) score of the detection, 0 to 1; 0 if there is none."""
     residual_px: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
-    """(N, J, V, 2) projected joint minus detection, pixels; NaN where there is none, or no joint to project."""
+    """(N, J, V, 2) projected joint minus detection, pixels; NaN if either is missing."""
     gate: Annotated[NDArray[np.uint8], Column("N J V", np.uint8, codes=Gate)]
     """(N, J, V) codes of `Gate`."""
     probability: Annotated[NDArray[np.float32], Column("N J V", np.float32, missing=1.0)] = None  # type: ignore[assignment]
-    """(N, J, V) probability that the detection is this person's; 0 where there is none, 1 in files without this
-    column."""
+    """(N, J, V) probability that the detection belongs to this person; 0 if there is none, 1 in
+    files without this column."""
     lead_s: Annotated[NDArray[np.float32], Column("N V", np.float32, "s", missing=0.0)] = None  # type: ignore[assignment]
-    """(N, V) time of exposure of each view after the row's time, seconds; 0 in older files."""
+    """(N, V) time at which each view was exposed minus the row's time, seconds; 0 in older files."""
 
     ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability lead_s".split()
 
     def __post_init__(self) -> None:
-        """Check shapes and types, that values make sense, and that columns agree on what was seen."""
+        """Check shapes, types and ranges of values, and that the columns agree on which detections
+        exist.
+        """
         unsaid = self.probability is None
         super().__post_init__()
         seen = self.gate != Gate.NOT_SEEN
@@ -88,7 +91,7 @@ class ObservationTable(Table):
                 raise ValueError(f"{name} must differ from each other")
         if not all(map(str.isprintable, self.view_names.tolist())):
             raise ValueError("view_names must be one-line names")
-        # A score may be too small for a float32, and which detection it was need not be said.
+        # A score may underflow in float32, and the index of the detection may be unknown.
         wrong = {
             "candidate": (self.candidate >= 0) & ~seen,
             "xy": np.isfinite(self.xy).all(axis=-1) != seen,
@@ -113,12 +116,14 @@ class ObservationTable(Table):
         joint_names: Sequence[str],
         carried: Observations | None = None,
     ) -> "ObservationTable":
-        """The table of N solved rows: what they observed, and their `joints` (N, J, 3) as solved.
+        """The table of N solved rows, from their observations and their solved `joints` (N, J, 3),
+        metres.
 
-        The rows have the observations' `frame` and `track` (as the person). `place` (N, J, V) is each detection's
-        `Detections.place`, `gate` (N, J, V) are the codes of `Gate`; missing detections, joints without a place
-        and points behind a camera get their own codes, whatever `gate` holds. `carried` are the observations moved
-        to the frames' time, where views are asynchronous.
+        The rows have the observations' `frame` and `track` (as the person). `place` (N, J, V) is
+        each detection's `Detections.place`, `gate` (N, J, V) are the codes of `Gate`; missing
+        detections, joints without a position and points behind a camera get their own codes,
+        independent of `gate`. `carried` are the observations extrapolated to the frames' times, for
+        asynchronous views.
         """
         here = observations if carried is None else carried
         seen = observations.seen
@@ -152,14 +157,15 @@ class ObservationTable(Table):
 
     @classmethod
     def concatenate(cls, parts: Sequence["ObservationTable"]) -> "ObservationTable":
-        """The rows of `parts`, one after the other; ValueError where joints or views differ."""
+        """The rows of `parts`, one after the other; ValueError if joints or views differ."""
         return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
 
     def observations(self, initial: Array, time_s: Array) -> Observations:
-        """The rows as observations, dropped detections included, from which they can be solved again.
+        """The rows as observations, gated detections included, for solving them again.
 
-        `initial` (N, J, 3) are the initial joints, `time_s` (N,) the times of the rows' frames. The index of each
-        detection is not recovered: `Detections` count over all views, and this table in each view.
+        `initial` (N, J, 3) are the initial joints, `time_s` (N,) the times of the rows' frames.
+        `candidate` is not recovered: `Observations` counts detections over all views, this table in
+        each view.
         """
         seen = self.gate != Gate.NOT_SEEN
         return Observations(
@@ -173,7 +179,7 @@ class ObservationTable(Table):
         )
 
     def unseen(self, frame: Whole) -> "ObservationTable":
-        """Rows of the same people in other frames, `frame` (N,), without detections."""
+        """Rows of the same people, without detections, in other frames: `frame` (N,)."""
         nothing = {name: np.full_like(getattr(self, name), np.nan) for name in ("xy", "residual_px")}
         nothing |= {
             name: np.zeros_like(getattr(self, name)) for name in "confidence gate probability lead_s".split()
@@ -186,27 +192,30 @@ class ObservationTable(Table):
         return self.gate == Gate.USED
 
     def reasons(self) -> dict[str, int]:
-        """Number of detections per gate, by the gate's name; missing detections are left out."""
+        """Number of detections per gate, by the name of the gate; missing detections are not
+        counted.
+        """
         count = np.bincount(self.gate.ravel(), minlength=len(Gate))
         names = code_names(Gate).tolist()
         return {names[gate]: int(count[gate]) for gate in Gate if gate != Gate.NOT_SEEN}
 
     def save(self, file: str | Path) -> None:
-        """Write the table as `file`, whole or not at all; NumPy alone reads it (docs/conventions.md)."""
+        """Write the table to `file` atomically; NumPy alone can read it (docs/conventions.md)."""
         write_atomically(Path(file), lambda stream: write_npz(stream, self.columns()))
 
     @classmethod
     def load(cls, file: str | Path, run_id: object = None) -> "ObservationTable":
-        """Read what `save` wrote; InputError, one sentence, on anything else.
+        """Read a file written by `save`; InputError, one sentence, for any other content.
 
-        `run_id` is that of the people whose observations they must be (`result_files.check_id`).
+        `run_id` is that of the people to whom the observations must belong
+        (`result_files.check_id`).
         """
         with cls.open(Path(file), run_id) as opened:
             return opened.read(None)
 
     @classmethod
     def open(cls, file: Path, run_id: object = None) -> "SavedTable[ObservationTable]":
-        """Open the file that `load` reads; its rows come into memory when they are read."""
+        """Open a file that `load` can read; rows are read into memory only when requested."""
         opened = SavedTable(file, ObservationTable, "give the observations.npz of a reconstruction")
         try:
             check_id(run_id, opened.run_id, file)

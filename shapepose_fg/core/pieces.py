@@ -10,12 +10,14 @@ from shapepose_fg.core.compiled import part
 ROBUST = {None: 0, "none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 """Robust kernels by their number in compiled functions."""
 _STEPS = 3
-"""Number of times that a point is triangulated with new robust weights."""
+"""Number of iterations of reweighted triangulation."""
 
 
 @part
 def robust_weight(robust, ratio):
-    """`factors.kernel_weight` of the squared norm over the squared width."""
+    """Weight of a robust kernel (`factors.kernel_weight`), from `ratio`: squared norm over squared
+    width.
+    """
     if robust == 0:
         return 1.0
     if robust == 1:
@@ -29,7 +31,7 @@ def robust_weight(robust, ratio):
 
 @part
 def project(camera, x):
-    """Pixel and depth of a point."""
+    """Pixel and depth of a point in a camera."""
     depth = camera[2, 0] * x[0] + camera[2, 1] * x[1] + camera[2, 2] * x[2] + camera[2, 3]
     u = camera[0, 0] * x[0] + camera[0, 1] * x[1] + camera[0, 2] * x[2] + camera[0, 3]
     v = camera[1, 0] * x[0] + camera[1, 1] * x[1] + camera[1, 2] * x[2] + camera[1, 3]
@@ -38,7 +40,9 @@ def project(camera, x):
 
 @part
 def add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
-    """Add J^T w J and J^T w r, with J the derivative of the pixel (u, v) and r = (to_u, to_v)."""
+    """Add J^T w J to `information` and J^T w r to `gradient`, with J the derivative of the pixel
+    (u, v) by the point, and r = (to_u, to_v).
+    """
     for a in range(3):
         ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
         gradient[a] += weight * (ua * to_u + va * to_v)
@@ -49,10 +53,11 @@ def add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
 
 @part
 def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight, x):
-    """Triangulate pixels `uv` (V, 2) into `x` (3,), and return how many views have rays within `reach_m` of it.
+    """Triangulate pixels `uv` (V, 2) to `x` (3,), metres; returns the number of views with rays
+    within `reach_m` of it.
 
-    Linear least squares with weights by confidence `sure` (V,), 0 for none, under a Cauchy kernel of `scale_m`,
-    reweighted in each step; `weight` (V,) is scratch space.
+    Linear least squares, weighted by confidence `sure` (V,) (0: no detection) and, in iterations,
+    by a Cauchy kernel of width `scale_m`, metres; `weight` (V,) is scratch space.
     """
     for v in range(len(sure)):
         weight[v] = sure[v]
@@ -83,7 +88,7 @@ def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight
 
 @part
 def solved(xx, xy, xz, yy, yz, zz, right_x, right_y, right_z, x):
-    """Put A^-1 b into `x` (3,), for a symmetric A (3, 3), by its cofactors."""
+    """Write A^-1 b to `x` (3,), for a symmetric A (3, 3), by cofactors."""
     first, second, third = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     over = 1.0 / (xx * first + xy * second + xz * third)
     middle, last, both = xx * zz - xz * xz, xx * yy - xy * xy, xy * xz - xx * yz

@@ -22,7 +22,9 @@ _PACKAGES = {
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that affect the numbers; nothing is imported to find them."""
+    """Versions of Python and of the packages that affect numerical results; no package is imported
+    for this.
+    """
     found = {"python": platform.python_version()} | dict.fromkeys(_PACKAGES, "not installed")
     for name, distributions in _PACKAGES.items():
         for distribution in reversed(distributions):
@@ -36,26 +38,29 @@ _INPUTS = (".txt", ".json", ".toml", ".yml", ".yaml", ".xml")
 
 
 def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
-    """SHA-256 of every input file; for a folder, one of the names and contents of its data files.
+    """SHA-256 of every input file; for a folder, one checksum of the names and contents of its data
+    files.
 
-    A recording of 10,000 JSON files is one line of run.json, and a file renamed or lost changes it.
+    So a recording of 10,000 JSON files is one line of run.json, and a renamed or missing file
+    changes it.
     """
     return {str(path): _digest(Path(path), _INPUTS) for path in inputs}
 
 
 class ReadInputs:
-    """Input files while they are read; detects files that change meanwhile.
+    """Detects input files that change while they are read.
 
-    Create it before anything is read, and call `checksums` when everything has been.
+    Create it before reading starts, and call `checksums` when everything has been read.
     """
 
     def __init__(self, paths: Iterable[str | Path | None]) -> None:
         self._before = dict(_states(paths))
 
     def checksums(self, inputs: Iterable[str | Path | None]) -> dict[str, str]:
-        """`checksums` of what was read; InputError where one of these files has changed since this was made.
+        """`checksums` of the files that were read; InputError if one of them has changed since this
+        object was created.
 
-        `inputs` are, or are in, the files and folders that this was made of.
+        `inputs` are files and folders given to the constructor, or lie in these.
         """
         inputs = [path for path in inputs if path is not None]
         found = checksums(inputs)
@@ -66,7 +71,7 @@ class ReadInputs:
 
 
 def program_digest() -> str:
-    """SHA-256 of this program and its data: equal for two runs of the same version."""
+    """SHA-256 of this program and its data: equal for runs of the same version."""
     here, data = Path(__file__).parents[1], (".py", ".npz", ".json", ".safetensors")
     parts = (_digest(package, data) for package in (here, here.with_name("factors")))
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()
@@ -79,7 +84,7 @@ def _files(folder: Path, endings: tuple[str, ...]) -> Iterator[Path]:
 def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
     """Size and modification time, as one number, of files, and of the data files in folders.
 
-    Plain values: hours of footage are half a million files.
+    Only path and number are kept, because hours of footage are half a million files.
     """
     for path in (Path(path) for path in paths if path is not None):
         for file in _files(path, _INPUTS) if path.is_dir() else (path,):
@@ -89,7 +94,7 @@ def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
 
 
 def _digest(path: Path, endings: tuple[str, ...]) -> str:
-    """SHA-256 in hexadecimal of a file, or of those of a folder with these suffixes."""
+    """SHA-256, hexadecimal, of a file; for a folder, of its files with these suffixes."""
     try:
         if path.is_dir():
             whole = hashlib.sha256()

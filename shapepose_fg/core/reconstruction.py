@@ -30,41 +30,45 @@ class Status(StrEnum):
     OK = "ok"
     """Joints and body are determined."""
     TOO_FEW_VIEWS = "too few views"
-    """No joint is seen by two views, or too few are: the person's place is not determined."""
+    """No joint, or too few joints, are seen by two views: the position of the person is not
+    determined."""
     BODY_UNDETERMINED = "body undetermined"
     """Joints are determined, but too few of them to fit a body; joints that no view saw are NaN."""
     CONTRADICTED = "views contradict"
-    """Some views contradict each other, it is unknown which is wrong, and too few are left without them."""
+    """Some views contradict each other, it is unknown which is wrong, and the others do not
+    determine the person."""
     NOT_SOLVED = "not solved"
-    """A joint diverged from its detections, or nothing determines it: `run` names person, frame and joint."""
+    """A joint diverged from its detections, or is not determined: `problems` in `run` names person,
+    frame and joint."""
 
 
 class Known(IntEnum):
     """How the position of one joint in one frame is known."""
 
     UNKNOWN = 0
-    """The joint is not placed (NaN); or the file is older than this column."""
+    """The joint has no position (NaN), or the file is older than this column."""
     SEEN = 1
-    """Two views' detections of the joint were used in this frame that are the person's as far as one can tell
-    (`estimation.outcome.how_known`); in files from before `WEAK`, one view's."""
+    """In this frame, detections of at least two views were used that very probably belong to the
+    person (`estimation.outcome.how_known`); in files older than `WEAK`, of at least one view."""
     BODY = 2
-    """No detection in this frame: inferred from the body, which other joints place."""
+    """Without a detection in this frame: inferred from the body, which other joints determine."""
     MOTION = 3
-    """Neither: carried by motion from the frames before and after."""
+    """Without a detection and without a body: interpolated by the motion model from other frames."""
     WEAK = 4
-    """Fewer than two such views: a joint that one view saw, or whose detections have a low probability. Body
-    and motion contribute as much."""
+    """Fewer than two such views: a joint that one view saw, or whose detections have a low
+    probability. Body and motion model contribute considerably to its position."""
 
     @classmethod
     def observed(cls, known: Whole) -> Mask:
-        """Return for which joints (...) the detection of at least one view was used."""
+        """Return for which joints (...) a detection of at least one view was used."""
         return np.isin(known, (cls.SEEN, cls.WEAK))
 
 
 BODY = ("betas", "global_orient", "body_pose", "transl")
-"""The columns of a result that are a body."""
+"""The columns of a result that describe the body."""
 MOST_NUMBER = 2**53 - 1
-"""The highest number of a frame or a person: the last whole number that all real ones below it are."""
+"""The highest number of a frame or a person: the largest integer up to which doubles represent all
+integers."""
 _LATER: Any = None
 """Default of a column that is not given: unknown values."""
 
@@ -76,42 +80,43 @@ class Reconstruction(Table):
     frame: Annotated[Whole, Column("N", np.int64, most=MOST_NUMBER)]
     """(N,) frame of each row, counted from 0 in the file."""
     person: Annotated[Whole, Column("N", np.int64, most=MOST_NUMBER)]
-    """(N,) identity of the person; without tracking, a number within the frame."""
+    """(N,) identity of the person; with `temporal = false`, only a number within the frame."""
     joint_names: Annotated[NDArray[np.str_], Column("J", np.str_)]
     """(J,) names of the joints, as OpenPose writes them."""
     joints: Annotated[Array, Column("N J 3", unit="m", most=1e6)]
-    """(N, J, 3) joint positions in the world, metres; NaN where unknown."""
+    """(N, J, 3) joint positions in the world, metres; NaN if unknown."""
     covariance: Annotated[Array, Column("N J 3 3", unit="m²", most=1e12)]
-    """(N, J, 3, 3) covariance of each joint's position, square metres; NaN where unknown."""
+    """(N, J, 3, 3) covariance of each joint's position, square metres; NaN if unknown."""
     confidence: Annotated[Array, Column("N J", most=1e3)]
     """(N, J) mean confidence of a joint's observations over all views, 0 to 1."""
     betas: Annotated[Array, Column("N 10", most=1e3)]
-    """(N, 10) shape of the body, standard deviations; NaN where there is no body."""
+    """(N, 10) shape of the body, standard deviations; NaN without a body."""
     global_orient: Annotated[Array, Column("N 3", unit="rad", most=1e3)]
-    """(N, 3) orientation of the pelvis in the world, axis times angle, radians."""
+    """(N, 3) orientation of the pelvis in the world, rotation vector (axis-angle), radians."""
     body_pose: Annotated[Array, Column("N 23 3", unit="rad", most=1e3)]
-    """(N, 23, 3) rotation of every other body joint against its parent, axis times angle, radians."""
+    """(N, 23, 3) rotation of every other body joint relative to its parent, rotation vector
+    (axis-angle), radians."""
     transl: Annotated[Array, Column("N 3", unit="m", most=1e6)]
     """(N, 3) translation of the body, metres."""
     status: Annotated[NDArray[np.str_], Column("N", np.str_, stored=f"U{max(map(len, Status))}")]
     """(N,) one of the values of `Status`."""
     time_s: Annotated[Array, Column("N", unit="s", most=1e12, missing=np.nan)] = _LATER
-    """(N,) when the row's frame was taken, seconds; NaN where unknown, as it is where the column is not given."""
+    """(N,) time of the row's frame, seconds; NaN if unknown (the default)."""
     velocity: Annotated[Array, Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
-    """(N, J, 3) velocity of each joint in the world, m/s; NaN where unknown or not given."""
+    """(N, J, 3) velocity of each joint in the world, m/s; NaN if unknown (the default)."""
     velocity_covariance: Annotated[Array, Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)] = _LATER
-    """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN where unknown or not given."""
+    """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN if unknown (the default)."""
     known: Annotated[NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)] = _LATER
-    """(N, J) how each joint is known: codes of `Known`; unknown where not given."""
+    """(N, J) how each joint is known: codes of `Known`; `UNKNOWN` by default."""
     run: dict[str, Any] = field(default_factory=dict)
     """Origin of the result: configuration, versions, checksums, times (stored in run.json)."""
     observations: ObservationTable | None = None
-    """Detections that each row was solved from (stored in observations.npz); None where they are not recorded."""
+    """Detections that each row was solved from (stored in observations.npz); None if not recorded."""
     shapes: SubjectShapes | None = None
-    """The shape of each identity with its covariance, named by its number; `save` leaves them out."""
+    """Body shape and covariance of each identity, named by its number; `save` does not write them."""
     rig: Rig | None = None
-    """The cameras that it was solved with, from `reconstruct`; None where unknown. `load` does not read them
-    (`read_rig(folder / "cameras.json")`)."""
+    """The cameras with which it was solved, set by `reconstruct`; None if unknown. `load` does not
+    read them (`read_rig(folder / "cameras.json")`)."""
 
     ROWS: ClassVar = (
         "frame person time_s joints covariance velocity velocity_covariance known confidence"
@@ -119,7 +124,7 @@ class Reconstruction(Table):
     )
 
     def __post_init__(self) -> None:
-        """Check every shape and type, once, and that `observations` are of these rows."""
+        """Check shapes and types of all columns, and that `observations` have the same rows."""
         super().__post_init__()
         check_joint_names(self.joint_names.tolist())
         unknown = set(np.unique(self.status).tolist()) - set(Status)
@@ -131,35 +136,37 @@ class Reconstruction(Table):
 
     @classmethod
     def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> "Reconstruction":
-        """Without people."""
+        """A result without people."""
         return cls.without_rows(joint_names=np.array(joint_names))
 
     @classmethod
     def concatenate(cls, parts: Sequence["Reconstruction"]) -> "Reconstruction":
         """The rows of `parts`, one after the other.
 
-        `run` says what all parts together are (`merged_run`): ValueError where their configurations differ or
-        two of them cover the same frame. `observations` are kept where every part that has rows has them, `rig`
-        where it is the same of all parts, `shapes` are not.
+        `run` is merged by `merged_run`: ValueError if configurations differ, or if two parts cover
+        the same frame. `observations` are kept if every part with rows has them, `rig` if it is the
+        same in all parts; `shapes` are dropped.
         """
         if len(parts) == 0:
             return cls.empty()
         filled = [part.observations for part in parts if len(part) > 0]
         tables = [table for table in filled if table is not None]
         together = ObservationTable.concatenate(tables) if 0 < len(tables) == len(filled) else None
-        # A part without rows and without a run has nothing to say of the whole.
+        # A part without rows and without a run does not affect the merged run.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
         rig = parts[0].rig if all(part.rig is parts[0].rig for part in parts) else None
         return Reconstruction.joined(parts, observations=together, shapes=None, rig=rig, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
-        """The rows that `index` picks: a mask (N,) or row numbers."""
+        """The rows selected by `index`: a mask (N,) or row numbers."""
         columns = {name: getattr(self, name)[index] for name in self.ROWS}
         table = None if self.observations is None else self.observations.rows(index)
         return replace(self, **columns, observations=table)
 
     def check_ranges(self) -> None:
-        """ValueError for what no result gives: also for a joint or a body that is called known and is not."""
+        """ValueError for impossible values, and for a joint or body that is marked as known but is
+        not.
+        """
         super().check_ranges()
         ok, known = self.status == Status.OK, self.known != Known.UNKNOWN
         sure = np.isfinite(self.covariance).all(axis=(2, 3)) | ~ok[:, None]
@@ -178,27 +185,30 @@ class Reconstruction(Table):
         return self.rows(self.frame == frame)
 
     def with_run(self, **entries: Any) -> "Reconstruction":
-        """Return these people with further entries in run.json."""
+        """Return these people with further `entries` in run.json."""
         return replace(self, run=self.run | entries)
 
     def relabelled(self, person: Whole) -> "Reconstruction":
-        """Return these rows with other identities (N,), in `observations` too."""
+        """Return these rows with other identities `person` (N,), also in `observations`."""
         table = None if self.observations is None else replace(self.observations, person=person)
         return replace(self, person=person, observations=table)
 
     def counts(self) -> dict[str, Any]:
-        """The entry of run.json about the rows: their number, statuses, and how their joints are known."""
+        """The entry of run.json about the rows: their number, and counts of statuses and of how
+        joints are known.
+        """
         return count_rows([(self.status, self.known)])
 
     def save(self, folder: str | Path, rig: Rig | None = None) -> None:
-        """Write people.npz, run.json, observations.npz and cameras.json into `folder`, each whole or not at all.
+        """Write people.npz, run.json, observations.npz and cameras.json into `folder`, each
+        atomically.
 
-        `rig` are the cameras, by default those that it was solved with (`self.rig`); where neither is known, a
-        cameras.json that is there stays. A process killed on the way leaves each file as it was or as it shall be,
-        and `load` says where they do not belong together (docs/conventions.md). Without `observations`, those of
-        an earlier result are removed. InputError where `load` would refuse them, or cameras.json is another
-        program's; OSError where `folder` cannot be written; ValueError where `rig` are not the cameras of the
-        observations.
+        `rig` are the cameras, by default `self.rig`; if both are None, an existing cameras.json
+        stays. If the process is killed, each file is either the old or the new one, and `load`
+        refuses files of different runs (docs/conventions.md). Without `observations`, those of an
+        earlier result are removed. InputError if `load` would refuse the files, or if cameras.json
+        belongs to another program; OSError if `folder` cannot be written; ValueError if `rig` does
+        not have the cameras of the observations.
         """
         rig = self.rig if rig is None else rig
         if rig is not None and self.observations is not None:
@@ -217,29 +227,31 @@ class Reconstruction(Table):
 
     @classmethod
     def load(cls, path: str | Path) -> "Reconstruction":
-        """Read what `save` wrote: its folder, or the people.npz in it. InputError on anything else.
+        """Read a result that `save` wrote; `path` is its folder, or the people.npz in it.
+        InputError for any other content.
 
-        `run` is empty where there is no run.json beside it, and `observations` are None where there is no
-        observations.npz. Columns that files of earlier versions lack are unknown.
+        `run` is empty without a run.json beside it, and `observations` are None without an
+        observations.npz. Columns that are missing in files of earlier versions have unknown values.
         """
         with cls.open(path) as opened:
             return opened.rows()
 
     @classmethod
     def open(cls, path: str | Path) -> "OpenedReconstruction":
-        """Open the result that `load` reads; its rows come into memory when they are read."""
+        """Open a result that `load` can read; rows are read into memory only when requested."""
         return OpenedReconstruction(Path(path))
 
 
 class OpenedReconstruction(ExitStack):
-    """A saved result, open: frames and people are in memory, other columns are read by rows.
+    """An opened result: the columns `frame` and `person` are in memory, others are read row by row.
 
-    A context manager that closes the files. Reading frames in rising order decompresses the files once. Rows are
-    checked as `Reconstruction.load` does; checksums of the files where all rows are read.
+    As a context manager, it closes the files. If frames are read in increasing order, the files are
+    decompressed only once. Rows are checked as by `Reconstruction.load`; checksums of the files
+    only if all rows are read.
     """
 
     def __init__(self, path: Path) -> None:
-        """InputError where there is no result, or its files are of two runs."""
+        """InputError if there is no result, or if its files are of two runs."""
         file = path / PEOPLE if path.is_dir() else path
         table = file.with_name(OBSERVATIONS)
         self._observed: SavedTable[ObservationTable] | None = None
@@ -263,40 +275,40 @@ class OpenedReconstruction(ExitStack):
 
     @property
     def observed(self) -> bool:
-        """Whether the result has the detections that its rows were solved from."""
+        """Whether the result has the detections from which its rows were solved."""
         return self._observed is not None
 
     def at(self, frame: int) -> Reconstruction:
-        """The people of one frame. The next frames come into memory with it."""
+        """The people of one frame. The following frames are read into memory together with it."""
         if frame not in self._block[0]:
             block = range(frame, frame + _BLOCK)
             self._block = block, self.frames(block.start, block.stop)
         return self._block[1].at(frame)
 
     def frames(self, start: int, stop: int) -> Reconstruction:
-        """All people in the frames from `start` to before `stop`."""
+        """All people in the frames `start` to `stop` - 1."""
         return self.rows(np.flatnonzero((self.frame >= start) & (self.frame < stop)))
 
     def people(self, numbers: Iterable[int], *, observations: bool = True) -> Reconstruction:
-        """These people, in all their frames; see `rows`."""
+        """All rows of the people with these `numbers`; see `rows`."""
         return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations)
 
     def thinned(self, most_rows: int) -> tuple[Reconstruction, int]:
-        """Every n-th frame, so that there are at most `most_rows` rows; and n."""
+        """Every n-th frame, with n so large that there are at most `most_rows` rows; and n."""
         every = max(1, -(-len(self) // most_rows))
         return self.rows(None if every == 1 else np.flatnonzero(self.frame % every == 0)), every
 
     def __getattr__(self, name: str) -> Any:
-        """A whole column, as `Reconstruction` has it; it is read when it is accessed."""
+        """A whole column, as in `Reconstruction`; it is read on access."""
         if name not in (*Reconstruction.ROWS, "joint_names"):
             raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
         return self._people.column(name)
 
     def rows(self, index: NDArray | None = None, *, observations: bool = True) -> Reconstruction:
-        """The rows `index`, a mask (N,) or numbers (R,) that rise, or all; with what they were solved from, where
-        that is wanted.
+        """The rows `index`: a mask (N,), increasing row numbers (R,), or all; with their
+        observations, unless `observations` is False.
 
-        InputError where a file is damaged, or they would not fit in memory.
+        InputError if a file is damaged, or if the rows would not fit in memory.
         """
         index = np.flatnonzero(index) if index is not None and index.dtype == bool else index
         people = self._people.read(index, run=self.run)
@@ -308,7 +320,9 @@ class OpenedReconstruction(ExitStack):
 
 
 def check_files(people: Path, observations: Path | None) -> None:
-    """InputError where the files of a result, on the way to their places, could not be read again."""
+    """InputError if these new files of a result, before they are moved to their places, cannot be
+    read.
+    """
     with SavedTable(people, Reconstruction, _UNREADABLE) as rows, ExitStack() as opened:
         table = None if observations is None else ObservationTable.open(observations)
         if table is not None:
@@ -324,7 +338,7 @@ _CHECKED_ROWS = 4096
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
-    """Content of run.json, if it is of the run with that id; empty where there is none."""
+    """Content of run.json, which must have this id; empty if there is no file."""
     run = read_json(file) if file.is_file() else {}
     with naming(file, "restore it or delete it"):
         if not isinstance(run, dict):
@@ -335,16 +349,19 @@ def _read_run(file: Path, people_id: object) -> dict[str, Any]:
 
 
 def with_body(*columns: Array) -> Mask:
-    """(N,) which rows have a body: all numbers of their `BODY` columns, each (N, ...), are known."""
+    """(N,) which rows have a body: all values of the `BODY` columns, each (N, ...), are known."""
     return np.logical_and.reduce([np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns])
 
 
 _BLOCK = 128
-"""Frames that are read together by `OpenedReconstruction.at`; as many as detections are kept in."""
+"""Number of frames that `OpenedReconstruction.at` reads together; equal to the block size of
+detections."""
 
 
 def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:
-    """`Reconstruction.counts` of rows that come piece by piece: `status` (R,) and `known` (R, J) of each."""
+    """`Reconstruction.counts` of rows that are given in pieces: `status` (R,) and `known` (R, J) of
+    each.
+    """
     status: Counter[str] = Counter()
     known = np.zeros(len(Known), dtype=np.int64)
     for their_status, their_known in pieces:
@@ -356,7 +373,9 @@ def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> 
 
 
 def sigma_m(covariance: Array) -> Array:
-    """(...) standard deviation of positions with covariance (..., 3, 3): root mean square over the axes."""
+    """(...) standard deviation of positions with covariance (..., 3, 3): root mean square over
+    the axes.
+    """
     variance = np.trace(covariance, axis1=-2, axis2=-1) / 3
     with np.errstate(invalid="ignore"):
         return np.sqrt(np.where(variance >= 0, variance, np.nan))

@@ -1,4 +1,6 @@
-"""Detects pictures that a camera delivers twice because it has stopped, or fills dropped frames."""
+"""Detects pictures that a camera delivers again because it has stopped, or to replace dropped
+frames.
+"""
 
 from dataclasses import dataclass, field
 
@@ -9,26 +11,28 @@ from shapepose_fg.core.detections import DerivedFrames, Detections
 from shapepose_fg.core.trust import Trust, trust_in
 
 _LEAST = 4
-"""Minimum number of detections that two pictures have in common: a few may be of something that stands still."""
+"""Minimum number of equal detections of two pictures: a few may be of something that does not move."""
 
 
 @dataclass(frozen=True)
 class WithoutRepeats(DerivedFrames):
-    """A recording without the detections of repeated pictures, which are of another time and would contradict
-    others.
+    """A recording without the detections of repeated pictures: these are from an earlier time and
+    would contradict the other cameras.
 
-    A detector gives the same numbers, to the last digit, for the same picture only. Where all cameras that see
-    anything repeat themselves, everything may stand still, as in a simulated scene: nothing is left out.
+    A detector returns equal values, to the last digit, only for equal pictures. If all cameras with
+    detections repeat themselves, the scene may be static, as in a simulation; then nothing is left
+    out.
     """
 
     views: int
     """V, the number of cameras."""
     _read: dict[int, tuple[Detections, Mask]] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """The frames that were read last, by number: all detections, and which views (V,) repeat themselves."""
+    """The most recently read frames, by number: all detections, and which views (V,) repeat their
+    picture."""
 
     @property
     def trust(self) -> Trust:
-        """The cameras that are left out for other reasons, and when."""
+        """Cameras that are left out for other reasons, and in which frames."""
         return trust_in(self.frames)
 
     def __getitem__(self, frame: int, /) -> Detections:
@@ -38,11 +42,11 @@ class WithoutRepeats(DerivedFrames):
         return every.only(~gone[every.view]) if gone.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
-        """The views whose detections in a frame repeat those of the frame before."""
+        """The views with detections in `frame` that repeat those of the frame before."""
         return tuple(np.flatnonzero(self._frame(frame)[1]).tolist())
 
     def _frame(self, frame: int) -> tuple[Detections, Mask]:
-        """All detections of a frame, and which views (V,) repeat themselves."""
+        """All detections of a frame, and which views (V,) repeat their picture."""
         if frame not in self._read:
             now, repeated = self.frames[frame], np.zeros(self.views, dtype=bool)
             if frame > self.first:
@@ -55,7 +59,9 @@ class WithoutRepeats(DerivedFrames):
 
 
 def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
-    """(V,) the views whose detections are those of the frame before, while other views have new ones."""
+    """(V,) the views whose detections equal those of the frame before, if other views have new
+    ones.
+    """
     there, was = (np.bincount(each.view, minlength=views) for each in (now, before))
     alike = (there == was) & (there >= _LEAST)
     if not alike.any():

@@ -1,5 +1,5 @@
-"""The files of a result, people.npz, observations.npz and run.json: written together, tied by one id, and
-opened.
+"""The files of a result (people.npz, observations.npz and run.json): written together with a common
+id, and opened.
 """
 
 import hashlib
@@ -24,27 +24,27 @@ from shapepose_fg.core.storage.schema import Table, columns_of
 
 PEOPLE, RUN, OBSERVATIONS = "people.npz", "run.json", "observations.npz"
 MOMENTS = "moments.csv"
-"""File that lists the picture of each camera in each frame, where cameras differ."""
+"""File with the number of each camera's picture in each frame, if cameras differ."""
 CLOCKS = "synchronised.csv"
-"""File that lists when each camera took its frames, where this was estimated from people."""
+"""File with the times of each camera's frames, if they were estimated from the people."""
 RUN_ID = "run_id"
-"""Key of the id that ties the files of a result: a digest of all columns of people.npz."""
+"""Key of the common id of a result's files: a digest of all columns of people.npz."""
 T = TypeVar("T", bound=Table)
 _DIGITS = 32
-"""Number of digits of the run's id. The id depends on the people alone, so that an interrupted run that was
-resumed writes the same bytes as one that was not interrupted."""
+"""Number of digits of the run's id. The id depends only on the people, so that a resumed run writes
+the same bytes as an uninterrupted one."""
 
 
 def results_folder(results: Path) -> Path:
-    """The folder of a result, which may be given as its people.npz too."""
+    """The folder of a result, given as this folder or as the people.npz in it."""
     return results.parent if results.name == PEOPLE else results
 
 
 def set_aside(folder: Path) -> list[str]:
-    """Rename exports and overlays of an earlier result in `folder`, so that they are not taken for those of the
-    new one.
+    """Rename exports and overlays of an earlier result in `folder`, so that they are not mistaken
+    for those of the new one.
 
-    Returns a sentence for each.
+    Returns a sentence about each.
     """
     told = []
     for made in (folder / name for name in ("export", "overlay")):
@@ -62,12 +62,14 @@ def write_result(
     run: Mapping[str, Any],
     check: Callable[[Path, Path | None], object] | None = None,
 ) -> None:
-    """Write the files of a result into `folder`, none before all are complete on the disk.
+    """Write the files of a result into `folder`; none is put in place before all are complete on
+    disk.
 
-    If the process is killed, each file is the old or the new one; `check_id` notices files of two runs. Without
-    `observations`, those of an earlier result are removed. Nothing is replaced where `check` raises, which is
-    called with the new people.npz and observations.npz. ValueError where JSON cannot hold `run`, OSError that
-    names the file where one cannot be written.
+    If the process is killed, each file is either the old or the new one; `check_id` detects files
+    of different runs. Without `observations`, those of an earlier result are removed. Before files
+    are replaced, `check` is called with the new people.npz and observations.npz; if it raises,
+    nothing is replaced. ValueError if `run` cannot be written as JSON; OSError that names the file
+    if one cannot be written.
     """
     digest = hashlib.sha256()
 
@@ -78,15 +80,15 @@ def write_result(
         return json.dumps({RUN_ID: id_text(), **run}, indent=2, allow_nan=False, default=plain) + "\n"
 
     def write_people(stream: BinaryIO) -> None:
-        # The id is asked for when all columns before it have been written.
+        # The id is read after all columns before it have been written.
         last = {RUN_ID: Pieces(np.dtype(f"U{_DIGITS}"), (), lambda: (np.array(id_text()),))}
         write_npz(stream, {name: _told(name, each, digest.update) for name, each in people.items()} | last)
 
     def write_observations(stream: BinaryIO) -> None:
         write_npz(stream, {**(observations or {}), RUN_ID: np.array(id_text())})
 
-    run_text()  # what cannot be written is known before the work
-    # The order counts: the id is known when people.npz has been written.
+    run_text()  # fails before the work if it cannot be written
+    # The order matters: the id is known only after people.npz has been written.
     files = {folder / PEOPLE: write_people}
     files |= {} if observations is None else {folder / OBSERVATIONS: write_observations}
 
@@ -106,9 +108,10 @@ def write_result(
 
 
 def check_id(people_id: object, other_id: object, file: Path) -> None:
-    """InputError where `file` is of another run than the people.npz beside it.
+    """InputError if `file` is from another run than the people.npz beside it.
 
-    An id is text, an array that holds it, or None in files of earlier versions, which are taken as they are.
+    An id is text, an array with this text, or None in files of earlier versions, which are accepted
+    unchecked.
     """
     if people_id is None or other_id is None or str(people_id) == str(other_id):
         return
@@ -120,7 +123,9 @@ def check_id(people_id: object, other_id: object, file: Path) -> None:
 
 
 def _told(name: str, column: Pieces, tell: Any) -> Pieces:
-    """Return the column; its pieces, when read, pass its name, type, shape and bytes to `tell`."""
+    """Return the column; when its pieces are read, its name, type, shape and bytes are passed to
+    `tell`.
+    """
 
     def pieces() -> Iterator[NDArray[Any]]:
         tell(f"{name} {column.dtype} {column.shape}\n".encode())
@@ -134,10 +139,12 @@ def _told(name: str, column: Pieces, tell: Any) -> Pieces:
 
 
 class SavedTable(ExitStack, Generic[T]):
-    """people.npz or observations.npz, open: a table of the class `kind`."""
+    """An opened people.npz or observations.npz: a table of the class `kind`."""
 
     def __init__(self, file: Path, kind: type[T], cure: str) -> None:
-        """InputError, with the `cure`, where it cannot be read or an array is missing that earlier files have."""
+        """InputError, with the `cure`, if the file cannot be read, or if a required array is
+        missing.
+        """
         super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
         self._columns, told = columns_of(kind), kind.meanings()
@@ -146,7 +153,7 @@ class SavedTable(ExitStack, Generic[T]):
         try:
             there = self._npz.names
             for name in there:
-                self._npz.shape(name)  # one that is damaged goes before one that is missing
+                self._npz.shape(name)  # report a damaged array before a missing one
             added = {name for name, column in self._columns.items() if column.missing is not None}
             added |= {f"{name}_names" for name in added if name not in there}
             for name in (*kind.ROWS, *kind.shared(), *told):
@@ -154,7 +161,7 @@ class SavedTable(ExitStack, Generic[T]):
                     raise InputError(f"{file}: column {name} is missing; {cure}")
             for name in told.keys() & set(there):
                 words = self._npz.array(name)
-                # Older files know fewer codes: what is added to them comes last.
+                # Files of earlier versions have fewer codes; new codes are appended.
                 if not (len(words) > 0 and np.array_equal(words, told[name][: len(words)])):
                     raise InputError(f"{file}: {name} are not those of this version; {cure}")
             self.run_id = self._npz.array(RUN_ID) if RUN_ID in there else None
@@ -173,8 +180,8 @@ class SavedTable(ExitStack, Generic[T]):
             raise
 
     def column(self, name: str) -> NDArray[Any]:
-        """A whole column, checked; rows are selected by it before the others are read."""
-        if name not in self._rows:  # a shared one, or files of earlier versions lack it
+        """A whole column, checked. Rows are selected by it before other columns are read."""
+        if name not in self._rows:  # a column shared by all rows, or one missing in files of earlier versions
             return self._shared[name] if name in self._shared else getattr(self.read(None), name)
         with naming(self.file, self.cure):
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
@@ -182,9 +189,11 @@ class SavedTable(ExitStack, Generic[T]):
             return column
 
     def read(self, index: Index | None, **others: Any) -> T:
-        """The rows `index` (R,), rising, or all, and `others`; InputError where they are no table, or too many."""
+        """The rows `index` (R,), increasing, or all, with the fields `others`; InputError if they
+        are invalid, or too many for the memory.
+        """
         count = self.count if index is None else len(index)
-        needed = 2 * count * sum(map(self._npz.row_bytes, self._rows))  # and as much again to work with them
+        needed = 2 * count * sum(map(self._npz.row_bytes, self._rows))  # twice, for working copies
         check_memory(f"{self.file}: {count} rows", needed, "--frames, --person, or Reconstruction.open")
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
         with naming(self.file, self.cure):
@@ -194,7 +203,9 @@ class SavedTable(ExitStack, Generic[T]):
 
 
 def check_memory(what: str, needed: int, options: str) -> None:
-    """InputError where more bytes of memory are `needed` than are free; `options` take a part."""
+    """InputError if more bytes of memory are `needed` than are free; `options` are the options that
+    select a part.
+    """
     import psutil
 
     free = psutil.virtual_memory().available

@@ -1,5 +1,5 @@
-"""The project's own rig file, which `io.calibration` reads: cameras of a result, and their trajectories beside
-it.
+"""Writes this project's rig file (cameras and, beside it, their trajectories), which
+`io.calibration` reads.
 """
 
 import json
@@ -12,27 +12,29 @@ from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.core.trajectory import Trajectory
 
 CAMERAS = "cameras.json"
-"""The cameras of a result, as a rig file of our own, beside its people.npz."""
+"""Name of the rig file with the cameras of a result, beside its people.npz."""
 RIG_FORMAT = "shapepose-fg rig 1"
-"""The tag by which a rig file of our own is known."""
+"""Format tag of this project's rig files."""
 POSE = ("time_s", "x", "y", "z", "qx", "qy", "qz", "qw")
-"""The columns of a pose: TUM's eight numbers, in its order."""
+"""Columns of a pose: the eight numbers of TUM's format, in its order."""
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
 COVARIANCE = tuple(f"{a}_{b}" for n, a in enumerate(_AXES) for b in _AXES[n:])
-"""The columns of a covariance: `rx_rx` to `z_z`, its upper triangle, rad and m along the carrier's own axes."""
+"""Columns of a covariance: its upper triangle, `rx_rx` to `z_z`, rad and m along the carrier's own
+axes."""
 
 
 def is_replaceable(file: Path) -> bool:
-    """Whether `file` may be overwritten: there is none, or a rig file of our own. Other programs' calibrations are
-    called cameras.json, too.
+    """Whether `file` may be overwritten: it does not exist, or it is a rig file of this project.
+    Calibrations of other programs may also be called cameras.json.
     """
     return not file.exists() or RIG_FORMAT in read_text(file, may_be_empty=True)
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write `rig` as a rig file of our own, which `read_rig` reads back to the last digit.
+    """Write `rig` as this project's rig file, which `read_rig` reads back without loss.
 
-    Trajectories go into the folder `trajectories` beside it, as CSV with covariances and as TUM's text.
+    Trajectories are written to the folder `trajectories` beside it, as CSV with covariances and in
+    TUM's format.
     """
     stems = [Path(each.name).stem for each in rig.trajectories]
     files = {
@@ -69,7 +71,9 @@ def write_rig(rig: Rig, path: str | Path) -> None:
 
 
 def write_trajectory(trajectory: Trajectory, path: Path) -> None:
-    """Write a trajectory as CSV with a header, covariances in it; or, `.tum`, as TUM's text, without."""
+    """Write a trajectory as CSV with a header and covariances; or, for a `.tum` file, in TUM's
+    format without covariances.
+    """
     from scipy.spatial.transform import Rotation
 
     quaternions = Rotation.from_matrix(trajectory.wTb[:, :3, :3]).as_quat(canonical=True)

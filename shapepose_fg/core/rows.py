@@ -1,4 +1,6 @@
-"""Dataclasses of arrays of one length: some of their rows, rows written over others, several joined."""
+"""Base class of dataclasses of arrays with the same length: selects, overwrites and concatenates
+rows.
+"""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -8,7 +10,9 @@ import numpy as np
 
 
 class Rows:
-    """Base of dataclasses of arrays of one length, or of `Rows` again; any other field is about all rows."""
+    """Base of dataclasses of arrays with the same length, or of other `Rows`; any other field
+    applies to all rows.
+    """
 
     def _columns(self) -> dict[str, Any]:
         columns = ((each.name, getattr(self, each.name)) for each in fields(cast(Any, self)))
@@ -18,7 +22,7 @@ class Rows:
         return len(next(iter(self._columns().values())))
 
     def rows(self, index: Any) -> Self:
-        """The rows `index`: places (R,), a mask (N,) or a slice."""
+        """The rows `index`: row numbers (R,), a mask (N,) or a slice."""
         chosen = {
             name: value.rows(index) if isinstance(value, Rows) else value[index]
             for name, value in self._columns().items()
@@ -26,19 +30,21 @@ class Rows:
         return replace(cast(Any, self), **chosen)
 
     def put(self, index: Any, other: Self) -> None:
-        """Write the rows of `other` over the rows `index` (R,)."""
+        """Overwrite the rows `index` (R,) by the rows of `other`."""
         for name, values in self._columns().items():
             values[index] = getattr(other, name)
 
     def with_rows(self, index: Any, other: Self) -> Self:
-        """Return a copy whose rows `index` (R,) are those of `other`."""
+        """Return a copy in which the rows `index` (R,) are those of `other`."""
         changed = replace(cast(Any, self), **{name: value.copy() for name, value in self._columns().items()})
         changed.put(index, other)
         return changed
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """The rows of one or more parts, one after the other; what is for all rows is the first part's."""
+        """The rows of one or more parts, one after the other; fields that apply to all rows are
+        those of the first part.
+        """
         joined = {
             name: type(value).concatenate([getattr(part, name) for part in parts])
             if isinstance(value, Rows)

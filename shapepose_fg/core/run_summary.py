@@ -1,4 +1,4 @@
-"""The content of run.json: checks it when it is read, and merges that of several results."""
+"""The content of run.json: checks it on reading, and merges that of several results."""
 
 import json
 import math
@@ -10,15 +10,16 @@ import numpy as np
 
 Run = dict[str, Any]
 MOST_FRAMES = 10_000_000
-"""Frames of a recording: over four days at 25 a second."""
+"""Maximum number of frames of a recording: over four days at 25 frames a second."""
 
 
 def merged_run(runs: Sequence[Run]) -> Run:
-    """One run of several: what they agree on, the frames of all together, and the rest listed under `parts`.
+    """Merge several runs into one: entries that are equal, the frames of all, and the other entries
+    under `parts`.
 
-    `frames` becomes [start, stop], or a list of those where there are gaps, and is left out where a part does
-    not say. ValueError where configurations or an input's checksum differ, or two parts cover the same frame.
-    Parts of one run, with one and the same `run`, leave it as it is.
+    `frames` becomes [start, stop], or a list of these if there are gaps; it is left out if a part
+    has none. ValueError if configurations or the checksum of an input differ, or if two parts cover
+    the same frame. If all `runs` are equal (parts of one run), a copy of it is returned.
     """
     distinct: list[Run] = []
     for run in runs:
@@ -53,7 +54,9 @@ def merged_run(runs: Sequence[Run]) -> Run:
 
 
 def _joined(spans: Sequence[range]) -> list[Any]:
-    """Frames together, as [start, stop] or a list of those; ValueError where two parts cover the same one."""
+    """Merge frame ranges to [start, stop], or to a list of these; ValueError if two parts cover the
+    same frame.
+    """
     found: list[list[int]] = []
     for span in sorted((span for span in spans if len(span) > 0), key=lambda span: span.start):
         if found and span.start < found[-1][1]:
@@ -66,7 +69,9 @@ def _joined(spans: Sequence[range]) -> list[Any]:
 
 
 def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """The dotted name of the first entry in which two sets of plain values differ, and both values; or None."""
+    """The dotted name of the first entry in which two nested plain values differ, and both values;
+    None if they are equal.
+    """
     if isinstance(one, dict) and isinstance(other, dict):
         for key in dict.fromkeys((*one, *other)):
             found = difference(one.get(key), other.get(key), f"{name}.{key}" if name else key)
@@ -81,7 +86,9 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def plain(value: object) -> object:
-    """`value` as plain values for JSON: arrays as lists, paths as text. TypeError where that is impossible."""
+    """Convert `value` to plain values for JSON: arrays to lists, paths to text. TypeError if that
+    is impossible.
+    """
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Path):
@@ -90,7 +97,9 @@ def plain(value: object) -> object:
 
 
 def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
-    """The frames that a run covered, as ranges; None where it does not say. ValueError where it makes no sense."""
+    """The frames that a run covered, as ranges; None if `run` has no such entry. ValueError if the
+    entry is invalid.
+    """
     frames = run.get("frames")
     if frames is None:
         return None
@@ -101,7 +110,9 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
 
 
 def check_run(run: Mapping[str, Any]) -> None:
-    """ValueError where an entry that is read again is not what it must be; others may be anything finite."""
+    """ValueError if an entry that this program reads again is invalid; other entries may be any
+    finite values.
+    """
 
     def refuse(name: str, wanted: str, value: object) -> ValueError:
         text = repr(value)
@@ -127,12 +138,12 @@ def check_run(run: Mapping[str, Any]) -> None:
     if any(span.start < 0 or span.stop < span.start for span in spans) or count > MOST_FRAMES:
         raise refuse("frames", f"[start, stop] of at most {MOST_FRAMES} frames", run["frames"])
     for way, value in _leaves(run):
-        if isinstance(value, float) and not math.isfinite(value):  # 1e999, which could not be written again
+        if isinstance(value, float) and not math.isfinite(value):  # 1e999, which JSON cannot store again
             raise ValueError(f'"{way[:80]}" must be a finite number, got {value}')
 
 
 def _leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
-    """Values in nested lists and objects, each with the dotted keys and indices that lead to it."""
+    """All values in nested lists and objects, each with its dotted path of keys and indices."""
     items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else None
     if items is None:
         yield way, value

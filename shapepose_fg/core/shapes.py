@@ -16,25 +16,27 @@ from shapepose_fg.core.storage.schema import Column, Table
 
 _COLUMNS = ("names", "betas", "information", "body")
 _LEAST, _MOST = 1e-6, 1e12
-"""Least and most information about a shape: that of the prior over adults alone is 1."""
+"""Smallest and largest eigenvalue of the information about a shape; the prior over adults has 1."""
 _CURE = "give a file that `--shapes` has written"
 
 
 @dataclass(frozen=True)
 class SubjectShapes(Table):
-    """The shapes of G people: a Gaussian each over the betas of one body model."""
+    """Body shapes of G people: for each, a Gaussian over the betas of one body model."""
 
     names: Annotated[NDArray[np.str_], Column("N", np.str_)]
-    """(G,) unique names: identities of a recording as text, or names that the user gave."""
+    """(G,) unique names: identities of a recording as text, or names given by the user."""
     betas: Annotated[Array, Column("N 10")]
     """(G, 10) mean shape, standard deviations."""
     information: Annotated[Array, Column("N 10 10")]
-    """(G, 10, 10) inverse covariance of that shape, the prior over adults included."""
+    """(G, 10, 10) inverse covariance of the shape, including the prior over adults."""
     body: str
-    """Fingerprint of the body model that the betas are of (`body.fitting.weights.fingerprint`)."""
+    """Fingerprint of the body model to which the betas belong (`body.fitting.weights.fingerprint`)."""
 
     def __post_init__(self) -> None:
-        """Check every shape and type; that names differ; that betas are finite and information is definite."""
+        """Check shapes and types, that names are unique, betas finite, and information matrices
+        positive definite.
+        """
         super().__post_init__()
         names = self.names.tolist()
         for name in names:
@@ -53,7 +55,7 @@ class SubjectShapes(Table):
 
     @classmethod
     def empty(cls, body: str) -> "SubjectShapes":
-        """No people."""
+        """Shapes of no people."""
         return cls(np.zeros(0, dtype="U1"), np.zeros((0, 10)), np.zeros((0, 10, 10)), body)
 
     @property
@@ -62,30 +64,32 @@ class SubjectShapes(Table):
         return np.linalg.inv(self.information).astype(np.float64, copy=False)
 
     def named(self, names: Sequence[str]) -> "SubjectShapes":
-        """Return these people with other names."""
+        """Return these shapes with other names."""
         return replace(self, names=np.array(list(names), dtype=str))
 
     def updated(self, other: "SubjectShapes") -> "SubjectShapes":
-        """These people and those of `other`, whose shapes replace older ones of the same name.
+        """Merge with the shapes in `other`, which replace older ones of the same name.
 
-        A shape that was estimated with an older one as its prior includes it already, so that the two are not
-        combined. ValueError where `other` is of another body.
+        Shapes of the same name are not combined, because the newer one was estimated with the older
+        one as its prior. ValueError if `other` is of another body model.
         """
         if other.body != self.body:
             raise ValueError("shapes must be of the same body model")
         return SubjectShapes.joined([self.rows(~np.isin(self.names, other.names)), other])
 
     def save(self, file: str | Path) -> None:
-        """Write the shapes as `.npz`, whole or not at all (docs/conventions.md)."""
+        """Write the shapes as `.npz`, atomically (docs/conventions.md)."""
         write_atomically(Path(file), self.write)
 
     def write(self, stream: BinaryIO) -> None:
-        """Write the contents of that file."""
+        """Write the content of the `.npz` file to a stream."""
         write_npz(stream, {name: np.asarray(getattr(self, name)) for name in _COLUMNS})
 
     @classmethod
     def load(cls, file: str | Path, body: str) -> "SubjectShapes":
-        """Read what `save` wrote, of the model with the fingerprint `body`; InputError on anything else."""
+        """Read a file written by `save` for the body model with the fingerprint `body`; InputError
+        for any other content.
+        """
         file = Path(file)
         columns = read_npz(file, _COLUMNS, _CURE)
         for name in _COLUMNS:

@@ -14,7 +14,9 @@ LONGEST_NAME = 64
 
 
 def check_joint_names(names: Iterable[str]) -> None:
-    """ValueError for a name that breaks the lines of other programs' files, or is a formula in their tables."""
+    """ValueError for a name that would break the lines of text files, or that spreadsheets read as
+    a formula.
+    """
     for name in names:
         if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
             raise ValueError(
@@ -30,21 +32,23 @@ class Skeleton:
     name: str
     """Name of the skeleton, for messages and files."""
     joints: tuple[str, ...]
-    """The J joint names, as OpenPose writes them."""
+    """The names of the J joints, spelled as in OpenPose."""
     limbs: tuple[tuple[int, int], ...]
-    """The L pairs of joints between which part affinities are given, in the detector's order."""
+    """The L pairs of joints with part affinities, in the detector's order."""
     parents: tuple[int, ...]
-    """(J,) the joint that a joint is grown from; -1 for the root, which is the anchor of a person."""
+    """(J,) parent of each joint in the tree in which people are assembled; -1 for the root, the
+    anchor of a person."""
     mirror: tuple[int, ...]
-    """(J,) index of the corresponding joint on the other side of the body; a joint in the middle has its own
-    index."""
+    """(J,) index of the corresponding joint on the other side of the body; a joint on the midline
+    has its own index."""
     core: tuple[int, ...]
     """The joints by which a person is recognised: trunk, arms and legs, without face and toes."""
     middles: tuple[tuple[int, int, int], ...] = ()
-    """Joints that the detector does not give: (joint, first, second), the midpoint of two that it gives."""
+    """Joints that the detector does not output: (joint, first, second), the midpoint of two that it
+    outputs."""
     keypoints: tuple[int, ...] | None = None
-    """(K,) index of the joint of each keypoint that the detector writes, -1 for one that is skipped (hands and
-    face, say); None where keypoints are the joints, in this order."""
+    """(K,) index of the joint of each keypoint that the detector writes, -1 for one that is ignored
+    (such as hands and face); None if the keypoints are the joints, in this order."""
 
     @classmethod
     def of(
@@ -60,12 +64,13 @@ class Skeleton:
         parents: Mapping[str, str] | None = None,
         passed_over: int = 0,
     ) -> "Skeleton":
-        """A skeleton described by names.
+        """Make a skeleton from names.
 
-        `keypoints` are the detector's, in its order; "" is passed over, and so are `passed_over` more at the end.
-        `middles` are made of two keypoints each. `anchor` is a joint, or the name of two of which the middle is
-        made ("MidHip" then). `mirror` are pairs of joints on both sides of the body. `parents` are found along
-        the limbs, from the anchor outwards, where they are not given. ValueError names what does not fit.
+        `keypoints` are the detector's, in its order; "" is ignored, and so are `passed_over`
+        further ones at the end. `middles` are computed as midpoints of two keypoints. `anchor` is a
+        joint, or the names of two joints with the midpoint "MidHip". `mirror` are pairs of joints
+        on both sides of the body. By default, `parents` are found along the limbs, from the anchor
+        outwards. ValueError names what is inconsistent.
         """
         middles = dict(middles or {})
         if not isinstance(anchor, str):
@@ -133,7 +138,9 @@ class Skeleton:
 
     @property
     def anchor(self) -> tuple[int, ...]:
-        """The joints that place a person: the root joint, or the two of which it is the midpoint."""
+        """The joints that determine the position of a person: the root joint, or the two of which
+        it is the midpoint.
+        """
         return next(((first, second) for joint, first, second in self.middles if joint == self.root), (self.root,))
 
     @property
@@ -143,13 +150,15 @@ class Skeleton:
 
     @property
     def hips(self) -> tuple[int, int]:
-        """The two joints beside the root that mirror each other."""
+        """The two mirrored joints next to the root."""
         beside = [j for j in range(len(self)) if self.parents[j] == self.root and self.mirror[j] != j]
         return beside[0], beside[1]
 
     @cached_property
     def tree_levels(self) -> tuple[Index, ...]:
-        """Joints by their distance from the root: level 0 is the root alone, level 1 its children, ..."""
+        """Joints by their distance from the root: level 0 is the root, level 1 its children, and so
+        on.
+        """
         levels = [np.array([self.root])]
         while len(children := np.flatnonzero(np.isin(self.parents, levels[-1]))) > 0:
             levels.append(children)
@@ -157,7 +166,7 @@ class Skeleton:
 
     @cached_property
     def adjacency(self) -> Index:
-        """(J, J) 1 where a limb joins two joints."""
+        """(J, J) adjacency matrix: 1 if a limb connects two joints."""
         joined = np.zeros((len(self), len(self)), dtype=np.intp)
         first, second = np.array(self.limbs).T
         joined[first, second] = joined[second, first] = 1
@@ -165,7 +174,7 @@ class Skeleton:
 
     @cached_property
     def tree_neighbours(self) -> Index:
-        """(J, N) parent and children of each joint in the tree, filled up with -1."""
+        """(J, N) parent and children of each joint in the tree, padded with -1."""
         parents = np.array(self.parents)
         lists = [[*parents[[j]][parents[[j]] >= 0], *np.flatnonzero(parents == j)] for j in range(len(self))]
         most = max(map(len, lists))
@@ -173,13 +182,15 @@ class Skeleton:
 
 
 def _limbs(text: str) -> tuple[tuple[int, int], ...]:
-    """Limbs from their usual notation: "1-8 9-10"."""
+    """Limbs from a text of index pairs: "1-8 9-10"."""
     pairs = (limb.split("-") for limb in text.split())
     return tuple((int(first), int(second)) for first, second in pairs)
 
 
 def _grown(root: int, limbs: Sequence[tuple[int, int]], count: int) -> list[int]:
-    """The parent of each joint when a tree is grown from `root` along the limbs, -1 where none leads."""
+    """The parent of each joint in a tree grown from `root` along the limbs; -1 for the root and
+    unreachable joints.
+    """
     parents, reached = [-1] * count, [root]
     for joint in reached:
         for first, second in limbs:
@@ -191,7 +202,7 @@ def _grown(root: int, limbs: Sequence[tuple[int, int]], count: int) -> list[int]
 
 
 MID_HIP = "MidHip"
-"""The anchor of a person where it is made: the middle of the hips."""
+"""Name of the anchor of a person if it is computed: the midpoint of the hips."""
 
 BODY_25 = Skeleton(
     name="BODY_25",
@@ -207,24 +218,24 @@ BODY_25 = Skeleton(
     mirror=(0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11, 16, 15, 18, 17, 22, 23, 24, 19, 20, 21),
     core=tuple(range(15)),
 )
-"""OpenPose's BODY_25: the skeleton in which everything else here is described."""
+"""OpenPose's BODY_25, the reference skeleton of this package."""
 
 _MIDDLES = {"Neck": ("RShoulder", "LShoulder"), MID_HIP: ("RHip", "LHip")}
-"""BODY_25's own middle joints as midpoints of two others: a skeleton without them gets them this way."""
+"""BODY_25's joints on the midline, as midpoints of two others, for skeletons without them."""
 _GROWN_FROM = dict(zip(BODY_25.joints, (BODY_25.joints[parent] for parent in BODY_25.parents), strict=True)) | {
     "Head": "Neck", "head": "Neck", "neck": "Neck", "left_collar": "Neck", "right_collar": "Neck",
     "spine1": MID_HIP, "spine2": MID_HIP, "spine3": MID_HIP,
     "left_hand": "LWrist", "right_hand": "RWrist", "left_foot": "LAnkle", "right_foot": "RAnkle",
 }  # fmt: skip
-"""Parent joint of each point of the body; where a skeleton lacks it, the parent's parent takes its place."""
+"""Parent joint of each body point; if a skeleton lacks it, the parent's parent is used."""
 
 
 def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> Skeleton:
-    """The skeleton of a detector whose `keypoints` are points of the body: of BODY_25, HALPE's top of the head
-    (`Head`), or SMPL_24's `head`, `neck`, spine, collars, hands and feet.
+    """Skeleton of a detector from the body points of its `keypoints`: those of BODY_25, HALPE's top
+    of the head (`Head`), or SMPL_24's `head`, `neck`, spine, collars, hands and feet.
 
-    "" is a keypoint that is passed over, and so are `passed_over` more at the end. Neck and mid-hip are made as
-    middles where they are not given. ValueError where shoulders or hips are missing.
+    "" is a keypoint that is ignored, and so are `passed_over` further ones at the end. Missing Neck
+    and MidHip are computed as midpoints. ValueError if shoulders or hips are missing.
     """
     given = [point for point in keypoints if point]
     lacking = [each for ends in _MIDDLES.values() for each in ends if each not in given]
@@ -261,7 +272,7 @@ def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> 
 
 
 def _layout(name: str, keypoints: str, passed_over: int = 0) -> Skeleton:
-    """A skeleton from its usual notation; - is a keypoint that is passed over."""
+    """A skeleton from a text of its keypoints; - is a keypoint that is ignored."""
     return body_skeleton(name, ["" if point == "-" else point for point in keypoints.split()], passed_over)
 
 
@@ -274,14 +285,14 @@ _ARMS = "RShoulder RElbow RWrist LShoulder LElbow LWrist"
 _LEGS = "RHip RKnee RAnkle LHip LKnee LAnkle"
 
 COCO_17 = _layout("COCO_17", _COCO)
-"""COCO's 17 keypoints; neck and mid-hip are made."""
+"""COCO's 17 keypoints; Neck and MidHip are computed."""
 COCO_18 = _layout("COCO_18", f"Nose Neck {_ARMS} {_LEGS} REye LEye REar LEar")
-"""OpenPose's COCO model; mid-hip is made."""
+"""OpenPose's COCO model; MidHip is computed."""
 HALPE_26 = _layout("HALPE_26", _HALPE)
 """HALPE's body with feet, AlphaPose's and RTMPose's."""
-"""HALPE's whole body; face and hands are passed over."""
+"""HALPE's whole body; face and hands are ignored."""
 COCO_133 = _layout("COCO_133", f"{_COCO} {_FEET}", passed_over=110)
-"""COCO-WholeBody; neck and mid-hip are made, face and hands are passed over."""
+"""COCO-WholeBody; Neck and MidHip are computed, face and hands are ignored."""
 BODY_25B = _layout("BODY_25B", f"{_COCO} head Head {_FEET}")
 """OpenPose's BODY_25B: COCO's joints, MPII's upper neck and top of the head, feet."""
 
@@ -331,7 +342,8 @@ SKELETONS = {
         ),
     )
 }
-"""Known skeletons of detection files; of several with the same number of keypoints the most usual comes first."""
+"""Known skeletons of detection files; among those with the same number of keypoints, the most
+common comes first."""
 
 SMPL_24 = tuple(
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot "

@@ -1,4 +1,6 @@
-"""Trajectories of what carries cameras, a robot, a person or a crane: poses over time from odometry or SLAM."""
+"""Trajectories of carriers of cameras (a robot, a person or a crane): poses over time from odometry
+or SLAM.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,43 +11,47 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import is_rotation, rigid
 
 DRIFT = 0.01
-"""Drift of an odometry that states no errors, per metre: wheels and cameras drift by about 1 % of the distance."""
+"""Default drift of an odometry, per metre: wheel and visual odometry drift by about 1 % of the
+distance."""
 LONGEST_GAP_S = 0.5
-"""Longest gap between poses that is interpolated, s: at a walk 0.7 m, at a turn 45 degrees."""
+"""Longest gap between poses that is interpolated, s: the carrier moves up to 0.7 m at walking
+speed, or turns up to 45 degrees."""
 _MOST_DRIFT = 1.0
 MOST_METRES = 1e6
-"""Largest coordinate of a place, m: farther away doubles are too coarse for joints."""
+"""Maximum coordinate of a position, m; farther away, double precision is too coarse for joints."""
 UNIT_LENGTH = 0.01
-"""Largest deviation of the length of a quaternion from 1: files round to two digits and more."""
+"""Largest deviation of the length of a quaternion from 1: files have two or more digits."""
 _START_M, _START_RAD = 0.05, 0.02
 """Standard deviation per axis of an odometry's start in the world of the fixed cameras: metres, rad."""
 _M_A_RAD, _M_A_S = 0.5, 0.05
-"""Path length that a turn by one radian, and a second at rest, count as, m."""
+"""Path length, m, to which a rotation by one radian, and a second at rest, are equivalent in the
+drift model."""
 _RAD_A_M = 0.5
-"""Error of rotation, rad, per metre of translational error of an odometry: equal effect after a straight path
-of 10 m."""
+"""Error of rotation, rad, per metre of translational error of an odometry; both have the same
+effect after a straight path of 10 m."""
 MOST_VARIANCE = 1e18
-"""Largest entry of a pose's covariance, rad² or m²: what is known this badly is not known at all."""
+"""Largest entry of a pose's covariance, rad² or m²: a larger one is equivalent to an unknown pose."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses over time of something that carries cameras."""
+    """Poses over time of a carrier of cameras."""
 
     name: str
     """Name of the carrier; cameras refer to it."""
     time_s: Array
-    """(F,) rising times, seconds, on the clock of the pictures' times."""
+    """(F,) increasing times, seconds, on the clock of the pictures' times."""
     wTb: Array
     """(F, 4, 4) world from carrier, metres."""
     covariance: Array | None = None
-    """(F, 6, 6) covariance of each pose in the world, rotation before translation along the carrier's own axes,
-    rad² and m² (GTSAM's order); None for an odometry, whose start is known and which drifts."""
+    """(F, 6, 6) covariance of each pose in the world: rotation, then translation, along the
+    carrier's own axes, rad² and m² (GTSAM's order); None for an odometry, which has a known start
+    and drifts."""
     drift: float = DRIFT
-    """Drift of an odometry per metre, as a share of the path; errors add up like steps of a random walk."""
+    """Drift of an odometry, as a share of the path length; its errors are a random walk."""
     refined: bool = False
-    """Whether the trajectory was refined with the people of a recording (`pipeline.trajectories`); it is then
-    used as it is."""
+    """Whether the trajectory was refined with the people of a recording (`pipeline.trajectories`);
+    it is then not refined again."""
 
     def __post_init__(self) -> None:
         def refuse(problem: str) -> ValueError:
@@ -83,14 +89,14 @@ class Trajectory:
         return len(self.time_s)
 
     def covers(self, time_s: Array) -> Mask:
-        """(...,) mask of the times that lie between two poses which are near enough to each other."""
+        """(...,) mask of the times between two poses that are at most `LONGEST_GAP_S` apart."""
         after = np.clip(np.searchsorted(self.time_s, time_s), 1, len(self) - 1)
         near = (np.diff(self.time_s)[after - 1] <= LONGEST_GAP_S) | (self.time_s[after] == time_s)
         return np.asarray((time_s >= self.time_s[0]) & (time_s <= self.time_s[-1]) & near)
 
     def at(self, time_s: Array) -> Array:
-        """(..., 4, 4) poses at times (...,): translations interpolated linearly, rotations about one axis;
-        constant beyond the ends.
+        """(..., 4, 4) poses at times (...,): translations are interpolated linearly, rotations
+        about a fixed axis; constant beyond the ends.
         """
         from scipy.spatial.transform import Rotation
 
@@ -102,7 +108,7 @@ class Trajectory:
         return pose.reshape(*np.shape(time_s), 4, 4)
 
     def covariance_at(self, time_s: Array) -> Array:
-        """(..., 6, 6) covariances of the poses at times (...,); 0 where none are given."""
+        """(..., 6, 6) covariances of the poses at times (...,); 0 if none are given."""
         if self.covariance is None:
             return np.zeros((*np.shape(time_s), 6, 6))
         return self._between(self.covariance, np.ravel(time_s)).reshape(*np.shape(time_s), 6, 6)
@@ -130,8 +136,8 @@ class Trajectory:
         return (1 - part) * values[before] + part * values[before + 1]
 
     def _place(self, time_s: Array) -> tuple[Index, Array]:
-        """(M,) index of the pose before each of the times (M,), and the time's relative position before the
-        next, 0 to 1.
+        """(M,) index of the pose before each of the times (M,), and the relative position between
+        it and the next, 0 to 1.
         """
         before = np.clip(np.searchsorted(self.time_s, time_s) - 1, 0, len(self) - 2)
         first, last = self.time_s[before], self.time_s[before + 1]
@@ -143,9 +149,9 @@ class Carried:
     """Poses of the carriers of cameras at N times, with covariances."""
 
     carrier: Index
-    """(V,) index of the carrier of each view among B; -1 for a camera that stands still."""
+    """(V,) index of the carrier of each view among B; -1 for a fixed camera."""
     wTb: Array
-    """(N, B, 4, 4) world from carrier."""
+    """(N, B, 4, 4) world from carrier, metres."""
     covariance: Array
     """(N, B, 6, 6) as in `Trajectory`."""
 

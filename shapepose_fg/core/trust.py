@@ -1,4 +1,6 @@
-"""Cameras that are left out of a reconstruction, and cameras that contradict each other."""
+"""Cameras that are left out of a reconstruction in some frames, and cameras that contradict each
+other.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +11,7 @@ from shapepose_fg.core.detections import DerivedFrames, DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, spans_of
 
 Spell = tuple[int, int, int]
-"""A view, the first frame of an interval, and the frame after its last."""
+"""A view, the first frame of an interval, and the first frame after it."""
 
 
 @dataclass(frozen=True)
@@ -17,9 +19,10 @@ class Trust:
     """Which cameras are used, in which frames of the recording; all by default."""
 
     left_out: tuple[Spell, ...] = ()
-    """Cameras that are treated as dark: they contradict others that agree."""
+    """Views and intervals that are left out, because they contradict other views that agree."""
     doubted: tuple[Spell, ...] = ()
-    """Cameras of which some are wrong, but it is unknown which: rows that need them are not `ok`."""
+    """Views and intervals of which some are wrong, but it is unknown which: rows that depend on
+    them are not `ok`."""
 
     def dark(self, frame: int) -> tuple[int, ...]:
         """The views that are left out of a frame."""
@@ -40,10 +43,10 @@ BELIEVED = Trust()
 
 @dataclass(frozen=True)
 class Trusted(DerivedFrames):
-    """A recording for `reconstruct` with the cameras that are left out or doubted."""
+    """A recording with the information for `reconstruct` which cameras are left out or doubted."""
 
     trust: Trust
-    """`setup_check.report.check_setup(detections, rig).trust`, for example."""
+    """For example `setup_check.report.check_setup(detections, rig).trust`."""
 
 
 def trust_in(detections: DetectionSequence) -> Trust:
@@ -52,7 +55,9 @@ def trust_in(detections: DetectionSequence) -> Trust:
 
 
 def without_poses(rig: Rig, times: FrameTimes) -> tuple[Spell, ...]:
-    """Intervals in which moving cameras have no pose: before, after and in gaps of their trajectories."""
+    """Intervals in which moving cameras have no pose: before, after and in gaps of their
+    trajectories.
+    """
     time_s, spells = times.of_views(len(rig)), list[Spell]()
     for view, number in enumerate(rig.carrier.tolist()):
         if number >= 0:
@@ -62,8 +67,8 @@ def without_poses(rig: Rig, times: FrameTimes) -> tuple[Spell, ...]:
 
 
 def with_poses(detections: DetectionSequence, rig: Rig, times: FrameTimes) -> DetectionSequence:
-    """The recording without the pictures of cameras that have no pose at the time; ValueError where one never
-    has.
+    """The recording without the pictures of cameras that have no pose at the time; ValueError if a
+    camera never has one.
     """
     spells, trust = without_poses(rig, times), trust_in(detections)
     for view, first, last in spells:

@@ -1,6 +1,6 @@
 """Rotates pictures so that gravity points down, at the size of a network's input, and back.
 
-Detectors are trained on upright people: of others they find half as many.
+Detectors are trained on upright people. They detect half as many people in rolled pictures.
 """
 
 from dataclasses import dataclass
@@ -13,21 +13,23 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Camera
 
 LEVEL_DEG = 5.0
-"""Roll below which pictures are not rotated, degrees: people lean by as much, and rotation loses corners."""
+"""Roll below which pictures are not rotated, degrees: people lean by as much, and rotation cuts off
+corners."""
 _LOOKS_DOWN = 0.17
-"""Length of the projected vertical, the sine of 10 degrees, below which the camera looks along it and no
-direction of the picture is up."""
+"""Length of the projected vertical (unit vector) below which the camera looks along the vertical,
+and no direction of the picture is up: the sine of 10 degrees."""
 
 
 def roll_of(camera: Camera, up: Array) -> float:
-    """Rotation of the picture of `camera` with which `up` (3,) points up in its middle: degrees clockwise.
+    """Clockwise rotation, degrees, of the picture of `camera` after which `up` (3,) points up at
+    its centre.
 
-    0 where the camera looks straight up or down.
+    0 if the camera looks straight up or down.
     """
     x, y, z = camera.cTw[:, :3] @ up
     width, height = camera.image_size
     right, down, _ = np.linalg.solve(camera.K, [(width - 1) / 2, (height - 1) / 2, 1.0])
-    # How the picture of a point in the middle moves when the point goes up.
+    # Motion of the projection of a point at the image centre when the point moves up.
     across, along = x - right * z, y - down * z
     if np.hypot(across, along) < _LOOKS_DOWN:
         return 0.0
@@ -63,10 +65,10 @@ class UprightView:
     ) -> "UprightView":
         """The view of a `region` rotated clockwise by `roll_deg`, about `long_side` pixels along its longer side.
 
-        Without `long_side` it keeps its size. Rolls under `LEVEL_DEG` from a multiple of 90 degrees are rotated by
-        that multiple. Both sides are the nearest multiples of `multiple`, so that the axes' scales differ by a few
-        per cent. A network with inputs of `only_size` (width, height) gets the region in the middle of such a
-        picture.
+        Without `long_side` the scale is 1. Rolls under `LEVEL_DEG` from a multiple of 90 degrees
+        are rotated by that multiple. Both sides are the nearest multiples of `multiple`, so that
+        the axes' scales differ by a few per cent. A network with inputs of `only_size` (width,
+        height) gets the region in the middle of such a picture.
         """
         quarter = 90.0 * round(roll_deg / 90.0)
         roll_deg = quarter if abs(roll_deg - quarter) < LEVEL_DEG else roll_deg
@@ -83,7 +85,7 @@ class UprightView:
         else:
             size = np.array(only_size)
             stretch = np.eye(2) * (size / sides).min()
-        # Edges, not centres, of pixels are scaled: hence the half pixel.
+        # The edges of pixels are scaled, not their centres, hence the half pixel.
         matrix = np.column_stack([stretch @ turn, (size - stretch @ (low + high)) / 2 - 0.5])
         return cls((int(size[0]), int(size[1])), matrix, region, roll_deg)
 
@@ -93,7 +95,8 @@ class UprightView:
         part = picture[max(top, 0) : bottom, max(left, 0) : right]
         matrix = self.input_from_picture.copy()
         matrix[:, 2] += matrix[:, :2] @ (max(left, 0), max(top, 0))
-        # Made smaller by areas first: sampling a picture that is much too large passes over most of its pixels.
+        # First reduced by area averaging: direct sampling of a much larger picture would skip most
+        # of its pixels.
         size = np.maximum(np.round(np.array(part.shape[1::-1]) * min(self.scale, 1.0)), 1).astype(int)
         small, ratio = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA), part.shape[1::-1] / size
         matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
@@ -102,7 +105,7 @@ class UprightView:
         return np.asarray(turned, dtype=np.uint8)
 
     def picture_from_input(self, xy: Array) -> Array:
-        """Pixels (..., 2) of the picture from those of the input."""
+        """Pixels (..., 2) of the picture for pixels of the input."""
         return (xy - self.input_from_picture[:, 2]) @ np.linalg.inv(self.input_from_picture[:, :2]).T
 
     def inside(self, xy: Array) -> Mask:

@@ -1,4 +1,6 @@
-"""Tests covariances without ground truth: a view is left out, and its detections are compared with the rest."""
+"""Tests covariances without ground truth: the detections of a held-out view are compared with the
+result of the other views.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,9 +16,10 @@ from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.evaluation.metrics import match_people
 
 NEAR_M = 0.3
-"""Distance from the joint, as a length, within which a candidate that the gate refused is compared, m."""
+"""Maximum distance of a gated candidate from the joint, m (a length at the joint's depth), up to
+which it is compared."""
 INSIDE_95 = 5.991
-"""A chi-squared variable with 2 degrees of freedom is under this in 95 of 100 cases."""
+"""95 % quantile of chi-squared with 2 degrees of freedom."""
 
 Solve = Callable[[DetectionSequence, Rig], Reconstruction]
 """Function that reconstructs a recording: `reconstruct`, with its settings."""
@@ -27,13 +30,15 @@ class HeldOut:
     """Result of `held_out` for one view."""
 
     squared: Array
-    """(M,) squared Mahalanobis distance of each candidate from where the other views put the joint."""
+    """(M,) squared Mahalanobis distance of each candidate from the joint's position by the other
+    views."""
     unmatched: int
-    """Number of candidates of rows that the other views alone do not find, or of joints that they do not place."""
+    """Number of candidates of rows that are missing in the result of the other views, or of joints
+    that have no position there."""
 
     @property
     def inside(self) -> float:
-        """Share inside the 95 % region; NaN where there is none."""
+        """Share of candidates inside the 95 % region; NaN if there are none."""
         return float((self.squared <= INSIDE_95).mean()) if len(self.squared) > 0 else float("nan")
 
 
@@ -54,9 +59,10 @@ def held_out(
     solve: Solve,
     config: ObservationConfig,
 ) -> HeldOut:
-    """Solve without a camera, and compare with its detections of the `people` of the whole run.
+    """Solve without one camera, and compare the result with the detections of this camera that were
+    assigned to `people`, the result of all cameras.
 
-    ValueError where `people` come without their observations.
+    ValueError if `people` have no observations.
     """
     others = Rig(tuple(camera for n, camera in enumerate(rig.cameras) if n != view), rig.up)
     return compare_view(rig.cameras[view], view, people, solve(without_view(recording, view), others), config)
@@ -67,8 +73,8 @@ def compare_view(
 ) -> HeldOut:
     """Compare the detections of `people` in `camera`, which is `view`, with the same people solved `without` it.
 
-    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are detections that were
-    assigned to a joint, unused ones only if they are near it.
+    Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are the
+    detections that were assigned to a joint; gated ones only within `NEAR_M` of it.
     """
     if people.observations is None:
         raise ValueError("the people have no observations: give the result of `reconstruct`, or load its folder")
@@ -110,9 +116,10 @@ def squared_distances(
 ) -> Array:
     """(M,) squared Mahalanobis distances of detections `xy` (M, 2), undistorted pixels, from projected `points`.
 
-    `points` (M, 3) in metres with `covariance` (M, 3, 3), m², were found without them. S = J C J^T + sigma² I
-    has the joint's uncertainty in the image and the noise that the graph gives a detection of that `confidence`
-    (M,) and of a joint with that `scatter` (M,). NaN behind the camera.
+    `points` (M, 3) in metres with `covariance` (M, 3, 3), m², were estimated without them. S = J C
+    J^T + sigma² I has the joint's uncertainty in the image and the noise variance that the graph
+    assigns to a detection with this `confidence` (M,) and this `scatter` (M,) of the joint. NaN
+    behind the camera.
     """
     projected, depth, J = project_with_jacobian(points, camera.K, camera.cTw)
     ahead, focal = depth >= MIN_DEPTH_M, _focal(camera)

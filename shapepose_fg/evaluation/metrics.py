@@ -1,4 +1,6 @@
-"""Metrics of joints against ground truth: matching, precision, recall, MPJPE, people found, covariances."""
+"""Metrics of joints against ground truth: matching, precision, recall, MPJPE, detected people,
+covariances.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +15,7 @@ from shapepose_fg.core.arrays import Array, Index, Real, Whole
 from shapepose_fg.core.skeleton import BODY_25
 
 MAX_DISTANCE_M = 0.5
-"""Mean joint distance from which on a prediction is not that person, m."""
+"""Mean joint distance from which a prediction does not match a person, m."""
 
 
 class People(Protocol):
@@ -39,7 +41,7 @@ class PlainPeople:
     joints: Array
     """(N, J, 3) joints of each row, metres in the world, NaN where unknown."""
     person: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(N,) identity, or the number within the frame; empty where there is none."""
+    """(N,) identity, or the number within the frame; empty if there are no identities."""
     joint_names: tuple[str, ...] = BODY_25.joints
     """(J,) names."""
 
@@ -84,7 +86,8 @@ def match_people(frame: Whole, joints: Real, truth: Real, frames: Sequence[int] 
     for index, number in enumerate(numbers):
         rows, people = np.flatnonzero((np.asarray(frame) == number) & has_joint), np.flatnonzero(is_there[index])
         cost = mean_distance(predicted[rows, None], true[index, people])
-        # Beyond the bound all pairs are equally none: a far one must not decide about the near ones.
+        # All pairs beyond the bound cost the same, so that distant pairs do not influence the near
+        # ones.
         at_row, at_person = linear_sum_assignment(np.minimum(cost, MAX_DISTANCE_M))
         near = cost[at_row, at_person] < MAX_DISTANCE_M
         at_row, at_person = at_row[near], at_person[near]
@@ -100,8 +103,8 @@ def match_people(frame: Whole, joints: Real, truth: Real, frames: Sequence[int] 
 def mean_distance(predicted: Array, truth: Array) -> Array:
     """Mean joint distance (...) in metres of pairs of people: `predicted` and `truth` (..., J, 3) broadcast.
 
-    A joint that only the prediction lacks counts 0.5 m, one that the truth lacks counts nothing; infinite for a
-    person without joints.
+    A joint that is missing only in the prediction counts 0.5 m; one that is missing in the truth is
+    ignored. Infinite for a person without joints.
     """
     distance = np.linalg.norm(predicted - truth, axis=-1)
     known = np.isfinite(truth).all(axis=-1)
@@ -116,7 +119,8 @@ CORRECT_M = 0.2
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 """Levels at which `covariance_calibration` counts the truths inside the ellipsoid."""
 _LEAST_LOG_SCORE = -50.0
-"""Minimum log score of a joint in the mean: ten sigma off; one exchanged limb must not decide alone."""
+"""Minimum log score of a joint in the mean, reached at an error of ten sigma, so that a single
+exchanged limb does not dominate the mean."""
 
 
 @dataclass(frozen=True)
@@ -224,10 +228,10 @@ class CovarianceCalibration:
     """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees of freedom
     if the covariances are correct."""
     coverage: dict[float, float]
-    """Share of the truths inside the ellipsoid that should hold 50, 90 and 95 % of them."""
+    """Share of the truths inside the ellipsoids of the levels 0.5, 0.9 and 0.95, by level."""
     log_score: float
-    """Mean of the logarithm of the Gaussian's density, 1/m³, at the truth, each at least -50: no sigma that is
-    merely larger raises it. NaN without joints."""
+    """Mean of the logarithm of the Gaussian's density, 1/m³, at the truth, each at least -50.
+    Sigmas that are too large decrease it. NaN without joints."""
 
     @property
     def mean_nees(self) -> float:
@@ -251,7 +255,7 @@ def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibra
     except np.linalg.LinAlgError:
         raise ValueError("a covariance is not positive definite") from None
     nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
-    # `2 gammaincinv(1.5, level)`: what chi-squared with 3 degrees of freedom is under with that probability.
+    # `2 gammaincinv(1.5, level)` is the quantile of chi-squared with 3 degrees of freedom.
     inside = {level: share((nees <= 2 * gammaincinv(1.5, level)).sum(), len(nees)) for level in COVERAGE_LEVELS}
     density = -0.5 * (nees + 3 * np.log(2 * np.pi)) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     score = float(np.maximum(density, _LEAST_LOG_SCORE).mean()) if len(nees) > 0 else float("nan")

@@ -1,6 +1,7 @@
 """Scores a reconstruction of the Shelf recording: PCP@0.5, MPJPE and recall against its annotation.
 
-No precision: not everyone in view is annotated, so that a prediction without an annotation may be right.
+Precision is not computed: not all visible people are annotated, so a prediction without an
+annotation may be correct.
 """
 
 from collections.abc import Iterable
@@ -38,8 +39,8 @@ LIMBS = np.array([[SHELF_JOINTS.index(joint) for joint in ends] for ends in _LIM
 ACTORS = (0, 1, 2)
 """The scored ids of the annotation: actors 1, 2 and 3."""
 MISSING_JOINT_M, RECALL_M = 0.5, 0.2
-"""Distance that a missing joint counts as in the choice of a prediction, and largest distance of a recalled
-joint, m."""
+"""Distance that a missing joint counts as when predictions are matched, and largest distance of a
+recalled joint, m."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,11 @@ class ShelfScore:
 
     @property
     def pcp_pooled(self) -> float:
-        """Share of correct limbs among all, whoever they belong to, per cent."""
+        """Share of correct limbs among all, of all actors, per cent."""
         return float(_percent(self.limbs_right.sum(), self.limbs_all.sum()))
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures by plain names, for JSON; None where there is nothing to score."""
+        """The figures by plain names, for JSON; None if there is nothing to score."""
         by_limb = _percent(self.limbs_right, self.limbs_all)
         limbs = {f"actor {a + 1}": dict(zip(LIMB_NAMES, map(_plain, by_limb[a]), strict=True)) for a in ACTORS}
         return {
@@ -121,11 +122,12 @@ class ShelfScore:
 def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[int] | None = None) -> ShelfScore:
     """Score `people` against the annotated actors, in `frames` or in all annotated frames.
 
-    Each annotated person takes the prediction of its frame with the smallest mean joint distance; two may take
-    the same one; a missing joint counts 0.5 m in that choice and makes its limbs wrong. A limb is right when
-    the mean error of its two ends is at most half its annotated length. Without `frames`, a reconstruction
-    whose run says which frames it covered (`run["frames"]`, [start, stop] or several) is scored on those.
-    InputError if no annotated frame is left to score.
+    Each annotated person is matched with the prediction of the frame that has the smallest mean
+    joint distance; two people may have the same one. A missing joint counts 0.5 m in the matching,
+    and its limbs are wrong. A limb is correct if the mean error of its two ends is at most half its
+    annotated length. Without `frames`, a reconstruction is scored on the frames in `run["frames"]`
+    ([start, stop] or several), if this entry exists. InputError if no annotated frame is left to
+    score.
     """
     scored = acted = np.isin(ground_truth.person, ACTORS)
     frames = _frames_run(people) if frames is None else frames
@@ -140,7 +142,7 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
     distance = _distances(truth, frame, people)
     found = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
     length = np.linalg.norm(truth[:, LIMBS[:, 0]] - truth[:, LIMBS[:, 1]], axis=2)
-    right = distance[:, LIMBS].mean(axis=2) <= 0.5 * length  # a missing end (NaN) makes it false
+    right = distance[:, LIMBS].mean(axis=2) <= 0.5 * length  # a missing end (NaN) makes the limb wrong
     member = ground_truth.person[scored, None] == np.array(ACTORS)
     known = np.isfinite(distance) & found[:, None]
     return ShelfScore(
@@ -156,8 +158,8 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
 
 
 def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
-    """(G, 15) distances of the joints of the predictions of annotated people (G, 15, 3), metres; NaN where
-    there is none.
+    """(G, 15) distances of the joints of the predictions of annotated people (G, 15, 3), metres;
+    NaN if the joint or the prediction is missing.
     """
     joints = np.asarray(people.joints, dtype=np.float64)
     if tuple(getattr(people, "joint_names", BODY_25.joints)) != BODY_25.joints:
@@ -176,11 +178,11 @@ def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
 def shelf_joints(body25: Array) -> Array:
     """Map BODY_25 joints (N, 25, 3), metres, z up, to Shelf's (N, 15, 3); NaN stays NaN.
 
-    The hips, limbs and MidHip are the joints of the same name. With s and e the middles of shoulders and
-    ears, Neck is s + 0.5 (e - s) and HeadTop is Neck + 0.125 f + 0.145 z, f the unit vector of
-    (neck - midhip) x (RShoulder - LShoulder). The mapping is fixed: tuning it on the annotation would lift the
-    figure in sample only. Where one ear is unknown, e is the other ear brought into the plane halfway between
-    the shoulders, which is where the middle of two mirrored ears lies.
+    The hips, limbs and MidHip are the joints of the same name. With s and e the midpoints of
+    shoulders and ears, Neck is s + 0.5 (e - s) and HeadTop is Neck + 0.125 f + 0.145 z, f the unit
+    vector of (neck - midhip) x (RShoulder - LShoulder). The mapping is fixed: tuning it on the
+    annotation would overfit. If one ear is unknown, e is the other ear projected on the plane
+    halfway between the shoulders, in which the midpoint of two mirrored ears lies.
     """
     body25 = np.asarray(body25, dtype=np.float64)
     if body25.ndim != 3 or body25.shape[1:] != (25, 3):
@@ -201,7 +203,7 @@ def shelf_joints(body25: Array) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
-    """Vectors (N, 3) of length one; NaN for one of no length."""
+    """Unit vectors (N, 3); NaN for vectors of length zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, np.nan)
 
@@ -222,7 +224,7 @@ def _spans(frames: NDArray[np.int64]) -> str:
 
 
 def _percent(part: Any, whole: Any) -> Array:
-    """100 part / whole, NaN where there is nothing."""
+    """100 part / whole, NaN if `whole` is 0."""
     whole = np.asarray(whole, dtype=np.float64)
     return 100 * np.asarray(part) / np.where(whole > 0, whole, np.nan)
 

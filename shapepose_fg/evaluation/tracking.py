@@ -26,11 +26,12 @@ from shapepose_fg.evaluation.metrics import (
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 FAST_M_S = 1.5
-"""Speed of a wrist above which a too stiff smoother becomes visible, m/s."""
+"""Speed of a wrist, m/s, above which too much smoothing becomes visible."""
 LONG_UNSEEN = 10
-"""Number of frames, with the present one, without a view after which a joint counts as long unseen."""
+"""Number of consecutive frames without a view, the current one included, from which a joint counts
+as long unseen."""
 UNMATCHED = np.iinfo(np.int64).min
-"""Stands for no identity: any other number may be one."""
+"""Code for "no identity"; every other number may be an identity."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class IdentityMetrics:
 
     @property
     def idf1(self) -> float:
-        """2 IDTP / (rows + true people); NaN where there is neither (Ristani et al., 2016)."""
+        """2 IDTP / (rows + true people); NaN if there are neither (Ristani et al., 2016)."""
         return share(2 * self.true_positives, self.rows + self.people_true)
 
 
@@ -77,7 +78,7 @@ class TrackingScore:
     joints: JointMetrics
     """Precision, recall, F1 at 0.2 m, MPJPE, duplicates and other false positives."""
     identities: IdentityMetrics | None
-    """IDF1, switches, tracks; None where `person` is no identity."""
+    """IDF1, switches, tracks; None if `person` is not an identity."""
     motion: MotionScore
     """The motion of the joints."""
     bodies: MotionScore
@@ -89,7 +90,7 @@ class TrackingScore:
     (`seen`), one view (`one_view`), none (`no_view`), and none in this frame and the nine before (`unseen`)."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The figures by plain names, for tables and JSON; None where there is nothing to measure."""
+        """The figures by plain names, for tables and JSON; None if there is nothing to measure."""
         figures = {name: 100 * getattr(self.joints, name) for name in ("f1", "precision", "recall")}
         figures["idf1"] = np.nan if self.identities is None else 100 * self.identities.idf1
         figures["velocity_error"] = self.velocity_error
@@ -111,9 +112,9 @@ def score_tracks(
 ) -> TrackingScore:
     """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
 
-    Scored are the frames from the truth's first to its last. Without `identities` the column `person` only numbers
-    the people of a frame; metrics over time then use the true person with whom a row is matched. ValueError for an
-    identity twice in one frame.
+    The frames from the first to the last of the truth are scored. Without `identities` the column
+    `person` only numbers the people of a frame; metrics over time then use the true person with
+    whom a row is matched. ValueError for an identity twice in one frame.
     """
     true, first = joints_by_frame(truth), int(truth.frame.min()) if len(truth) > 0 else 0
     frames = range(first, first + len(true))
@@ -161,11 +162,11 @@ def identity_metrics(
 ) -> IdentityMetrics:
     """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
 
-    Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the truth, -1 for
-    a frame that is not scored. For IDF1 identities and people are assigned one to one for the whole recording, so
-    that as many rows as possible are nearer than 0.5 m to theirs (Ristani et al., "Performance Measures and a Data
-    Set for Multi-Target, Multi-Camera Tracking", 2016). Switches are counted with `matches`, which are made frame
-    by frame.
+    Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the
+    truth, -1 for a frame that is not scored. For IDF1 identities and people are assigned one to one
+    for the whole recording, so that as many rows as possible are nearer than 0.5 m to theirs
+    (Ristani et al., "Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking",
+    2016). Switches are counted with `matches`, which are computed frame by frame.
     """
     scored = np.flatnonzero((index >= 0) & np.isfinite(joints.sum(axis=2)).any(axis=1))
     present = np.isfinite(truth.sum(axis=3)).any(axis=2)
@@ -194,8 +195,8 @@ def identity_metrics(
 
 
 def body_joints(people: Reconstruction) -> Array:
-    """(N, J, 3) joints of the fitted bodies, with the offsets that the run estimated; NaN where there is no
-    body.
+    """(N, J, 3) joints of the fitted bodies, metres, with the detector offsets that the run
+    estimated; NaN without a body.
     """
     model = detector_s_body(people)
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
@@ -203,13 +204,13 @@ def body_joints(people: Reconstruction) -> Array:
 
 
 def detector_s_body(people: Reconstruction) -> BodyModel:
-    """The open body, with joints where the run has estimated that the detector puts them."""
+    """The open body, with its joints moved by the detector offsets that the run estimated."""
     model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
     return model if offsets is None else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
 
 
 def views_used(people: Reconstruction) -> Index:
-    """(N, J) number of views with a detection that each joint was solved from.
+    """(N, J) number of views with a detection from which the joint was solved.
 
     Without recorded observations a joint with a confidence counts as seen by two views.
     """
@@ -239,14 +240,16 @@ def acceleration_errors(placed: Array, truth: Array, follows: Mask, fps: float) 
 
 
 def velocities(truth: Array, fps: float) -> Array:
-    """(T, P, J, 3) velocities, m/s, of `truth` (T, P, J, 3), metres: over two frames; NaN beside missing ones."""
+    """(T, P, J, 3) velocities, m/s, of `truth` (T, P, J, 3), metres: by central differences; NaN
+    next to missing frames.
+    """
     velocity = np.full(truth.shape, np.nan)
     velocity[1:-1] = (truth[2:] - truth[:-2]) * fps / 2
     return velocity
 
 
 def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
-    """(M,) errors in metres of the wrists whose truth is faster than 1.5 m/s (difference over two frames)."""
+    """(M,) errors in metres of the wrists with a true speed above 1.5 m/s (central differences)."""
     true = truth[:, :, WRISTS]
     fast = np.linalg.norm(velocities(true, fps), axis=-1) > FAST_M_S
     error = np.linalg.norm(placed[:, :, WRISTS] - true, axis=-1)
@@ -254,7 +257,8 @@ def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
 
 
 def frames_unseen(seen: Mask, frame: Whole, identity: Whole) -> NDArray:
-    """(N, J) number of frames, with the present one, in which a joint of an identity has not been `seen` (N, J).
+    """(N, J) number of consecutive frames, the current one included, in which a joint of an
+    identity has not been `seen` (N, J).
 
     The count starts again where the identity has no row in the frame before.
     """

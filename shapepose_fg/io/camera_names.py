@@ -1,4 +1,4 @@
-"""Cameras and frame numbers from names of files."""
+"""Camera names and frame numbers from file names."""
 
 import re
 from collections.abc import Sequence
@@ -8,18 +8,20 @@ from pathlib import Path
 from shapepose_fg.core.errors import InputError
 
 MOST_FRAME = 10**12
-"""Largest number of a frame."""
+"""Maximum frame number."""
 _WORDS = re.compile(r"[^\W\d_]+|\d{1,18}", re.ASCII)
 _NUMBERS = re.compile(r"\d+")
 
 
 def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
-    """For each camera the index of its name among `names`, which are longer or written differently.
+    """For each camera, the index of its name among `names`, which may be longer or spelled
+    differently.
 
-    A camera is recognised by its own name as a word in another (`walk_Miqus_1_23087` is camera `23087`), by the
-    only number in both (`cam01` is camera `int_cam1`), or by what is left of both without the words with which all
-    cameras, or all names, begin and end (`2022-09-19_synced_Cam1` is `view_01_json`). None where this fails for a
-    camera, or is ambiguous: nothing is guessed.
+    A name belongs to a camera if it contains the camera's name as a word (`walk_Miqus_1_23087` is
+    camera `23087`), if both have only one number and it is equal (`cam01` is camera `int_cam1`), or
+    if both are equal after removing the words with which all cameras, or all names, begin and end
+    (`2022-09-19_synced_Cam1` is `view_01_json`). None if a camera has no match or several: nothing
+    is guessed.
     """
     words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras]
     found = [[index for index, name in enumerate(names) if word.search(name) is not None] for word in words]
@@ -33,11 +35,11 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
 
 
 def _own_words(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
-    """Words and numbers of each name, in small letters, without those with which all begin or end; None where
-    nothing is left of one, or two are equal.
+    """Words and numbers of each name, in lower case, without those with which all names begin or
+    end; None if a name has no words left, or if two are equal.
     """
     words = [[int(word) if word.isdigit() else word for word in _WORDS.findall(name.lower())] for name in names]
-    for _ in range(2):  # from the beginning, and from the end
+    for _ in range(2):  # from the beginning, then from the end
         while all(each and each[0] == words[0][0] for each in words) and len(words) > 1:
             words = [each[1:] for each in words]
         words = [each[::-1] for each in words]
@@ -46,7 +48,7 @@ def _own_words(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
 
 
 def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
-    """The only number in each name; None where one has none or several, or two have the same."""
+    """The only number in each name; None if a name has none or several, or if two are equal."""
     found = [_NUMBERS.findall(name) for name in names]
     if any(len(each) != 1 for each in found):
         return None
@@ -59,7 +61,7 @@ def told_by_parts(
 ) -> tuple[list[Path], list[str]] | None:
     """Return the path of each camera, found in `paths` (called `names`) with `match_names`, and a note about it.
 
-    None where the names do not tell cameras apart.
+    None if the names do not identify the cameras.
     """
     chosen = match_names(cameras, names)
     if chosen is None:
@@ -70,26 +72,30 @@ def told_by_parts(
 
 
 def listing(names: Sequence[str], nothing: str = "nothing") -> str:
-    """The first of some names, for a message."""
+    """The first few of some names, for a message; `nothing` if there are none."""
     return (" ".join(names[:8]) or nothing) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
 
 
 def last_number(name: str) -> int | None:
-    """The last number in the name of a picture, its frame's; at most `MOST_FRAME`, and None if there is none."""
+    """The last number in a picture's name, which is the frame number; at most `MOST_FRAME`, None if
+    there is none.
+    """
     found = _NUMBERS.findall(name)
     return min(int(found[-1][-1000:]), MOST_FRAME) if found else None
 
 
 def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:
-    """The files of a folder whose names end with a frame's number and the pattern `ending`, in their order."""
-    # macOS leaves ._000000_keypoints.json beside each file that it copies.
+    """The files of a folder with names that end with a frame number and the pattern `ending`,
+    sorted by number.
+    """
+    # macOS writes ._000000_keypoints.json beside each copied file.
     files = [each for each in folder.iterdir() if not each.name.startswith(".")] if folder.is_dir() else []
     found = ((re.search(rf"(\d+){ending}$", each.name), each) for each in files)
     return sorted((int(match[1]), each) for match, each in found if match is not None and each.is_file())
 
 
 def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
-    """Files sorted by their frame numbers; InputError where a number is invalid or occurs twice."""
+    """Files sorted by their frame numbers; InputError if a number is invalid or occurs twice."""
     ordered = sorted(files)
     if ordered[-1][0] >= MOST_FRAME:
         raise InputError(

@@ -24,24 +24,25 @@ _STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 def read_config(path: str | Path, kind: type[T]) -> T:
-    """Read settings of the dataclass `kind` from a TOML file; settings that are not in the file keep their
-    defaults.
+    """Read settings of the dataclass `kind` from a TOML file; settings that are missing in the file
+    have their defaults.
 
-    A field that is itself a dataclass is a table. Raises InputError naming the file, the key and the cure for bad
-    TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
+    A field that is a dataclass corresponds to a table. Raises InputError naming the file, the key
+    and the cure for bad TOML, an unknown key, a wrong type, or a value that the dataclass refuses.
     """
     return config_from(read_toml(Path(path), may_be_empty=True), kind, path)
 
 
 _CURE = "`shapepose-fg config` prints the defaults"
 ANOTHER_VERSION = "it was written by another version of this program; reconstruct the recording again"
-"""Cure for settings that a program wrote."""
+"""Advice for errors in settings that this program wrote."""
 
 
 def config_from(
     table: dict[str, Any], kind: type[T], path: str | Path, *, place: str = "", cure: str = _CURE
 ) -> T:
-    """Settings of the dataclass `kind` from nested plain values, as run.json has them (`asdict`) in `path`.
+    """Settings of the dataclass `kind` from nested plain values (`asdict`), such as those in the
+    run.json at `path`.
 
     `place` is the dotted name of the table in the file. Raises InputError naming file and key, as `read_config`
     does, with `cure` at its end.
@@ -67,7 +68,8 @@ def config_from(
             values[key] = config_from(value, cast(type, hint), path, place=name, cure=cure)
             continue
         try:
-            # As JSON, strict types still let a list be a tuple and a text be an enumeration.
+            # Validated as JSON, so that in strict mode lists are still accepted for tuples, and
+            # texts for enumerations.
             values[key] = _adapter(hint).validate_json(json.dumps(value, default=str))
         except ValidationError as error:
             inside, problem = first_problem(error)
@@ -80,18 +82,20 @@ def config_from(
 
 
 def toml_text(config: object) -> str:
-    """`config` (a dataclass) as TOML that `read_config` reads back, each field's docstring above it."""
+    """`config` (a dataclass) as TOML for `read_config`; the docstring of each field is a comment
+    above it.
+    """
     return "\n".join(_lines(config)).strip() + "\n"
 
 
 @cache
 def _adapter(hint: Any) -> TypeAdapter[Any]:
-    """Checks values of a type; made once for each, which takes a millisecond."""
+    """The validator of a type; cached, because it takes a millisecond to make."""
     return TypeAdapter(hint, config=_STRICT)
 
 
 def _lines(config: Any, table: str = "") -> list[str]:
-    """TOML lines of a dataclass: its own settings first, then its tables."""
+    """TOML lines of a dataclass: first its settings, then its tables."""
     comments = _field_docstrings(type(config))
     settings, tables = [], []
     for field in fields(config):
@@ -122,10 +126,12 @@ def _toml(value: Any) -> str:
 
 
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """The string below each field of a dataclass, which Python itself does not keep."""
+    """The docstring below each field of a dataclass, from the source, because Python does not keep
+    it.
+    """
     try:
         body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-    except (OSError, TypeError):  # no source beside the byte code
+    except (OSError, TypeError):  # no source file
         return {}
     comments = {}
     for statement, following in pairwise(cast(ast.ClassDef, body).body):

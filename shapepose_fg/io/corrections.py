@@ -1,4 +1,6 @@
-"""Corrections of a result's identities, kept beside it: corrections.json, and the uncorrected result."""
+"""Corrections of the identities of a result. Beside it are corrections.json and the uncorrected
+result.
+"""
 
 import json
 import shutil
@@ -18,7 +20,7 @@ from shapepose_fg.io.validation import validated
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
-"""The list of corrections, and the folder of the uncorrected result."""
+"""File with the list of corrections, and folder of the uncorrected result."""
 _PART = f".{UNCORRECTED}.part"
 """Name of the folder of the uncorrected result while it is created, or deleted."""
 _FILES = (PEOPLE, RUN, OBSERVATIONS)
@@ -41,10 +43,12 @@ class _File(BaseModel, strict=True, extra="forbid"):
 
 
 def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
-    """The corrections of the result in `folder`, first to last; none where there is no corrections.json.
+    """The corrections of the result in `folder`, first to last; empty if there is no
+    corrections.json.
 
-    InputError, one sentence, where that file is damaged, people.npz is not the corrected result, or there is
-    `uncorrected` without corrections.json: a correction was interrupted, or `uncorrected` is of an earlier result.
+    InputError, one sentence, if this file is damaged, if people.npz is not the corrected result, or
+    if `uncorrected` exists without corrections.json: then a correction was interrupted, or
+    `uncorrected` is from an earlier result.
     """
     file = Path(folder) / CORRECTIONS
     if not file.is_file():
@@ -64,18 +68,19 @@ def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
 
 
 def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edited:
-    """Correct the result in `folder` once more, and add the correction to the list; returns the result and the
-    changed people.
+    """Apply one more correction to the result in `folder` and append it to the list; returns the
+    result and the changed people.
 
-    Changed people are solved again by `solve`; without it joints and bodies stay as they were. InputError where
-    the correction is impossible. The first correction keeps the original result in `uncorrected`.
+    Changed people are solved again with `solve`; without it, joints and bodies are unchanged.
+    InputError if the correction is impossible. The first correction saves the original result in
+    `uncorrected`.
     """
     folder = Path(folder)
     edits, people = _kept_edits(folder), Reconstruction.load(folder)
     with naming(folder):
         edited = apply(people, edit)
     solved = edited.people if solve is None else solve_anew(edited, solve)
-    if len(edits) == 0:  # the result is copied aside, whole or not at all
+    if len(edits) == 0:  # the result is copied atomically
         part, _ = inside(folder, _PART), inside(folder, UNCORRECTED)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
@@ -88,10 +93,11 @@ def correct(folder: str | Path, edit: Edit, solve: Solve | None = None) -> Edite
 
 
 def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Reconstruction]:
-    """Undo the last correction; returns it and the result without it. InputError where there is none.
+    """Undo the last correction; returns the correction and the result without it. InputError if
+    there is none.
 
-    Without any other, the files are again those from before the first. Only people that the last correction
-    changed are solved again.
+    If it was the only correction, the original files are restored. Otherwise only the people that
+    it changed are solved again.
     """
     folder = Path(folder)
     edits = _kept_edits(folder)
@@ -109,7 +115,9 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
 
 
 def refuse_corrected(folder: Path) -> None:
-    """InputError where `folder` holds a result that was corrected by hand, which a new one would replace."""
+    """InputError if `folder` has a result that was corrected by hand, which a new result would
+    overwrite.
+    """
     there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
     if len(there) > 0:
         cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
@@ -117,7 +125,9 @@ def refuse_corrected(folder: Path) -> None:
 
 
 def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
-    """Save the result, and then its corrections: if interrupted between the two, the next reader reports it."""
+    """Save the result, then its corrections: an interruption between the two is detected at the
+    next reading.
+    """
     counts = people.run.get("people", {})
     people.with_run(people=counts | people.counts()).save(folder)
     kept = [{name: value for name, value in vars(edit).items() if value is not None} for edit in edits]
@@ -126,7 +136,7 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
 
 
 def _kept_edits(folder: Path) -> tuple[Edit, ...]:
-    """`read_corrections`; InputError where the uncorrected result is missing."""
+    """`read_corrections`; InputError if the uncorrected result is missing."""
     edits, file = read_corrections(folder), inside(folder, UNCORRECTED) / PEOPLE
     if len(edits) > 0 and not file.is_file():
         cure = f"restore it, or delete {CORRECTIONS} to keep the result as it is now"
@@ -135,15 +145,16 @@ def _kept_edits(folder: Path) -> tuple[Edit, ...]:
 
 
 def _restore(folder: Path) -> None:
-    """Restore the files from before the first correction."""
+    """Restore the original files from `uncorrected`."""
     for name in _FILES:
         file = folder / UNCORRECTED / name
         if file.is_file():
             write_content(folder / name, file.read_bytes())
-        else:  # people.npz was there before; a result may lack the others
+        else:  # people.npz existed before; the other files may not
             (folder / name).unlink(missing_ok=True)
     (folder / CORRECTIONS).unlink()
-    # Stopped while it is deleted, it must not be taken for the result as it was.
+    # Renamed before it is deleted, so that a partly deleted folder is not mistaken for the original
+    # result.
     shutil.rmtree(folder / _PART, ignore_errors=True)
     (folder / UNCORRECTED).rename(folder / _PART)
     shutil.rmtree(folder / _PART)

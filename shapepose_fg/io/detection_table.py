@@ -1,4 +1,4 @@
-"""A whole recording of 2D candidates, stored in blocks of frames: in memory, or as files where it is larger."""
+"""A whole recording of 2D candidates, stored in blocks of frames, in memory or in files."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,7 +15,8 @@ from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
 BLOCK_FRAMES = 128
 """Number of frames that are read and stored together."""
 _AT_HAND = 4
-"""Number of blocks that stay in memory: windows are solved a little behind the frame that is read."""
+"""Number of blocks that stay in memory: windows are solved with a short delay after the frame that
+is read."""
 _KEPT: dict[str, Any] = {
     "view": np.int16,
     "joint": np.int16,
@@ -24,14 +25,15 @@ _KEPT: dict[str, Any] = {
     "pairs": np.int32,
     "affinity": np.float64,
 }
-"""Arrays of a stored block, and their types: 28 bytes a candidate, 16 an affinity."""
+"""Arrays of a stored block and their types; 28 bytes a candidate, 16 bytes an affinity."""
 
 
 @dataclass(frozen=True)
 class DetectionTable:
     """The candidates of all views and frames; `table[frame]` is that frame's `Detections`.
 
-    Within a frame, candidates are sorted by view, then by joint, then as the detector listed them.
+    Within a frame, candidates are sorted by view, then by joint, then in the order of the
+    detector's file.
     """
 
     skeleton: Skeleton
@@ -41,15 +43,17 @@ class DetectionTable:
     frame_count: int
     """T, the number of frames of the recording."""
     sources: tuple[Path, ...] = ()
-    """The file or folder that each view was read from."""
+    """The file or folder from which each view was read."""
     notes: tuple[str, ...] = ()
-    """Notes, a sentence each, on how the reader interpreted the files and what it left out."""
+    """Notes of the reader, a sentence each, on how the files were interpreted and what was left
+    out."""
     first: int = 0
     """Number of the first frame in the files."""
     picture: Index | None = None
-    """(T, V) frame of its file that each view shows in each frame, -1 for none; None where numbers are equal."""
+    """(T, V) number of each view's own frame in each frame of the table, -1 for none; None if
+    numbers are equal."""
     _at_hand: dict[int, Arrays] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """The blocks that were read last."""
+    """The most recently read blocks."""
 
     def __len__(self) -> int:
         return self.frame_count
@@ -75,10 +79,10 @@ class DetectionTable:
 
 
 def keep_block(kept: KeptArrays, number: int, candidates: Detections, start: Index, pair_start: Index) -> None:
-    """Store block `number` of a recording: the candidates of its T frames, one frame after the other.
+    """Store block `number` of a recording: the candidates of its T frames, sorted by frame.
 
-    `pairs` count from the first candidate of their own frame; `start` and `pair_start` (T + 1,) are where each
-    frame's candidates and pairs begin.
+    Indices in `pairs` are relative to the first candidate of their frame; `start` and `pair_start`
+    (T + 1,) are the offsets of each frame's candidates and pairs.
     """
     arrays = {name: getattr(candidates, name).astype(dtype) for name, dtype in _KEPT.items()}
     kept.keep(_name(number), arrays | {"candidate_start": start, "pair_start": pair_start})

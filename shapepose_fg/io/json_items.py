@@ -1,4 +1,6 @@
-"""The items of a list in a JSON file, decoded one at a time, so that the file may be larger than memory."""
+"""Reads the items of a list in a JSON file one at a time, so that the file may be larger than
+memory.
+"""
 
 import json
 from collections.abc import Collection, Iterator
@@ -10,29 +12,31 @@ from shapepose_fg.core.storage.files import MIDDLE, bounded, has_long_number, no
 
 _SPACE = " \t\n\r"
 _NEAR = 16
-r"""Number of characters at the end of what was read in which an error may come from a value that is cut, such
-as `\u00` of `\u00e9`."""
+r"""Number of characters at the end of the text read so far in which an error may be due to a
+truncated value, such as `\u00` of `\u00e9`."""
 
 
 class JsonItems:
-    """A JSON file that is a list, or an object with a list under one of some keys: its items, one after the other.
+    """Iterates over the items of a JSON file that is a list, or an object with a list under one of
+    some keys.
 
-    What is wrong with the file is an InputError as of `files.read_json`, raised when it is met.
+    Raises InputError as `files.read_json` does, when the faulty place is reached.
     """
 
     def __init__(self, path: Path, keys: Collection[str]) -> None:
-        """Read up to the list's first item, or to the end where there is no such list."""
+        """Read up to the list's first item, or to the end if there is no such list."""
         self.path = path
         self.key: str | None = None
-        """The key under which the list is; None where the file is the list, or there is none."""
+        """The key of the list; None if the file itself is the list, or if there is none."""
         self.value: Any = None
-        """The value instead of a list: under the key, or the whole file, an object without its values."""
+        """The value if it is not a list: under the key, or of the whole file (for an object,
+        without its values)."""
         self.others: dict[str, Any] = {}
-        """Values under other keys; those after the list are there when all items have been read."""
+        """Values of other keys; those after the list are complete when all items have been read."""
         self._text = _Text(path)
         begin = self._text.peek()
         self.found, self._in_object = begin == "[", begin == "{"
-        """`found`: whether there is such a list."""
+        """Whether there is such a list."""
         if self._in_object:
             self.value = {}
             self._text.next_of("{")
@@ -44,7 +48,7 @@ class JsonItems:
             self._text.next_of("[")
 
     def __iter__(self) -> Iterator[Any]:
-        """The items, once."""
+        """Iterate over the items; possible only once."""
         text = self._text
         if not self.found:
             return
@@ -60,7 +64,9 @@ class JsonItems:
             text.end()
 
     def _members(self, keys: Collection[str], *, may_end: bool = False) -> None:
-        """Read keys and values of the object, to the list under one of `keys` or to the object's end."""
+        """Read keys and values of the object, up to the list under one of `keys` or to the end of
+        the object.
+        """
         text = self._text
         going = not (may_end and text.peek() == "}" and text.next_of("}"))
         while going:
@@ -82,7 +88,7 @@ class JsonItems:
 
 
 class _Text:
-    """A JSON text, of which only what has not been decoded is in memory."""
+    """A JSON text of which only the part that has not been decoded is in memory."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -93,7 +99,7 @@ class _Text:
         self._decoder = json.JSONDecoder(object_pairs_hook=lambda pairs: unique_keys(pairs, path))
 
     def peek(self) -> str:
-        """The next character that is not white space; none at the end."""
+        """The next character that is not white space; empty at the end."""
         while True:
             while self._at < len(self._left) and self._left[self._at] in _SPACE:
                 self._at += 1
@@ -103,7 +109,7 @@ class _Text:
                 return ""
 
     def next_of(self, characters: str) -> str:
-        """Go on behind the next character, which must be one of these."""
+        """Skip the next character, which must be one of `characters`."""
         found = self.peek()
         if found == "" or found not in characters:
             wanted = "," if "," in characters else characters
@@ -112,7 +118,7 @@ class _Text:
         return found
 
     def value(self) -> Any:
-        """The next value, decoded."""
+        """Decode the next value."""
         self.peek()
         while True:
             try:
@@ -127,19 +133,21 @@ class _Text:
             except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
                 raise InputError(f"{self._path}: cannot be read as JSON ({error}); write the file again") from None
             number = isinstance(value, int | float) and end >= len(self._left) - len("e-")
-            if number and self._more():  # it may go on
+            if number and self._more():  # the number may continue
                 continue
             long = has_long_number(self._left, self._at, end)
             self._at = end
             return bounded(value, self._path, numbers=long)
 
     def end(self) -> None:
-        """Raise InputError where anything is left."""
+        """Raise InputError if any text is left."""
         if self.peek() != "":
             raise self.refuse("Extra data")
 
     def refuse(self, problem: str, at: int | None = None) -> InputError:
-        """An error at a place of what is in memory, by default where the next value begins."""
+        """An error at a position of the text in memory, by default at the beginning of the next
+        value.
+        """
         at = self._at if at is None else at
         line = self._lines + self._left.count("\n", 0, at) + 1
         begin = self._left.rfind("\n", 0, at)
@@ -147,7 +155,9 @@ class _Text:
         return not_json(self._path, line, column, problem, rest=self._left[at:] if self._over else None)
 
     def _more(self) -> bool:
-        """Read on, as much again as is in memory; returns whether there was more. Decoded text is dropped."""
+        """Read as much text again as is in memory, and drop decoded text; returns whether there was
+        more.
+        """
         done, left = self._left[: self._at], len(self._left) - self._at
         breaks = done.count("\n")
         if left > MIDDLE:

@@ -1,4 +1,6 @@
-"""Cameras with a known field of view only: names from files of detections, sizes from the footage."""
+"""Cameras with a known field of view but without poses: names from the detection files, picture
+sizes from the footage.
+"""
 
 import warnings
 from collections.abc import Sequence
@@ -14,12 +16,14 @@ from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import per_camera
 
 _NARROWEST, _WIDEST = 5.0, 150.0
-"""Smallest and largest horizontal field of view of a lens without distortion, degrees."""
+"""Smallest and largest horizontal field of view that is accepted for a lens without distortion,
+degrees."""
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF")
-"""Pillow's names of the supported formats: its other readers, of which some start programs, are disabled."""
+"""Pillow's names of the supported formats: other readers of Pillow are disabled, because some start
+external programs."""
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
-"""The tags of EXIF's own directory in a photo, and of FocalLengthIn35mmFilm in it."""
+"""EXIF tags: the Exif directory in a photo, and FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
 _USUAL = 65.0
 """Typical horizontal field of view of a phone, degrees."""
@@ -28,9 +32,10 @@ _USUAL = 65.0
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
     """Cameras without poses, one for each file or folder of `detections`, in the order of their names.
 
-    `fields` are horizontal fields of view in degrees, or a photo of the same lens whose EXIF has the focal length;
-    `CAMERA=` before it is for one camera. `size` (width, height) are the pictures' pixels; without it
-    footage.json, which `detect` writes, has them. InputError names what is missing.
+    `fields` are horizontal fields of view in degrees, or photos of the same lens with the focal
+    length in EXIF; `CAMERA=` before a value restricts it to one camera. `size` is (width, height)
+    of the pictures, pixels; by default it is read from footage.json, which `detect` writes.
+    InputError names what is missing.
     """
     names = camera_names(detections)
     given = dict(zip(names, per_camera("--field-of-view", fields, names, one_for_all=True), strict=True))
@@ -54,7 +59,7 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
 
 
 def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:
-    """Cameras with known sizes of pictures (width, height) only, without poses, upright."""
+    """Upright cameras for which only the picture sizes (width, height) are known, without poses."""
     return Rig(tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z")
 
 
@@ -83,19 +88,19 @@ def _degrees(given: str, size: tuple[int, int]) -> float:
 
 
 def _focal_of_photo(file: Path) -> float:
-    """A photo's focal length relative to its longer side, from EXIF's FocalLengthIn35mmFilm: that of a film's
-    picture with the same diagonal (EXIF 2.3, 4.6.5).
+    """A photo's focal length relative to its longer side, from EXIF's FocalLengthIn35mmFilm, which
+    refers to 35 mm film with the same image diagonal (EXIF 2.3, 4.6.5).
     """
     image = optional("PIL.Image", "photos")
     cure = "give an unedited photo of the camera, or degrees"
     with open_regular(file, cure, BIG) as stream, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's on large pictures: none is unpacked here
+        warnings.simplefilter("ignore")  # Pillow's warning about large pictures; none is decoded here
         try:
             with image.open(stream, formats=_FORMATS) as photo:
-                # Without EXIF in its head a PNG would be unpacked to look behind the picture.
+                # Without EXIF in its header, a PNG would be decoded to look behind the image data.
                 known = photo.format != "PNG" or "exif" in photo.info
                 sides, found = photo.size, photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM) if known else None
-        except Exception as error:  # of damaged files the library raises anything: SyntaxError, struct.error
+        except Exception as error:  # for damaged files Pillow raises many kinds of errors, such as SyntaxError
             raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
     if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
         raise InputError(f"{file}: its EXIF data have no FocalLengthIn35mmFilm; {cure}")

@@ -1,4 +1,4 @@
-"""Tables of numbers as text: a line for each row, columns that a header may name."""
+"""Reads tables of numbers from text: a line per row, with an optional header of column names."""
 
 import re
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from shapepose_fg.core.storage.files import BIG, read_text
 from shapepose_fg.io.validation import is_number
 
 MISSING = "-"
-"""Placeholder of a missing number, in the columns that may lack some."""
+"""Placeholder of a missing number in the columns that allow it."""
 
 
 def read_number_table(
@@ -23,9 +23,10 @@ def read_number_table(
 ) -> tuple[list[str], Array, Index]:
     """The names of the columns, the numbers (R, C), NaN for missing ones, and the line (R,) of each row.
 
-    Words are apart by commas or spaces, and `#` begins a comment. `heads` is given the number and the words of the
-    first line, and returns the names of the columns and whether that line is the header. `may_lack` says which
-    columns may have `MISSING`. InputError that names file and line; `units` is the cure for what is no number.
+    Words are separated by commas or spaces, and `#` begins a comment. `heads` receives the number
+    and the words of the first line, and returns the names of the columns, and whether that line is
+    a header. `may_lack` returns whether a column may contain `MISSING`. InputError that names file
+    and line; `units` is the advice for words that are no numbers.
     """
     names, rows, lines = list[str](), list[list[float]](), list[int]()
     for line, text in enumerate(read_text(path, most=BIG).splitlines(), start=1):

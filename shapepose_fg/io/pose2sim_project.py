@@ -1,4 +1,6 @@
-"""Reads a Pose2Sim project: finds its files, and the places where its next steps look for results."""
+"""Reads a Pose2Sim project: finds its files, and the folders in which its next steps look for
+results.
+"""
 
 import shlex
 from dataclasses import dataclass
@@ -17,12 +19,13 @@ from shapepose_fg.io.footage.places import VIDEOS
 
 CONFIG = "Config.toml"
 _POSES = ("pose-sync", "pose", "pose-associated")
-"""Folders of 2D detections, the best first: synchronised, as detected, and one person as Pose2Sim chose them.
-People are associated between cameras anew, so that what Pose2Sim dropped is not lost."""
+"""Folders of 2D detections in order of preference: synchronised, as detected, and Pose2Sim's
+selection of one person. People are associated between cameras again, so that people dropped by
+Pose2Sim are not lost."""
 _MOST_KEYPOINTS = 1000
-"""Largest number of a keypoint: a larger id is a mistake."""
+"""Maximum id of a keypoint; a larger one is a mistake."""
 _RATE = 30.0
-"""Frame rate where neither Config.toml nor a video states it, Hz, as in Pose2Sim."""
+"""Default frame rate, Hz, as in Pose2Sim, if neither Config.toml nor a video defines it."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +39,15 @@ class Pose2SimProject:
     detections: Path
     """The folder of 2D detections."""
     fps: float | None
-    """Frame rate, Hz; None where the detections' times.csv has the times of frames."""
+    """Frame rate, Hz; None if times.csv beside the detections has the times of the frames."""
     first_number: int
-    """Number of the first frame in the project: results have the project's numbers."""
+    """Number of the first frame in the project: results use the project's numbers."""
     frames: tuple[int, int] | None
-    """The project's own numbers of the first frame to reconstruct and of the one after the last."""
+    """Frame numbers in the project: the first frame to reconstruct, and the first after the last."""
     multi_person: bool
     """Whether all people are wanted, or one person."""
     joints: DeclaredJoints | None
-    """The detector's joints from pose.pose_model; None where it is missing."""
+    """The detector's joints from pose.pose_model; None if it is missing."""
     notes: tuple[str, ...]
     """Notes on how the files were interpreted."""
 
@@ -64,12 +67,16 @@ class Pose2SimProject:
         return self.folder.resolve().name
 
     def name_of(self, person: int | None, first: int, last: int) -> str:
-        """The name of a person's files, without ending, as Pose2Sim gives it; `person` None for the only one."""
+        """File name of a person, without extension, in Pose2Sim's style; `person` None for the only
+        one.
+        """
         who = "" if person is None else f"_P{person}"
         return f"{self.name}{who}_{first}-{last}"
 
     def span(self, count: int) -> range:
-        """Wanted frames of a recording of `count` frames, counted from 0; InputError where there are none."""
+        """Wanted frames of a recording of `count` frames, counted from 0; InputError if there are
+        none.
+        """
         if self.frames is None:
             return range(count)
         start, stop = (min(max(number - self.first_number, 0), count) for number in self.frames)
@@ -83,7 +90,9 @@ class Pose2SimProject:
 
 
 def read_pose2sim_project(folder: Path) -> Pose2SimProject:
-    """The project, or trial of a project, in `folder`; InputError, one sentence, where something is missing."""
+    """The project, or trial of a project, in `folder`; InputError, one sentence, if something is
+    missing.
+    """
     config, session = _settings(folder)
     project = config.get("project", {})
     if not isinstance(project, dict):
@@ -102,7 +111,8 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         given = rate != "auto"
         fps, origin = (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
         said = f"{fps:g} Hz{origin}"
-    # Results have the numbers of the files' names, 0 where they have none, from the first that all have.
+    # Results have the numbers in the file names (or counted from 0), from the first frame that all
+    # cameras have.
     folders = [numbered(each, FRAME_FILE) for each in detections.iterdir() if each.is_dir()]
     numbers = (files[0][0] for files in folders if len(files) > 0)
     return Pose2SimProject(
@@ -138,7 +148,7 @@ def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
 
 
 def _joints(config: dict[str, Any], file: Path) -> DeclaredJoints | None:
-    """Joints from pose.pose_model: a layout's name, or the tree of joints under that name."""
+    """Joints from pose.pose_model: the name of a layout, or a tree of joints under this name."""
     pose = config.get("pose", config.get("pose-2d", {}))
     if not isinstance(pose, dict):
         raise InputError(f"{file}: pose must be a table; write [pose] as Pose2Sim's demos do")
@@ -153,7 +163,9 @@ def _joints(config: dict[str, Any], file: Path) -> DeclaredJoints | None:
 
 
 def _joints_of_tree(tree: Any) -> dict[int, str]:
-    """The names of joints by their places among the keypoints: tables with `id`, `name` and `children`."""
+    """Joint names by keypoint index, from a tree of joints: tables with `id`, `name` and
+    `children`.
+    """
     names, waiting = dict[int, str](), [tree]
     while waiting:
         each = waiting.pop()
@@ -168,7 +180,7 @@ def _joints_of_tree(tree: Any) -> dict[int, str]:
 
 
 def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
-    """Config.toml of a trial over that of the session above it, and the session's folder."""
+    """Config.toml of a trial merged over that of its session, and the session's folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; give the folder of a Pose2Sim project")
     own, above = folder / CONFIG, folder.resolve().parent / CONFIG
@@ -184,7 +196,7 @@ def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _over(below: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Settings `own` over those `below`, table by table."""
+    """Merge the settings `own` over those in `below`, table by table."""
     together = below | own
     for key in own.keys() & below.keys():
         if isinstance(own[key], dict) and isinstance(below[key], dict):
@@ -193,7 +205,9 @@ def _over(below: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _calibration(session: Path, folder: Path) -> Path:
-    """The calibration of a session: the newest TOML, as Pose2Sim takes it, else a file or folder that is known."""
+    """The calibration of a session: the newest TOML, as in Pose2Sim, otherwise a file or folder in
+    a known format.
+    """
     places = dict.fromkeys((session.resolve(), folder.resolve()))
     inside = [each for place in places for each in sorted(place.iterdir()) if each.is_dir()]
     rooms = [each for each in inside if "calib" in each.name.lower()]
@@ -203,7 +217,7 @@ def _calibration(session: Path, folder: Path) -> Path:
         )
     files = [each for room in rooms for each in room.iterdir() if each.is_file()]
     files.sort(key=lambda file: (file.stat().st_mtime, file.name), reverse=True)
-    files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first among its kind
+    files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first within each kind
     found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
@@ -213,7 +227,9 @@ def _calibration(session: Path, folder: Path) -> Path:
 
 
 def _detections(folder: Path, has_videos: bool) -> Path:
-    """The folder of 2D detections; InputError with the command that makes them where there are videos only."""
+    """The folder of 2D detections; if there are only videos, InputError with the command that
+    computes them.
+    """
 
     def is_pose(path: Path) -> bool:
         there = len(numbered(path, FRAME_FILE)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
@@ -231,5 +247,7 @@ def _detections(folder: Path, has_videos: bool) -> Path:
 
 
 def footage_of(folder: Path) -> tuple[Path, Path, Path]:
-    """Cameras and videos of the project in `folder`, and where 2D detections of them go; InputError as above."""
+    """Cameras, videos, and folder for the 2D detections of the project in `folder`. Raises
+    InputError as `read_pose2sim_project` does.
+    """
     return _calibration(_settings(folder)[1], folder), folder / "videos", folder / "pose"

@@ -1,4 +1,4 @@
-"""A recording for reconstruction: synchronised detections of all cameras, and their times."""
+"""Reads a recording for reconstruction: synchronised detections of all cameras, and their times."""
 
 import re
 from dataclasses import replace
@@ -20,11 +20,13 @@ from shapepose_fg.io.detections.view_streams import in_moments
 from shapepose_fg.io.timestamps import read_own_times, read_timestamps
 
 TIMES = "times.csv"
-"""Name of the file with the times of detections, beside them."""
+"""Name of the file with frame times, beside the detections."""
 
 
 def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -> Path | None:
-    """The file with the times of the frames: the given one, or without a rate the one beside; or none."""
+    """The file with the frame times: the given one; without a frame rate, the one beside the
+    detections; or None.
+    """
     if fps is not None and timestamps is not None:
         raise InputError("--fps and --timestamps: both determine the times of frames; give one of them")
     beside = detections / TIMES
@@ -40,13 +42,14 @@ def read_recording(
     timestamps: Path | None = None,
     own_frames: bool = False,
 ) -> tuple[DetectionTable, FrameTimes | None]:
-    """Detections of all cameras, in the empty folder `kept`, and the times of the frames; None where these are
-    unknown.
+    """Detections of all cameras, in the empty folder `kept`, and the times of the frames; None if
+    these are unknown.
 
-    `timestamps` is a file that `read_timestamps` reads, times.csv beside the detections by default. Cameras that
-    started at different times, or have different rates, are grouped by it to synchronised frame sets, which are
-    then the frames. With `own_frames` start times are unknown: frames are each camera's own, and all are kept.
-    InputError, one sentence that names file, place and cure.
+    `timestamps` is a file for `read_timestamps`, by default times.csv beside the detections. If
+    cameras started at different times, or have different frame rates, their frames are grouped to
+    synchronised frame sets, which then are the frames of the recording. With `own_frames` (unknown
+    start times), each camera keeps all of its own frames. InputError, one sentence that names file,
+    place and cure.
     """
     file = times_beside(detections, fps, timestamps)
     recording = read_detections(
@@ -67,25 +70,27 @@ def read_recording(
 
 
 def own_times(recording: DetectionTable, times: FrameTimes, views: int) -> Array:
-    """(T, V) times of each camera's own frames, on its own clock; NaN for frames that it lacks."""
+    """(T, V) times of each camera's own frames, on its own clock, seconds; NaN for missing frames."""
     own = times.of_views(views)
     return own if recording.picture is None else np.where(recording.picture >= 0, own, np.nan)
 
 
 def _own(there: Mask) -> Index:
-    """(T, V) the frame's own number where a camera has it, else -1."""
+    """(T, V) frame number for frames that a camera has, otherwise -1."""
     return np.where(there, np.arange(len(there))[:, None], -1)
 
 
 def write_moments(file: Path, rig: Rig, picture: Index) -> None:
-    """Write which picture `picture` (T, V) of its own each camera shows in each frame, -1 for none."""
+    """Write the number of each camera's own picture in each frame, `picture` (T, V), -1 for none."""
     rows = [", ".join(["frame", *rig.names])]
     rows += [", ".join(map(str, [frame, *row])) for frame, row in enumerate(picture.tolist())]
     write_content(file, "\n".join(rows) + "\n")
 
 
 def read_moments(file: Path) -> dict[str, Index]:
-    """Read a file of `write_moments`: (T,) pictures by the camera's name; InputError on anything else."""
+    """Read a file written by `write_moments`: (T,) picture numbers by camera name; InputError for
+    any other content.
+    """
     lines = [re.split(r",\s*", line) for line in read_text(file, most=BIG).splitlines()]
     names, *rows = lines if len(lines) > 0 else [[""]]
     try:

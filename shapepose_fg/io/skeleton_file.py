@@ -1,4 +1,6 @@
-"""A detector's own skeleton, described in TOML: its keypoints, limbs, mirror, anchor and places on the body."""
+"""Reads a detector's skeleton from TOML: its keypoints, limbs, mirror pairs, anchor and body
+points.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +19,7 @@ _FACE_AND_TOES = {
     "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel",
     "left_hand", "right_hand", "left_foot", "right_foot",
 }  # fmt: skip
-"""Points of the body that are not core joints."""
+"""Body points that are not core joints."""
 _HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
 
 
@@ -33,8 +35,8 @@ class _File(BaseModel, strict=True, extra="forbid"):
 
 
 def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
-    """A skeleton, given as itself, by its name (`joint_names.layouts_called`), or by the file that describes
-    it.
+    """A skeleton from a `Skeleton`, from a name (`joint_names.layouts_called`), or from a TOML
+    file.
     """
     if wanted is None or isinstance(wanted, Skeleton):
         return wanted
@@ -56,13 +58,13 @@ def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
 
 
 def read_skeleton(path: str | Path) -> Skeleton:
-    """Read a skeleton's TOML file; its joints get the names of the body's points.
+    """Read a skeleton's TOML file; its joints get the names of their body points.
 
     InputError, one sentence that names the file, the key and the cure.
     """
     path = Path(path)
     file = validated(_File, read_toml(path), path, "docs/conventions.md describes the file")
-    # The point of the body that each joint is, by the joint's name in the file.
+    # The body point of each joint, by the joint's name in the file.
     points = {joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint}
     unknown = [name for name in file.body if name not in points]
     if unknown:

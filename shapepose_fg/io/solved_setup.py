@@ -1,4 +1,4 @@
-"""The cameras and the body that a saved result was solved with."""
+"""The cameras and the body model with which a saved result was solved."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +13,7 @@ from shapepose_fg.io.calibration import read_rig
 
 
 def cameras_of(folder: Path) -> Rig:
-    """The cameras of the result in `folder`; InputError with the cure where there are none."""
+    """The cameras of the result in `folder`; InputError with the cure if there are none."""
     file = folder / CAMERAS
     if not file.exists():
         raise InputError(
@@ -24,7 +24,9 @@ def cameras_of(folder: Path) -> Rig:
 
 
 def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
-    """The body model of a result with run.json `run`, or of the file `given`; InputError if it is missing."""
+    """The body model named in `run` (the content of run.json), or in the file `given`; InputError
+    if it is missing.
+    """
     named = run.get("body") if given is None else given
     file = None if named is None else Path(str(named))
     if file is None:

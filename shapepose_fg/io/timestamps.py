@@ -1,4 +1,6 @@
-"""Times of frames from a text file: a line per frame, in seconds; one column, or one for each camera."""
+"""Reads and writes times of frames as text: a line per frame, in seconds; one column, or one for
+each camera.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -17,18 +19,19 @@ from shapepose_fg.io.number_table import MISSING, read_number_table
 from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
-"""Columns with a meaning of their own; every other column is a camera's."""
+"""Columns with a special meaning; every other column belongs to a camera."""
 _LONGEST_STEP_S = 10.0
-"""Longest time between frames, s: beyond it the file has another unit."""
+"""Maximum time between frames, s; a longer one means that the file has another unit."""
 
 
 def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
     """The times of a recording of `frames` frames, from a text file (docs/conventions.md).
 
-    Numbers are separated by commas or spaces. Without a header each line is a time in seconds, frame 0 first. The
-    header names the columns: `time_s`, or the rig's cameras; and `frame`, if lines have frame numbers. Where the
-    times of frames with the same number differ by more than a frame, or cameras lack some, pictures are grouped to
-    synchronised frame sets, whose times are returned. InputError, one sentence that names file, line and cure.
+    Numbers are separated by commas or spaces. Without a header each line is a time in seconds,
+    frame 0 first. The header names the columns: `time_s`, or the rig's cameras; and `frame`, if
+    lines have frame numbers. If times of frames with the same number differ by more than a frame,
+    or if a camera lacks frames, pictures are grouped to synchronised frame sets, and the times of
+    these are returned. InputError, one sentence that names file, line and cure.
     """
     path = Path(path)
     time_s, clocks = _times(path, rig, frames)
@@ -41,7 +44,7 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
         found = align(clocks, True, "give times of one clock")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    # Pictures that a camera lacks are counted by its own frames, as the detections are.
+    # Frames that a camera lacks keep their numbers, as in the detections.
     number = [np.append(np.flatnonzero(np.isfinite(each)), -1) for each in time_s.T]
     picture = np.column_stack([own[place] for own, place in zip(number, found.picture.T, strict=True)])
     notes = tuple(f"{path}: {each}" for each in found.notes)
@@ -49,10 +52,11 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
 
 
 def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]:
-    """The times of each camera's own frames, where the offsets of the cameras are unknown; and (T, V) which exist.
+    """The times of each camera's own frames, if the offsets between cameras are unknown; and (T, V)
+    which frames exist.
 
-    Times of missing frames continue at the camera's rate. InputError as in `read_timestamps`, and where cameras
-    have different rates.
+    Times of missing frames continue at the camera's rate. Raises InputError as `read_timestamps`
+    does, and if cameras have different rates.
     """
     time_s, clocks = _times(path, rig, frames)
     periods = [clock.period for clock in clocks]
@@ -73,10 +77,12 @@ def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]
 
 
 def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]:
-    """The times (T, C) of frames, of all cameras or of each, NaN for those that a camera lacks; and the clocks."""
+    """The times (T, C) of frames, common (C = 1) or for each camera, NaN for missing frames; and
+    the clocks.
+    """
 
     def heads(line: int, words: list[str]) -> tuple[list[str], bool]:
-        # Cameras may be called by numbers; without a header there is one column.
+        # Cameras may have numbers as names; a file without header has one column.
         header = not is_number(words[0]) or (len(words) > 1 and set(rig.names) <= set(words))
         return (words if header else [_TIME]), header
 
@@ -102,13 +108,13 @@ def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]
 
 
 def nameable(names: Sequence[str]) -> bool:
-    """Whether columns can be named after these cameras."""
+    """Whether these camera names can be used as column names."""
     return not any(set(name) & set(", \t#") for name in names)
 
 
 def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
-    """Write the times of frames, from 0 on, as `read_timestamps` reads them: (T,), or (T, V) for each camera,
-    NaN for frames that it lacks.
+    """Write the times of frames, from 0 on, as `read_timestamps` reads them: (T,), or (T, V) for
+    each camera, NaN for missing frames.
     """
     if times.ndim == 2 and not nameable(names):
         raise InputError(f"{path}: a camera's name has a blank, a comma or #; rename it in the calibration")
@@ -120,7 +126,9 @@ def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
 
 
 def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
-    """The clock of a camera, or of all, whose frames were taken at `time_s` (T,), NaN for those it lacks."""
+    """The clock of one camera, or of all, from the times of its frames `time_s` (T,), NaN for
+    missing ones.
+    """
     there = np.isfinite(time_s)
     time_s, lines = time_s[there], lines[there]
     steps = np.diff(time_s)
@@ -136,7 +144,7 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
 
 
 def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> Index:
-    """(T,) the row of each frame of the recording; other frames are skipped."""
+    """(T,) row of the table for each frame of the recording; other rows are ignored."""
     odd = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
     if len(odd) > 0:
         line, number = lines[odd[0]], numbers[odd[0]]

@@ -1,4 +1,4 @@
-"""Trajectories of carriers of cameras: TUM's text and our own CSV, which may have covariances."""
+"""Trajectories of carriers of cameras: TUM's format, CSV with optional covariances, and MCAP."""
 
 from pathlib import Path
 
@@ -16,10 +16,11 @@ from shapepose_fg.io.validation import is_number
 def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     """Read the poses of a carrier: world from carrier, metres, seconds on the clock of the pictures.
 
-    Eight numbers a line (TUM: time x y z qx qy qz qw), apart by blanks or commas; or with a header that names the
-    columns `POSE` in any order, and those of `COVARIANCE` that there are: the diagonal at least. `#` begins a
-    comment. Or an MCAP file of ROS 2 messages, `FILE.mcap#FRAME` where more than one frame moves in it.
-    InputError, one sentence that names file, line and cure.
+    The file has eight numbers per line (TUM: time x y z qx qy qz qw), separated by blanks or
+    commas; or a header with the columns `POSE` in any order and optionally those of `COVARIANCE`,
+    at least its diagonal. `#` begins a comment. Or it is an MCAP file of ROS 2 messages;
+    `FILE.mcap#FRAME` if more than one frame moves in it. InputError, one sentence that names file,
+    line and cure.
     """
     from scipy.spatial.transform import Rotation
 
@@ -69,7 +70,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
 
 
 def _check_columns(path: Path, line: int, names: list[str]) -> None:
-    """InputError where the columns are not those of a trajectory."""
+    """InputError if these are not the columns of a trajectory."""
     known = {*POSE, *COVARIANCE}
     odd = next((name[:20] for name in names if name not in known or names.count(name) > 1), None)
     missing = next((name for name in POSE if name not in names), None)

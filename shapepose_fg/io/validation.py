@@ -1,4 +1,4 @@
-"""Validation errors of pydantic as plain sentences."""
+"""Converts validation errors of pydantic to plain sentences."""
 
 import math
 from collections.abc import Mapping
@@ -12,9 +12,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validated(model: type[Model], value: object, place: object, cure: str | Mapping[str, str]) -> Model:
-    """`value`, from a file, as the `model`; InputError that names place, key and cure where it is invalid.
+    """Validate `value`, from a file, as a `model`; InputError that names place, key and cure if it
+    is invalid.
 
-    `cure` may be by key: that of the innermost known key is used.
+    If `cure` is a mapping by key, that of the innermost known key is used.
     """
     try:
         return model.model_validate(value)
@@ -25,7 +26,7 @@ def validated(model: type[Model], value: object, place: object, cure: str | Mapp
 def validated_list(
     kind: TypeAdapter[list[Model]], value: object, place: object, cure: str, start: int = 0
 ) -> list[Model]:
-    """Validate a list as `validated` does; its first item is number `start` in the file."""
+    """Validate a list like `validated`; its first item has the number `start` in the file."""
     try:
         return kind.validate_python(value)
     except ValidationError as error:
@@ -33,7 +34,7 @@ def validated_list(
 
 
 def _refused(error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0) -> InputError:
-    """The first problem of `error` as a sentence."""
+    """The first problem in `error`, as a sentence."""
     keys, problem = first_problem(error)
     if start > 0 and isinstance(keys[0], int):
         keys = (keys[0] + start, *keys[1:])
@@ -44,7 +45,7 @@ def _refused(error: ValidationError, place: object, cure: str | Mapping[str, str
 
 
 def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
-    """The first problem of `error`: where (keys and indices), and what is wrong there.
+    """The first problem in `error`: its place (keys and indices), and its description.
 
     For example `(("RT",), "must hold 12 values, got 11")`.
     """
@@ -68,13 +69,13 @@ def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
 
 
 def key_text(place: tuple[int | str, ...]) -> str:
-    """`("cameras", 1, "K", 0)` as `cameras[1].K[0]`; the whole file where there is no key."""
+    """`("cameras", 1, "K", 0)` as `cameras[1].K[0]`; "the whole file" if there is no key."""
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
     return key.removeprefix(".") or "the file"
 
 
 def describe(value: object) -> str:
-    """A short name for a value of a JSON or TOML file: "a list of 3", "text 'abc'", "null"."""
+    """Short description of a value of a JSON or TOML file: "a list of 3", "text 'abc'", "null"."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -91,7 +92,7 @@ def describe(value: object) -> str:
 
 
 def is_number(word: str) -> bool:
-    """Whether `word` is a finite number."""
+    """Whether `word` can be read as a finite number."""
     try:
         return math.isfinite(float(word))
     except ValueError:
@@ -114,4 +115,4 @@ _WANTED = {
     "dataclass_type": "a table",
     "finite_number": "a finite number",
 }
-"""What each of pydantic's type errors expects, in words."""
+"""The expected value for each of pydantic's type errors, in words."""

@@ -1,6 +1,6 @@
 """Writes 2D detections for other programs: 4D Association's text with its calibration, and OpenPose's JSON.
 
-Both have distorted pixels: for a rig with distortion, detections are distorted again.
+Both formats have distorted pixels, so detections are distorted again if the rig has distortion.
 """
 
 import json
@@ -22,16 +22,17 @@ from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
 SMALLEST_PERSON = 3
-"""Minimum number of joints of a group that counts as a person, as in OpenPose's default settings."""
+"""Minimum number of joints of a group for it to count as a person, as in OpenPose's default
+settings."""
 
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
     """Write calibration.json and detection/<camera>.txt into `folder`, as 4D Association reads them.
 
-    Positions have seven decimals (parts of the picture), scores and affinities six. What lies a quarter of
-    the picture or more outside it is left out: readers refuse it. ValueError where the skeleton is not
-    BODY_25, there is no frame, a lens is not one of five coefficients, or the world's z does not point up, as the
-    format wants it.
+    Positions (relative to the picture) have seven decimals, scores and affinities six. Joints
+    outside the picture by a quarter of its size or more are left out, because readers refuse them.
+    ValueError if the skeleton is not BODY_25, if there is no frame, if a lens does not have five
+    coefficients, or if z does not point up in the world, as the format requires.
     """
     _check(recording)
     for camera in rig.cameras:
@@ -48,7 +49,7 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
             "RT": camera.cTw.ravel().tolist(),
             "imgSize": [*camera.image_size],
         }
-        # Distortion under the key that the format's readers know.
+        # Distortion under the key that readers of this format use.
         straight = not camera.distortion.any()
         calibration[camera.name] = entry | ({} if straight else {"distCoeff": camera.distortion[:5].tolist()})
     write_content(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
@@ -60,9 +61,10 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
 def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
     """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
 
-    Candidates are grouped by `group_people`; groups of fewer joints than `SMALLEST_PERSON` are false positives,
-    which such files leave out. Positions have three decimals, pixels. ValueError where the skeleton is not BODY_25
-    or there is no frame; InputError where the folder of a camera already holds frames.
+    Candidates are grouped by `group_people`; groups of fewer joints than `SMALLEST_PERSON` are
+    false positives, and are left out. Positions are in pixels with three decimals. ValueError if
+    the skeleton is not BODY_25 or if there is no frame; InputError if the folder of a camera
+    already has frames.
     """
     _check(recording)
     refuse_leftovers(rig, folder)
@@ -76,17 +78,20 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
             listed = []
             for members in people:
                 if found.view[members[0]] == view:
-                    keypoints = np.zeros((len(BODY_25), 3))  # a joint that a person lacks is 0 0 0
+                    keypoints = np.zeros((len(BODY_25), 3))  # missing joints are 0 0 0
                     keypoints[found.joint[members], :2] = camera.distort(found.xy[members]).round(3)
                     keypoints[found.joint[members], 2] = found.confidence[members].round(6)
                     listed.append({"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()})
-            # Thousands of small files: written plainly, the reader notices one that is missing or cut.
+            # Thousands of small files are not written atomically; readers notice missing or
+            # truncated ones.
             file = each / f"{camera.name}_{frame:012d}_keypoints.json"
             file.write_text(json.dumps({"version": 1.3, "people": listed}, allow_nan=False))
 
 
 def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
-    """InputError where `write_openpose` would mix its frames with others; to be called before long work."""
+    """InputError if `write_openpose` would mix its frames with existing ones; for checking before
+    long work.
+    """
     for camera in rig.cameras:
         place = Path(folder) / camera.name
         if next(place.glob("*_keypoints.json"), None) is not None:
@@ -94,7 +99,7 @@ def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
 
 
 def _check(recording: DetectionSequence) -> None:
-    """Refuse what the formats cannot hold."""
+    """ValueError if a recording cannot be written in these formats."""
     if recording.skeleton.joints != BODY_25.joints:
         raise ValueError(f"only BODY_25 can be written, not {recording.skeleton.name}")
     if len(recording) == 0:
@@ -102,7 +107,7 @@ def _check(recording: DetectionSequence) -> None:
 
 
 def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, camera: Camera) -> None:
-    """The text of one camera, frame by frame: the recording may be larger than memory."""
+    """Write the text of one camera frame by frame, because the recording may be larger than memory."""
     kind, size = TEXT_SKELETONS[BODY_25.name], np.array(camera.image_size, dtype=np.float64)
     stream.write(f"{kind.number} {len(recording)}\n".encode())
     for frame in range(len(recording)):
@@ -122,8 +127,8 @@ def association_lines(
 ) -> Iterable[str]:
     """The lines of one frame: candidates joint by joint, then affinities limb by limb.
 
-    `joint` (D,), `fractions` (D, 2) parts of the picture's size, `confidence` (D,), `pairs` (E, 2) candidates,
-    the limb's first joint first, `affinity` (E,).
+    `joint` (D,); `fractions` (D, 2), positions relative to the picture's size; `confidence` (D,);
+    `pairs` (E, 2) of candidates, the limb's first joint first; `affinity` (E,).
     """
     order = np.argsort(joint, kind="stable")
     x, y = fractions[order].T
@@ -148,5 +153,7 @@ def association_lines(
 
 
 def _numbers(values: Array, decimals: int) -> str:
-    """Numbers in a line; zeros are short, because they are most of an affinity matrix."""
+    """Numbers as a line of text; zeros are written as 0, because an affinity matrix consists mostly
+    of zeros.
+    """
     return " ".join("0" if value == 0 else f"{value:.{decimals}f}" for value in values.tolist())

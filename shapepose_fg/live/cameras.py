@@ -34,15 +34,16 @@ class CameraState(IntEnum):
     OK = 0
     """The camera works."""
     FROZEN = 1
-    """The picture repeats; its detections are left out."""
+    """The camera repeats its picture; its detections are ignored."""
     SILENT = 2
     """The camera gives no detections where people should be seen."""
     CONTRADICTS = 3
-    """The camera contradicts the others; its detections are left out until it agrees again."""
+    """The camera contradicts the others; its detections are ignored until it agrees again."""
     DOUBTED = 4
-    """Too many cameras contradict each other to tell which of them are right; all are used."""
+    """Too many cameras contradict each other to tell which are right; all are used."""
     OFF_CLOCK = 5
-    """The camera's times are seconds away from those of the others; its views are left out until they agree."""
+    """The camera's clock differs by seconds from those of the others; its views are ignored until
+    it agrees."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +60,17 @@ class CameraWatch:
 
     @classmethod
     def of(cls, views: int) -> "CameraWatch":
-        """Initial state, in which nothing is known."""
+        """Initial state, before any detection."""
         return cls(np.full(views, np.nan), np.full(views, -np.inf), np.zeros(views, dtype=np.int64))
 
     def seen(
         self, given: Detections, before: Detections | None, rig: Rig, time_s: float
     ) -> tuple["CameraWatch", Rig]:
-        """Update with a frame's detections; returns the new state and the rig without the cameras that are left
-        out.
+        """Update with a frame's detections; returns the new state, and the rig without excluded
+        cameras.
 
-        A view without any detection is treated as one without a picture: people are not expected in it.
+        A view without any detection is treated as one without a picture: people are not expected in
+        it.
         """
         views = len(rig)
         there = np.bincount(given.view, minlength=views) > 0
@@ -82,7 +84,7 @@ class CameraWatch:
         return now, now.believed(given, rig)
 
     def believed(self, given: Detections, rig: Rig) -> Rig:
-        """The rig for a frame with these detections, without the cameras that are left out."""
+        """The rig for a frame with these detections, without excluded cameras."""
         there = np.bincount(given.view, minlength=len(rig)) > 0
         out = ~there | np.isin(self.state, (CameraState.FROZEN, CameraState.CONTRADICTS))
         doubted = np.flatnonzero(self.state == CameraState.DOUBTED).tolist()

@@ -1,4 +1,4 @@
-"""The common clock of cameras: one camera with a wrong time does not move it, most of them together do."""
+"""Common clock of the cameras: it follows a jump only if most cameras jump together."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -7,21 +7,23 @@ from typing import Generic, TypeVar
 Given = TypeVar("Given")
 
 JUMP_S = 2.0
-"""Distance from the newest frame's time above which a time is a jump, s; no lag is longer."""
+"""Difference from the newest frame's time, s, above which a view's time is a jump; no lag is
+longer."""
 _AGREE_S = 1.0
 """Maximum difference between the times of cameras that jump together, s."""
 _ALIVE = 4
 """Number of recent views, per camera, among which a camera must have one to count as alive."""
 _PATIENCE = 2
-"""Number of views, per camera, during which cameras that are alive may still confirm a jump."""
+"""Number of views, per camera, during which active cameras may still confirm a jump."""
 
 
 @dataclass
 class CommonClock(Generic[Given]):
-    """Keeps views back whose times jump until other cameras confirm the jump.
+    """Holds back views with jumping times until other cameras confirm the jump.
 
-    One camera, or one line, with a wrong time changes nothing for the others. After a pause of all cameras, or
-    when their clock is set, the first views wait for those of the others, and are processed with them.
+    One camera, or one bad message, with a wrong time does not affect the others. After a pause of
+    all cameras, or when their clock is set, the first views wait for those of the others, and are
+    processed with them.
     """
 
     cameras: int
@@ -29,7 +31,7 @@ class CommonClock(Generic[Given]):
     off: dict[int, int] = field(default_factory=dict)
     """By camera: number of consecutive views that were kept back."""
     _held: dict[int, tuple[float, Given]] = field(default_factory=dict)
-    """By camera: the time and content of its newest view, where that is a jump."""
+    """By camera: the time and content of its newest view, if that is a jump."""
     _stay: set[int] = field(default_factory=set)
     """Cameras with a view that did not jump since the first one that is kept back."""
     _passed: int = 0
@@ -40,8 +42,9 @@ class CommonClock(Generic[Given]):
     def admit(self, camera: int, time_s: float, now_s: float, given: Given) -> tuple[list[Given], bool]:
         """The views to process now, in order of time, and whether the clock jumps with them.
 
-        `given` is what a camera saw at `time_s`, and `now_s` the time of the newest frame, -inf before the first.
-        The view is kept back, and the list empty, if it jumps and the others have not confirmed that.
+        `given` is the content of the view of `camera` at `time_s`; `now_s` is the time of the
+        newest frame, -inf before the first. If the view jumps and the others have not confirmed it,
+        it is held back and the list is empty.
         """
         self._recent.append(camera)
         if len(self._recent) > _ALIVE * self.cameras:

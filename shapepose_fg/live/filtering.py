@@ -28,14 +28,14 @@ ON_TRIAL = -1
 _SEARCH_S = 0.1
 """Interval between searches for new people, seconds."""
 _SURE = 0.3
-"""Evidence per second from which a new person is reported at once: a probability of 0.97
+"""Evidence per second above which a new person is reported at once: probability 0.97
 (`presence.probability`)."""
 _WAITS_S = 1.0
 """Longest time for which a new track that may be a re-identification waits for its bone lengths, s."""
 _MOST_GONE = 256
 """Maximum number of ended tracks that are remembered."""
 _LONGEST_S = 0.1
-"""Maximum duration that a frame's evidence counts for, s, however long no other frame came before."""
+"""Maximum duration of a frame's evidence, s, also after a longer gap between frames."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Filter:
         return replace(now.rows(stays), gone=gone.rows(slice(-_MOST_GONE, None))), candidate[stays]
 
     def _with_newcomers(self, now: Moment, candidate: Index, given: Input) -> tuple[Moment, Index]:
-        """Add the tracks of people found in detections that no track uses."""
+        """Add tracks of people found in unassigned detections."""
         tracker, tracks = self.tracker, now.tracks
         tracker.search(given.frame)
         places, own = tracker.newcomers(tracks, candidate, given.detections, given.rig)
@@ -190,7 +190,7 @@ class Filter:
         new = tracker.at(places, ids, zero, tracks.time_s)
         trace = self._trace(places)
         blank = np.zeros((count, trace.bones.shape[1]))
-        # Who is surely a person by one frame has been evident long enough.
+        # A person whom one frame makes certain has sufficient evidence at once.
         sight, world = Sight.of(given.detections, given.rig, tracker.skeleton), np.zeros(count, dtype=np.intp)
         evidence = own_evidence(own, *weighed(own, places, sight, tracker.skeleton, world))
         running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
@@ -230,7 +230,7 @@ class Filter:
         return replace(now, identity=identity, next_identity=next_identity, gone=gone)
 
     def _may_be_back(self, now: Moment, row: int) -> bool:
-        """Whether too little is known of a track to distinguish it from ended tracks nearby."""
+        """Whether too few bones are measured to distinguish the track from ended tracks nearby."""
         if now.tracks.time_s - now.born_s[row] > _WAITS_S or (now.count[row] >= LEAST_ROWS).mean() >= 0.5:
             return False
         gap_s = now.born_s[row] - now.gone.time_s
@@ -239,7 +239,7 @@ class Filter:
         return bool((near & (apart_m <= self.stitching.reach_m + 1.5 * gap_s)).any())
 
     def _returned(self, now: Moment, ready: Index) -> dict[int, int]:
-        """Return the identities of those rows among `ready` that continue an ended track, by
+        """Identities of the rows among `ready` that continue an ended track, found by
         `tracking.stitching`.
         """
         gone, G, R = now.gone, len(now.gone.identity), len(ready)

@@ -1,7 +1,8 @@
 """Online inputs of detections: lines of JSON from a file, a pipe or clients of a socket; MCAP.
 
-One bad line does not end the service: it is left out with a note. A sender that begins with an unreadable line, or
-sends ten in a row, is refused: a client is disconnected and the others continue, a file is an `InputError`.
+A single bad line does not end the service: it is skipped with a note. A sender that begins with an
+unreadable line, or sends ten in a row, is refused: a client is disconnected and the others
+continue; for a file, InputError is raised.
 """
 
 import selectors
@@ -23,24 +24,25 @@ from shapepose_fg.io.ros.mcap_files import read_views
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
 Push = Callable[..., None]
-"""Function that accepts what `OnlineReconstructor.push_view` does, and raises ValueError where it refuses."""
+"""Function with the parameters of `OnlineReconstructor.push_view`; raises ValueError if it refuses
+a view."""
 Note = Callable[[str], None]
 _PIECE = 2**16
-"""Bytes that are read at a time."""
+"""Maximum number of bytes read at a time."""
 _MOST_BAD = 10
 """Number of consecutive unusable lines after which their sender is refused."""
 _RECONNECT_S = 2.0
 """Time for which a socket stays open after its last client has left, s: clients may reconnect."""
 _SILENT_S = 60.0
-"""Time of silence after which a client is disconnected where others need its place, s."""
+"""Time of silence, s, after which a client may be disconnected to make room for another."""
 
 
 def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push) -> None:
     """Pass detections to `push` as they come, until the input ends.
 
-    `where` is a file or a pipe of lines, `-` or None for standard input, `FILE.mcap`, or `tcp://HOST:PORT`, which
-    ends when all clients that sent something have left. `note` receives what is left out. InputError where the
-    input cannot be used.
+    `where` is a file or a pipe of lines, `-` or None for standard input, `FILE.mcap`, or
+    `tcp://HOST:PORT`, which ends when all clients that sent something have left. `note` receives a
+    message for each skipped line. Raises InputError if the input cannot be used.
     """
     given = _Given(rig, skeleton, note, push)
     if where is not None and where.startswith("tcp:"):
@@ -79,13 +81,15 @@ class _Sender:
     good: int = 0
     """Number of accepted lines."""
     refused: InputError | None = None
-    """The reason why the first line that states the format was refused."""
+    """The first refusal by `push`."""
     _number: int = 0
     _bad: int = 0
     """Number of consecutive unreadable lines."""
 
     def line(self, line: bytes | None) -> None:
-        """Process the next line, None for one that is too long. InputError where the sender is to be refused."""
+        """Process the next line, None for one that is too long. Raises InputError if the sender
+        must be refused.
+        """
         if line is not None and self._number == 0:
             line = line.removeprefix(b"\xef\xbb\xbf")
         if line is None or line.strip():
@@ -94,7 +98,9 @@ class _Sender:
             self._number += 1
 
     def take(self, read: Callable[[str], tuple[Any, ...] | None]) -> None:
-        """Push the result of `read` for the name of the next line, unless it is None. InputError as in `line`."""
+        """Push the result of `read`, called with the next line's name, unless None. Raises
+        InputError as `line` does.
+        """
         self._number += 1
         place = f"{self.name}, line {self._number}"
         try:
@@ -111,14 +117,14 @@ class _Sender:
         try:
             with naming(place):
                 self.given.push(*view)
-        except InputError as error:  # which may be another client's doing
+        except InputError as error:  # maybe another client's fault
             self.refused = self.refused or error
             self.given.note(f"{error}; the line is left out")
         else:
             self.good += 1
 
     def end(self) -> None:
-        """Raise InputError where lines came and none was accepted."""
+        """Raise InputError if lines came and none was accepted."""
         if self.good == 0 and self.refused is not None:
             raise self.refused
 
@@ -138,10 +144,12 @@ class _Lines:
 
     _begun: bytearray = field(default_factory=bytearray)
     _too_long: bool = False
-    """Whether the line that has begun has been refused."""
+    """Whether the current line is too long."""
 
     def split(self, piece: bytes) -> Iterator[bytes | None]:
-        """Lines that end in the next bytes, the last one where there are none; None for one that is too long."""
+        """Lines completed by the next bytes, or the last line if `piece` is empty; None for one
+        that is too long.
+        """
         *ended, begun = piece.split(b"\n") if piece else (b"", b"")
         for part in ended:
             self._begun += part
@@ -200,7 +208,7 @@ def _from_socket(where: str, given: _Given) -> None:
             connection, name = found
             client = _Client(connection, _Sender(f"{where}, {name}", given), _Lines(), time.monotonic())
             if len(clients) >= MOST_CLIENTS:
-                # Who has sent nothing that can be used goes first, then who is silent for longest.
+                # The first to go is one without any accepted line, then the longest silent.
                 first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
                 if first.sender.good > 0 and client.heard_s - first.heard_s < _SILENT_S:
                     connection.close()

@@ -1,4 +1,4 @@
-"""Rate-limited notes of a running service, however often something happens."""
+"""Rate limit for the notes of a running service."""
 
 import time
 from collections.abc import Callable
@@ -12,9 +12,9 @@ _AT_ONCE = 10
 
 
 class SparingNotes(AbstractContextManager["SparingNotes"]):
-    """Passes notes on: the first ten, then one a second, with the number of those left out.
+    """Passes on the first ten notes, then one per second, with the number of skipped ones.
 
-    A context manager, which ends with that number.
+    A context manager; on exit it reports the remaining number.
     """
 
     def __init__(self, note: Callable[[str], None]) -> None:

@@ -50,10 +50,10 @@ def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
 
 
 def of_poses(rows: Observations, joints: JointStates, rig: Rig, config: EstimatorConfig) -> Array:
-    """(A, J, 3, 3) part of the joints' covariances that comes from the uncertain poses of moving cameras.
+    """(A, J, 3, 3) part of the joints' covariances, m², due to uncertain poses of moving cameras.
 
-    `rows` are the newest frame's rows of A people. Errors of poses are correlated over time, so that frames do not
-    average them out.
+    `rows` are the newest frame's rows of A people. Pose errors are correlated over time, so that
+    frames do not average them out.
     """
     places, views = joints.position, Views.of(rig, rows.time_s)
     sigmas = observation_sigmas(rows, places, views, config.observations, config.joints)
@@ -67,7 +67,7 @@ class Newest:
     """The newest frame, from which `people` is computed."""
 
     frame: int
-    """Number of the frame."""
+    """Number of the newest frame."""
     moment: Moment
     """The tracks, also those without an identity yet."""
     fitter: BodyFitter
@@ -80,12 +80,12 @@ class Newest:
 
     @cached_property
     def people(self) -> tuple[Moment, Array, Array, BodyFit]:
-        """Tracks with identities, covariances (P, J, 3, 3) of their joints, NaN where unknown, codes (P, J) of
-        `Known`, and their bodies.
+        """Tracks with identities, covariances (P, J, 3, 3) of their joints, NaN where unknown,
+        codes (P, J) of `Known`, and their bodies.
 
-        Bodies are fitted to the known joints. Joints that no two views see are taken from the body, if its
-        covariance is smaller and some joint is seen; otherwise the body is a guess from motion and the prior.
-        Tracks without a known joint are left out.
+        Bodies are fitted to the known joints. Joints that fewer than two views see are taken from
+        the body if its covariance is smaller and two views see another joint; otherwise the body
+        follows from motion and the prior. Tracks without a known joint are left out.
         """
         named = np.flatnonzero(self.moment.named & (self.moment.tracks.joints.sigma_m < PLACED_M).any(axis=1))
         order = named[np.argsort(self.moment.identity[named], kind="stable")]
@@ -96,7 +96,7 @@ class Newest:
         information[known] = np.linalg.inv(covariance[known])
         fit = self.fitter.fit_whole(JointTargets(np.where(known[..., None], joints.position, 0.0), information))
         of_body = fit.covariance + MODEL_SIGMA_M**2 * np.eye(3) + _FORGOTTEN * covariance
-        surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(covariance, axis1=2, axis2=3)  # not where NaN
+        surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(covariance, axis1=2, axis2=3)  # false for NaN
         seen = now.views >= 2
         surer &= ~seen & seen.any(axis=1, keepdims=True)
         mean = joints.mean.copy()
@@ -116,7 +116,7 @@ class Newest:
 
 
 def people_at(newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: float) -> Reconstruction:
-    """All people `ahead_s` after the newest frame, as rows of its number."""
+    """Rows of all people, predicted `ahead_s` after the newest frame, with its frame number."""
     now, surely, code, fit = newest.people
     P, J = now.views.shape
     mean, covariance = later(now, surely, skeleton, motion, ahead_s)
@@ -145,12 +145,13 @@ def people_at(newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: 
 def later(
     now: Moment, surely: Array, skeleton: Skeleton, motion: MotionModel, ahead_s: float
 ) -> tuple[Array, Array]:
-    """Position and velocity (A, J, 6) of all joints `ahead_s` later, and covariances (A, J, 6, 6) to report.
+    """Position and velocity (A, J, 6) of all joints `ahead_s` later, and covariances (A, J, 6, 6)
+    to report.
 
-    The covariances leave out the correlation of position and velocity. `surely` (A, J, 3, 3) are the joints'
-    present covariances. A joint's velocity converges to that of its person, the median of the core joints', which
-    decays: white noise on accelerations, with friction; more the faster the joint and the person's joints are,
-    because in walking the leg swings that stood before.
+    The covariances neglect the correlation of position and velocity. `surely` (A, J, 3, 3) are the
+    joints' present covariances. A joint's velocity converges to that of its person, the median of
+    the core joints', which decays. Accelerations are white noise with friction, stronger the faster
+    the joint and the person's joints are: in walking, the leg that stood still swings next.
     """
     joints = now.tracks.joints
     x, v = joints.position, joints.velocity

@@ -58,7 +58,8 @@ _STANDS = 30
 """Excess of views without a pose over views with one, after which a camera is taken to stand where the rig has
 it."""
 _BACK_S = 1.0
-"""Time for which poses of moving cameras are kept beyond the longest time that a frame waits to be solved, s."""
+"""Additional time for which poses of moving cameras are kept, beyond the longest wait of a frame,
+s."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,8 @@ class LiveReport:
     not_taken: int
     """Number of settled rows that were not collected in time."""
     jumps: int
-    """Number of jumps of the common clock, after a pause or because it was set: tracking starts again where it
-    went back, or by more than the longest absence of a track."""
+    """Number of jumps of the common clock, after a pause or because it was set. Tracking restarts
+    if the clock went back, or forward by more than the longest gap of a track."""
     cameras: dict[str, CameraState]
     """Status of each camera by name."""
 
@@ -97,8 +98,8 @@ class LiveReport:
 class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     """Tracks people from frame to frame as they come, and refines them within a fixed lag.
 
-    A context manager, at whose end the refining processes end. `push`, `push_view`, `settled`, `save` and `close`
-    block each other; `people` and `report` block on nothing and may be called by any thread.
+    A context manager; on exit the worker processes end. `push`, `push_view`, `settled`, `save` and
+    `close` lock each other out; `people` and `report` never wait and may be called from any thread.
     """
 
     def __init__(
@@ -113,9 +114,10 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     ) -> None:
         """`skeleton` are the detector's joints; `lag_s` is the delay of the refined people.
 
-        `workers` processes refine; with 1 it is done within `push`, in the same order, so that the same frames
-        give the same bytes. Offsets of the detector's joints come from `config.offsets.source`, where that is a
-        file. ValueError for fewer than two cameras, or a lag that is not 0.1 to 2 seconds.
+        `workers` is the number of processes for refinement; with 1 it runs within `push`, in a
+        fixed order, so that the same frames give the same bytes. Offsets of the detector's joints
+        are read from `config.offsets.source` if it is a file. Raises ValueError for fewer than two
+        cameras, or a lag outside 0.1 to 2 seconds.
         """
         config = PipelineConfig() if config is None else config
         if len(rig) < 2:
@@ -159,7 +161,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         workers: int = 2,
         fitter: BodyFitter | None = None,
     ) -> "OnlineReconstructor":
-        """Resume from a file of `save`, with the same cameras, settings and lag; else InputError."""
+        """Resume from a file of `save`. Raises InputError unless cameras, settings and lag are the
+        same.
+        """
         found = cls(rig, config, skeleton=skeleton, lag_s=lag_s, workers=workers, fitter=fitter)
         try:
             found._state = read_state(Path(path), found._id, rig, found._filter)
@@ -175,18 +179,20 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         self.close()
 
     def close(self) -> None:
-        """End the refining processes. Settled rows can still be collected."""
+        """End the worker processes. Settled rows can still be collected."""
         with self._lock:
             self._open.close()
 
     def push(self, detections: Detections, time_s: float | Array) -> None:
-        """Process a frame of all cameras, taken at `time_s`: seconds, or (V,) for asynchronous cameras.
+        """Process a frame of all cameras, taken at `time_s`: seconds, or (V,) for asynchronous
+        cameras.
 
-        A camera without detections has none in it. Frames may come late or out of order by up to the lag: all
-        later frames are then tracked again. Older ones, and a second one of the same time, are counted and left
-        out; ten in a row that are seconds old mean that the clock was set back, and tracking starts again.
-        ValueError where a detection is of a camera or joint that does not exist, or not finite, or of a moving
-        camera (`push_view`) whose pose is not known, and for times seconds apart.
+        A camera without detections is treated as absent from the frame. Frames may come late or out
+        of order by up to the lag: all later frames are then tracked again. Older frames, and
+        duplicates of a time, are counted and ignored; ten in a row that are seconds old mean that
+        the clock was set back, and tracking restarts. Raises ValueError if a detection is not
+        finite, has no valid camera or joint, or is of a moving camera (`push_view`) without a known
+        pose, and for times seconds apart.
         """
         times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
         self._check_time(times)
@@ -213,19 +219,21 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     ) -> None:
         """Process the detections of one camera at `time_s`, seconds, on the common clock.
 
-        Views make a frame: it is complete when every camera that was active in the last half second is in it (the
-        first one: every camera), or when one comes again. A view for a completed frame is added to it where it is
-        within half a frame of it and within the lag; else it is counted and left out. `detections` are of this
-        camera whatever their `view` says.
+        A frame is complete when it has a view of every camera that was active in the last half
+        second (the first frame: of every camera), or when a camera comes again. A view for a
+        completed frame is added to it if it is within half a frame of it and within the lag; else
+        it is counted and ignored. `detections` are assigned to `camera`; their `view` is not used.
 
-        A view whose time is seconds away from the others' waits until those of other cameras confirm it: one
-        camera does not move the common clock. Where all cameras jump, the waiting views are processed.
+        A view with a time seconds away from the others' waits until those of other cameras confirm
+        it: a single camera does not move the common clock. If all cameras jump, the waiting views
+        are processed.
 
-        `pose` (4, 4) is world from camera at that time, or from its carrier (`Camera.carrier`), metres;
-        `pose_covariance` (6, 6) its covariance, rotation before translation along its own axes, rad² and m²
-        (GTSAM's order); without it, the pose is exact. Between poses at most half a second apart they are
-        interpolated. A camera without a carrier moves if its first view has a pose. ValueError as in `push`, for a
-        camera that does not exist, and for the pose of a camera that stands still; the state has not changed then.
+        `pose` (4, 4) is world from camera at that time, or from its carrier (`Camera.carrier`),
+        metres; `pose_covariance` (6, 6) its covariance, rotation before translation along its own
+        axes, rad² and m² (GTSAM's order); without it, the pose is exact. Poses are interpolated if
+        they are at most half a second apart. A camera without a carrier moves if its first view has
+        a pose. Raises ValueError as `push` does, for an unknown camera, and for the pose of a
+        static camera; the state is then unchanged.
         """
         if camera not in self.rig.names:
             raise ValueError(f"there is no camera {camera}; there are {', '.join(self.rig.names)}")
@@ -252,7 +260,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
                 raise refused
 
     def _placed(self, view: int, time_s: float, pose: Array | None, covariance: Array | None) -> Rig:
-        """The cameras with the pose of a view, which is checked. ValueError, and the state has not changed."""
+        """The rig with the checked pose of a view. Raises ValueError without changing the state."""
         state, name = self._state, self.rig.names[view]
         moves, alone = bool(state.rig.cameras[view].carrier), not self.rig.cameras[view].carrier
         if pose is None:
@@ -273,7 +281,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     def _take_view(
         self, view: int, own: Detections, time_s: float, pose: Array | None, covariance: Array | None
     ) -> None:
-        """Add a view whose time fits to its frame."""
+        """Add a view to the frame its time belongs to."""
         if pose is not None:
             self._state.rig = self._placed(view, time_s, pose, covariance)
             self._state.without_pose[view] = max(self._state.without_pose[view] - 1, 0)
@@ -285,7 +293,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             self._take(frame, times)
 
     def _say_clock(self, view: int, was_off: int, off: int) -> None:
-        """Count a view that is dropped, and report its camera after several."""
+        """Count a view that is ignored for its time, and report its camera after several."""
         self._state.dropped += int(off > 1)
         if off == _OFF_CLOCK or (off == 0 and was_off >= _OFF_CLOCK):
             code = CameraState.OFF_CLOCK if off > 0 else CameraState(int(self._state.watch.state[view]))
@@ -317,9 +325,10 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     def people(self, time_s: float | None = None) -> Reconstruction:
         """The people at `time_s`, from the newest frame's time (the default) to a second after it.
 
-        A row per person, with the newest frame's number. Joints are predicted by the motion model, and their
-        covariances grow with the prediction time. Bodies are fitted to the newest joints at the first call, and
-        moved with them; joints that no two views see are the body's. ValueError for another time.
+        A row per person, with the newest frame's number. Joints are predicted by the motion model,
+        and their covariances grow with the prediction time. Bodies are fitted to the newest joints
+        at the first call, and moved with them; joints seen by fewer than two views are the body's.
+        Raises ValueError for any other time.
         """
         newest = self._now
         newest_s = newest.moment.tracks.time_s
@@ -394,7 +403,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             raise ValueError("xy and confidence must be finite")
 
     def _check_places(self, detections: Detections, times: Array, rig: Rig | None = None) -> None:
-        """ValueError where a moving camera has detections and no pose."""
+        """Raise ValueError if a moving camera has detections without a known pose."""
         rig = self._state.rig if rig is None else rig
         for view in np.flatnonzero(rig.carrier >= 0).tolist():
             if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(times[view]):
@@ -472,8 +481,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         self._show()
 
     def _restart(self, refined: Reconstruction) -> None:
-        """Restart tracking at a frame with refined people, whose joints are more accurate; not where it is
-        older than the lag, because the frames since take too long.
+        """Restart tracking at a frame with refined people, since their joints are more accurate;
+        not at a frame older than the lag, because tracking again since then takes too long.
         """
         slots = self._state.slots
         frames = [slot.given.frame for slot in slots if slots[-1].time_s - slot.time_s < self.lag_s]
@@ -506,7 +515,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             elif age_s[first] > _BEHIND * self.lag_s:
                 slots[first].settled = True
                 self._state.unrefined += 1
-        # What a late frame is put behind, and what the next window begins with.
+        # The frames that a late frame may follow, and those that the next window includes before
+        # its own.
         needed_s = max(self.lag_s, age_s[first] if first < len(slots) else 0.0) + around_s
         del slots[: int((age_s > needed_s).sum())]
 

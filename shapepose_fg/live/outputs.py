@@ -28,16 +28,18 @@ from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 Publish = Callable[[str, Reconstruction], None]
 """Function that takes the kind of the rows, `now` or `settled`, and the rows."""
 _MOST_WAITING = 2**23
-"""Maximum backlog of a client, bytes."""
+"""Maximum backlog of a client, bytes; a slower one is disconnected."""
 _LOOK_S = 0.2
-"""Longest time that the end waits for the thread that accepts readers, s."""
+"""Longest wait for the thread that accepts clients, when the output ends, s."""
 _LAST_S = 2.0
-"""Longest time that the end waits for all clients together, s."""
+"""Longest wait for all clients together, when the output ends, s."""
 
 
 @contextmanager
 def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
-    """Function that writes people, frame by frame, to all these targets; standard output where there is none."""
+    """Yield a function that writes people, frame by frame, to all of `where`; by default to
+    standard output.
+    """
     with ExitStack() as files:
         targets = [files.enter_context(_target(each, rig, note)) for each in where or ["-"]]
 
@@ -103,7 +105,7 @@ def _by_time(people: Reconstruction, take: Callable[[Reconstruction, float], Non
 
 
 def _plain(values: np.ndarray) -> Any:
-    """Nested lists of numbers of 6 digits, null where one of an innermost list is unknown."""
+    """Nested lists of numbers with 6 digits; null for an innermost list with an unknown number."""
     if values.ndim > 1:
         return [_plain(each) for each in values]
     return [float(f"{value:.6g}") for value in values] if np.isfinite(values).all() else None
@@ -115,7 +117,7 @@ class _Listeners:
     def __init__(self, listening: socket.socket, note: Callable[[str], None]) -> None:
         self._listening, self._note = listening, note
         self._waiting: dict[socket.socket, deque[memoryview]] = {}
-        """By client: what is still to be sent. Lines are in memory once for all clients."""
+        """By client: data still to be sent. The memory of a line is shared by all clients."""
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._wait_for_readers, daemon=True)
@@ -139,7 +141,9 @@ class _Listeners:
                     continue
 
     def send(self, line: str) -> None:
-        """Send a line, after the backlog, as far as each client accepts it now."""
+        """Send the backlog and a line to each client, as far as it accepts data without
+        blocking.
+        """
         self._welcome()
         data = memoryview(line.encode())
         for client, waiting in list(self._waiting.items()):
@@ -159,7 +163,7 @@ class _Listeners:
                 self._part(client, "a reader is too slow; its connection is closed")
 
     def _wait_for_readers(self) -> None:
-        """Accept clients in a thread while there is nothing to send, because the system's queue of them is
+        """Accept clients in a thread, also while there is nothing to send: the system's queue is
         short.
         """
         with selectors.DefaultSelector() as ready:
@@ -169,10 +173,10 @@ class _Listeners:
                     self._ended.wait(1.0)
 
     def _welcome(self) -> bool:
-        """Accept waiting clients; returns whether the system had room for them."""
+        """Accept waiting clients; returns False if the system has no resources for them."""
         try:
             with self._lock:
-                for _ in range(MOST_CLIENTS):  # and then a line again, however many come
+                for _ in range(MOST_CLIENTS):  # bounded, to return to sending
                     if (found := accept(self._listening)) is None:
                         break
                     client, name = found

@@ -35,7 +35,8 @@ class Slot:
     settled: bool = False
     """Whether its rows are refined, or being refined."""
     refined: Reconstruction | None = None
-    """The rows of the newest window that ends here, from which later frames are tracked. Not saved."""
+    """Rows refined by the newest window that ends here; later frames are tracked from these. Not
+    saved."""
 
     @property
     def time_s(self) -> float:
@@ -60,12 +61,11 @@ class LiveState:
     without_pose: Counter[int] = field(default_factory=Counter)
     """By view: the excess of views without a pose over those with one. Not saved."""
     slots: list[Slot] = field(default_factory=list)
-    """The last frames, in order of time: those that are not settled, and those that a window includes before
-    them."""
+    """The last frames, by time: those not settled, and those that a window includes before them."""
     before: Detections | None = None
     """The newest frame's detections, all of them."""
     settled: deque[Reconstruction] = field(default_factory=deque)
-    """Rows that were not collected yet."""
+    """Settled rows that were not collected yet."""
     frames: int = 0
     """Number of processed frames; the next ones are counts of `LiveReport`."""
     late: int = 0
@@ -82,7 +82,7 @@ class Refined:
     rows: Reconstruction
     """Rows that the window settles."""
     newest: Reconstruction
-    """The rows of its newest frame, whose bodies are the initial ones of the newest people."""
+    """Rows of its newest frame, from which tracking restarts."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class _Sent:
     names: dict[int, int]
     """Identities of the tracks."""
     own: int
-    """Number of its frames from `Span.start` on that it settles."""
+    """Number of frames, from `start` on, that it settles."""
     start: int
 
 
@@ -112,18 +112,19 @@ class Refinery:
         return len(self._sent)
 
     def send(self, window: list[Slot], start: int, own: int, rig: Rig) -> None:
-        """Submit the `own` slots from `start` on with those around them, and the cameras of `rig`."""
+        """Submit a window that settles `own` slots from `start` on, with the cameras of `rig`."""
         names = dict[int, int]()
         for slot in window:
             ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
             names |= {track: name for track, name in zip(ids, who, strict=True) if name != ON_TRIAL}
         decided, tracks = [], np.array(sorted(names), dtype=np.int64)
         for n, slot in enumerate(window):
-            # Frames are numbered by their times, in whatever order they came.
+            # Frames are numbered by time, not by arrival.
             given = replace(slot.given, frame=n)
             rows = self._filter.observations(slot.moment, slot.candidate, given)
             rows = rows.rows(np.isin(rows.track, tracks))
-            # Tracks are counted anew in each window: keys of a graph do not reach as far as a service goes on.
+            # Each window numbers its tracks from 0: graph keys have a limited range, a service may
+            # run without end.
             decided.append((given, replace(rows, track=np.searchsorted(tracks, rows.track))))
         rows = Observations.concatenate([each for _, each in decided])
         if len(rows) == 0:
@@ -144,7 +145,8 @@ class Refinery:
                 rows = sent.part.result().rows
             at = rows.frame
             person = np.array([sent.names[track] for track in rows.person.tolist()], dtype=np.int64)
-            # Of two tracks of one identity in a frame, who came back while they were still followed, one stays.
+            # If two tracks in a frame have one identity (re-identified while still tracked), keep
+            # the first.
             _, first = np.unique(np.column_stack([at, person]), axis=0, return_index=True)
             keep, frame = np.sort(first), sent.frames[at]
             table = rows.observations

@@ -33,15 +33,16 @@ FORMAT = "shapepose-fg live state 3"
 _CURE = "start without it"
 _WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place", "mirrored")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
-"""Columns of detections."""
+"""Columns of detections in a saved state."""
 _POSES = ("time_s", "wTb", "covariance")
-"""Columns of poses of moving cameras, besides the carrier's name."""
+"""Columns of poses of moving cameras, in addition to the carrier's name."""
 _MOST_PIXELS, _MOST_APART_M, _MOST_AFFINITY = 1e9, 1e3, 10
-"""Largest coordinate of a detection, px, distance of a camera from the others, m, and affinity."""
+"""Maximum coordinate of a detection, px, joint-to-detection distance of a camera, m,
+and affinity."""
 _LEAST_VARIANCE = 1e-12
 """Minimum variance of a position in any direction, m²: smaller ones have no finite inverse."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
-"""The counts of a state."""
+"""Names of the counts of a state."""
 _COLUMNS = {
     "slots": Column("T 8", _WHOLE),
     "times": Column("T 2"),
@@ -74,12 +75,12 @@ _COLUMNS = {
     "seen.pairs": Column("E 2", _WHOLE),
     "seen.affinity": Column("E", most=1e9),
 }
-"""Arrays of the frames, one frame after the other; `slots` has the share of each frame: its number, whether it
-is settled, the next track and identity, and its numbers of tracks, detections, pairs and ended tracks."""
+"""Arrays of the frames, concatenated. `slots` has for each frame its number, whether it is settled,
+the next track and identity, and its numbers of tracks, detections, pairs and ended tracks."""
 
 
 def setup_id(rig: Rig, skeleton: Skeleton, config: PipelineConfig, lag_s: float) -> str:
-    """Digest of everything that a saved state depends on."""
+    """Digest of all that a saved state depends on: cameras, skeleton, settings and lag."""
     told = repr((asdict(config), rig.names, skeleton.joints, skeleton.limbs, lag_s)).encode()
     return hashlib.sha256(told + rig.K.tobytes() + rig.cTw.tobytes()).hexdigest()
 
@@ -121,7 +122,7 @@ def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
 
 
 def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
-    """The cameras of a state, with recent poses of moving ones."""
+    """The rig with the recent poses of moving cameras from a saved state."""
     if "pose.carrier" not in arrays:
         return rig
     found = []
@@ -135,8 +136,8 @@ def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
 
 
 def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> list[Slot]:
-    """The frames from the arrays of `slot_arrays`; ValueError where they do not fit these cameras, or no run
-    wrote them.
+    """The frames from the arrays of `slot_arrays`. Raises ValueError if they are invalid or of
+    other cameras.
     """
     J, B = nobody.views.shape[1], nobody.count.shape[1]
     sizes = {"V": len(rig), "J": J, "B": B, "S": nobody.tracks.joints.mean.shape[2]}
@@ -193,8 +194,8 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
 
 
 def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
-    """ValueError where detections have no valid camera, joint or place, or where tracks have detections that do
-    not exist.
+    """Raise ValueError if detections have no valid camera, joint or value, or if tracks have
+    detections that do not exist or are of another joint or camera.
     """
     if not (np.abs(seen.xy) <= _MOST_PIXELS).all():
         raise ValueError("its detections must be finite")
@@ -245,13 +246,13 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
 
 
 def write_state(path: Path, arrays: Mapping[str, NDArray[Any]], setup: str) -> None:
-    """Write a state, whole or not at all; the same one gives the same bytes."""
+    """Write a state atomically; equal states give equal bytes."""
     told = {"format": np.array(FORMAT), "setup": np.array(setup), **arrays}
     write_atomically(path, lambda stream: write_npz(stream, told))
 
 
 def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState:
-    """Read a state. InputError where the file is none, or has another set-up."""
+    """Read a state. Raises InputError if the file is not a state, or of another set-up."""
     names = ["counts", "cameras", "clock", "waiting_s"]
     names += [f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS]
     optional = [f"settled.{each}" for each in Reconstruction.ROWS]
@@ -273,7 +274,7 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
 
 
 def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -> LiveState:
-    """The state from its arrays; ValueError where they do not fit."""
+    """The state from its arrays. Raises ValueError if they do not fit."""
     V, skeleton = len(rig), following.tracker.skeleton
     shapes = {"counts": (len(_COUNTS),), "cameras": (4, V), "clock": (2,), "waiting_s": (V,)}
     for name, shape in shapes.items():

@@ -6,13 +6,13 @@ from urllib.parse import urlsplit
 from shapepose_fg.core.errors import InputError
 
 MOST_CLIENTS = 64
-"""Maximum number of clients of a socket: fewer than the files that a process may have open."""
+"""Maximum number of clients of a socket; below the usual limit of open files per process."""
 _OWN_MACHINE = "127.0.0.1"
 
 
 def listen(where: str) -> socket.socket:
-    """A listening socket for `tcp://HOST:PORT`; without a host, on this machine only. InputError where it
-    fails.
+    """A listening socket for `tcp://HOST:PORT`; without a host, on this machine only. Raises
+    InputError on failure.
     """
     try:
         parts = urlsplit(where)
@@ -27,12 +27,12 @@ def listen(where: str) -> socket.socket:
 
 
 def accept(listening: socket.socket) -> tuple[socket.socket, str] | None:
-    """The next connection, non-blocking, and its address; None where there is none. OSError where the system
-    has no room for it.
+    """The next connection, non-blocking, and its address; None if none waits. Raises OSError if the
+    system has no resources for it.
     """
     try:
         client, address = listening.accept()
-    except (BlockingIOError, ConnectionError):  # or it has gone again
+    except (BlockingIOError, ConnectionError):  # or it was closed
         return None
     client.setblocking(False)
     client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

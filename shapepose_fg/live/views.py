@@ -11,17 +11,17 @@ from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.clock import JUMP_S
 
 _HEARD_S = 0.5
-"""Time since the last view of a camera for which frames wait for it, s."""
+"""Time since the last view of a camera, s, after which frames no longer wait for it."""
 _ASSUMED_S = 1 / 30
-"""Assumed time between a camera's pictures before two of them have come, s."""
+"""Assumed time between a camera's pictures until two have come, s."""
 _FRESH = 0.05
 """Weight of a camera's last step in the running mean of its period."""
 SHORTEST_S = 1 / 250
-"""Shortest time between a camera's pictures, s: closer ones are one picture, received twice."""
+"""Shortest time between a camera's pictures, s; closer ones are duplicates of one picture."""
 MOST_S = 1e12
 """Largest time, s: beyond it the resolution of doubles is too coarse."""
 _BEFORE_S = 0.4
-"""Time for which the first pose of a camera holds before it came, s."""
+"""Time before a camera's first pose from which on this pose is used, s."""
 
 Frame = tuple[Detections, Array]
 """Detections of all cameras, and their times (V,)."""
@@ -47,12 +47,14 @@ class ViewsInStep:
             self.heard_s = np.full(self.views, -np.inf)
 
     def is_late(self, view: int, time_s: float) -> bool:
-        """Whether the frame of this view was completed without it, or the camera's last view is repeated."""
+        """Whether the view belongs to a frame that is complete already, or repeats the camera's
+        last view.
+        """
         step_s = min(self.period_s, max(time_s - float(self.heard_s[view]), SHORTEST_S))
         return time_s <= max(self.heard_s[view], self.done_s + step_s / 2)
 
     def heard(self, view: int, time_s: float) -> None:
-        """Note the time of a view, also of a late one."""
+        """Record the time of a view, also of a late one."""
         self.heard_s[view] = max(self.heard_s[view], time_s)
 
     def add(self, view: int, detections: Detections, time_s: float) -> list[Frame]:
@@ -63,13 +65,13 @@ class ViewsInStep:
             self.period_s += _FRESH * (min(max(step_s, SHORTEST_S), 3 * self.period_s) - self.period_s)
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
-        # Before the first frame every camera is waited for, until one comes again.
+        # The first frame waits for every camera, until one comes again.
         awaited = (time_s - self.heard_s <= _HEARD_S) | np.isinf(self.done_s)
         alive = np.flatnonzero(awaited).tolist()
         return found + (self.rest() if all(each in self.waiting for each in alive) else [])
 
     def rest(self) -> list[Frame]:
-        """The waiting views as a frame; where their times are far apart, as at the beginning, most of them."""
+        """The waiting views as a frame, with those whose times agree; others are dropped."""
         if len(self.waiting) == 0:
             return []
         every = [time_s for _, time_s in self.waiting.values()]
@@ -86,9 +88,10 @@ class ViewsInStep:
 
 
 def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array | None, since_s: float) -> Rig:
-    """The rig in which a camera, or its carrier, has one more pose (4, 4) with covariance (6, 6), at `time_s`.
+    """The rig with one more pose (4, 4) of a camera, or its carrier, at `time_s`, with covariance
+    (6, 6).
 
-    Poses before `since_s` are dropped except for one. ValueError where `pose` is none.
+    Poses before `since_s` are dropped except the last. Raises ValueError for invalid poses.
     """
     camera = rig.cameras[view]
     name = camera.carrier or camera.name

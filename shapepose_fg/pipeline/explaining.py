@@ -444,8 +444,8 @@ def _findings(
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body contributes {shares[0]:.0%},"
-            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and motion from other frames the"
-            " rest."
+            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and motion from other frames"
+            " the rest."
         )
         found.append(Finding(Cause.PRIOR_ONLY, (), words))
     if len(used) == 1:

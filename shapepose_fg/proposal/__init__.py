@@ -1,1 +1,3 @@
-"""Stage I, one frame: who is there, and whose are the 2D detections (section 3.1 of the paper)."""
+"""Stage I, single-frame: finds people and associates 2D detections with them (section 3.1 of the
+paper).
+"""

@@ -1,4 +1,4 @@
-"""Who gets what: greedy one-to-one matching of whole arrays."""
+"""Greedy one-to-one matching on arrays."""
 
 import numpy as np
 
@@ -7,14 +7,15 @@ from shapepose_fg.core.compiled import kernel
 
 
 def lesser(value: Real | Whole) -> Mask:
-    """(P, P) whether one has less of `value` (P,) than another; of equal ones the later has."""
+    """(P, P) whether one has a smaller `value` (P,) than another; on a tie, the later one has."""
     return (value[:, None] < value) | ((value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool))
 
 
 def match_best_first(left: Index, right: Index, score: Array) -> Index:
-    """Greedy one-to-one matching of edges (left, right) by falling score; returns indices of picked edges.
+    """Greedy one-to-one matching of edges (left, right) by descending score; returns indices of the
+    chosen edges.
 
-    Of equal scores the first edge is picked. Ends are numbers from 0.
+    On a tie the first edge is chosen. Ends are numbered from 0.
     """
     order = np.argsort(-score, kind="stable")
     left, right = (np.require(end, np.intp, ["C", "W"]) for end in (left, right))
@@ -24,7 +25,7 @@ def match_best_first(left: Index, right: Index, score: Array) -> Index:
 
 @kernel("i1 i1 i1 b1 b1")
 def _pick(order: Index, left: Index, right: Index, taken_left: Mask, taken_right: Mask) -> int:
-    """Move the edges whose ends are free, in `order`, to its front; returns their number."""
+    """Move the edges with free ends to the front of `order`, in order; returns their number."""
     count = 0
     for k in range(len(order)):
         edge = order[k]

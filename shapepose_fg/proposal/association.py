@@ -1,6 +1,8 @@
-"""Which 2D detections are whose: proposals projected back into the views, filtered by part affinities.
+"""Association of 2D detections with people: proposals are projected into the views and filtered by
+part affinities.
 
-Stage I (e) of the paper (section 3.1): gives each person *their* 2D observation of every joint in every view.
+Stage I (e) of the paper (section 3.1): assigns each person *their* 2D observation of every joint in
+every view.
 """
 
 import numpy as np
@@ -15,14 +17,15 @@ from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Sight, nearby
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals
 
 _NEAR_M = 0.08
-"""How closeness to the projected joint falls off: sigma of a Gaussian, as a length at the joint's depth."""
+"""Standard deviation of the nearness score around a projected joint, as a length at its
+depth, m."""
 _FAR_M = 0.25
-"""No detection farther than this from the projection of a joint whose place is known is taken."""
+"""Maximum distance of a detection from the projection of a placed joint, m."""
 _REACH_M = 0.6
 """A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no limb
 from a joint to the next is longer, the trunk aside."""
 _PASSES = 2
-"""How often the choice is made again with the neighbours that the last one chose."""
+"""Number of further passes, each with the neighbours that the last one assigned."""
 
 
 def associate(
@@ -33,10 +36,12 @@ def associate(
     skeleton: Skeleton,
     config: ProposalConfig,
 ) -> tuple[Observations, int]:
-    """Give every person at most one detection per joint and view, and every detection to one person.
+    """Assign each person at most one detection per joint and view, and each detection to one
+    person.
 
-    A detection on which two people's joints lie serves both. Proposals that are left with hardly any
-    joint seen by two views are dropped, and what they took is reassigned; the second value is their number.
+    A detection on which joints of two people coincide serves both. Proposals left with too few
+    joints seen by two views are dropped, and their detections reassigned; the second value is the
+    number of dropped ones.
     """
     own, places = by_support(proposals, candidates, detections, len(rig)), proposals.places
     real = np.ones(len(proposals), dtype=bool)
@@ -46,13 +51,15 @@ def associate(
         keep = seen_twice(own >= 0, skeleton).mean(axis=1) >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
         places, own = places[keep], own[keep]
-        # What the dropped had is reassigned.
+        # Detections of dropped proposals are reassigned.
         rounds = rounds - 1 if keep.all() else _PASSES
     return Observations.of(own, detections, places), int((~real).sum())
 
 
 def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
-    """(P, J, V) what people with joints at `places` (P, J, 3) get, who are thought to have `own` (P, J, V)."""
+    """Detections (P, J, V) assigned to people at `places` (P, J, 3), whose present ones are `own`
+    (P, J, V).
+    """
     world, unplaced = np.zeros(len(own), dtype=np.intp), np.isnan(places[..., 0])
     sight = Sight.of(detections, rig, skeleton)
     near = nearby(places, np.full(unplaced.shape, _FAR_M), world, sight)
@@ -72,7 +79,7 @@ def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skelet
 
 
 def seen_twice(seen: Mask, skeleton: Skeleton) -> Mask:
-    """(P, K) which of each person's core joints two views see, of `seen` (P, J, V)."""
+    """(P, K) whether two views see each of the K core joints, from `seen` (P, J, V)."""
     return (seen.sum(axis=2) >= 2)[:, list(skeleton.core)]
 
 
@@ -82,7 +89,7 @@ def by_support(proposals: Proposals, candidates: Candidates, detections: Detecti
     own = np.full((*proposals.candidate.shape, views), -1, dtype=np.intp)
     for person, chosen in enumerate(proposals.candidate):
         of[chosen] = person
-    of[-1] = -1  # -1 marked the spare last one
+    of[-1] = -1  # restore the spare entry
     candidate, detection = candidates.support.T
     whose = of[candidate]
     has, detection = whose >= 0, detection[whose >= 0]

@@ -1,6 +1,7 @@
-"""Where joints may be: pairs of views triangulated, and clustered by confidence-aware voting.
+"""3D joint candidates: triangulation of pairs of views, clustered by confidence-weighted voting.
 
-Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstruction" and "Candidates Association").
+Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstruction" and "Candidates
+Association").
 """
 
 import math
@@ -18,46 +19,52 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.pieces import project, solved
 
 _ANYWHERE_M = 10.0
-"""A gate that no pair of rays in a room fails."""
+"""Gate that any pair of rays in a room passes, m."""
 
 
 @dataclass(frozen=True)
 class CandidateConfig(Settings):
-    """How pairs of detections become 3D joint candidates."""
+    """Settings for 3D joint candidates from pairs of detections."""
 
     gate_m: Metres = 0.07
-    """Largest reprojection error of a pair's point, as a length at the point's depth. The point shares the gap
-    between the two rays out: its error is 0.7 of a detection's sigma, 2 cm where the detector is half sure."""
+    """Maximum reprojection error of a pair's point, as a length at the point's depth, m. Each of
+    the two rays gets half of the gap: the error is 0.7 of a detection's sigma, 2 cm if the detector
+    is half certain."""
     min_angle_deg: Annotated[float, Interval(gt=0, le=90)] = 3.0
-    """Smallest angle between the two rays; below it depth is guessed, not measured."""
+    """Minimum angle between the two rays; below it the depth is poorly observed."""
     vote_radius_m: Metres = 0.12
-    """rho: points of one joint closer than this to the most confident one vote for it."""
+    """Radius rho of a cluster, m: points of one joint this close to the most confident one vote for
+    it."""
     min_votes: Count = 3
-    """The paper's three points: fewer make a *weak* candidate, which cannot anchor a person. With two cameras
-    there is one pair only, so what counts is min(min_votes, pairs of views)."""
+    """The paper's three points; a candidate with fewer is *weak* and cannot anchor a person. Two
+    cameras give a single pair, so the limit is min(min_votes, pairs of views)."""
     min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
-    """Where there are very many views, chance crossings of rays have three votes, too: a strong candidate must
-    have those of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and fewer: 3)."""
+    """With very many views, chance crossings of rays also get three votes: a strong candidate needs
+    the votes of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and
+    fewer: 3)."""
     weak: bool = True
-    """Whether clusters of fewer votes are kept, as weak candidates. The paper drops them: a joint that two views
-    see is lost."""
+    """Whether clusters with fewer votes are kept as weak candidates. The paper drops them, and
+    loses joints seen by only two views."""
     weighted_centre: bool = True
-    """Whether the centre of a cluster is weighted by the squared confidence of its points. In the paper it is
-    their mean."""
+    """Whether the centre of a cluster is weighted by the squared confidence of its points. In the
+    paper it is their mean."""
 
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
-    """Pairs of detections of one joint that a frame may have: of more, each view keeps its most confident ones."""
+    """Maximum number of pairs of detections per joint and frame; each view keeps its most confident
+    detections."""
     most_points: Annotated[int, Interval(ge=100, le=100_000)] = 8000
-    """Points of one joint: of more, the most confident. Twelve people before 30 cameras have 5000."""
+    """Maximum number of points per joint; the most confident are kept. Twelve people before 30
+    cameras have 5000."""
     most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
-    """Candidates of one joint: of more, those with most votes. Twelve people before 30 cameras have 220, half of
-    them crossings of rays."""
+    """Maximum number of candidates per joint; those with most votes are kept. Twelve people before
+    30 cameras have 220, half of them chance crossings of rays."""
 
     @classmethod
     def paper(cls) -> "CandidateConfig":
-        """As written in section 3.1: every pair is triangulated, wherever its rays pass; three points or none.
+        """The settings of section 3.1: every pair is triangulated without a gate; at least three
+        points.
 
-        The paper does not say rho: 6 cm is the best of 5 to 12 on `tune`.
+        The paper does not give rho: 6 cm is the best of 5 to 12 on `tune`.
         """
         return cls(
             gate_m=_ANYWHERE_M,
@@ -96,19 +103,22 @@ class Candidates:
     votes: Index
     """(C,) number of pair points in the cluster."""
     strong: Mask
-    """(C,) whether the cluster has the votes that the paper asks for."""
+    """(C,) whether the cluster has the votes that the paper requires."""
     support: Index
-    """(S, 2) rows (candidate, detection): the detections that made each candidate, one a view, sorted."""
+    """(S, 2) rows (candidate, detection): the supporting detections, at most one per
+    view, sorted."""
 
     def __len__(self) -> int:
         return len(self.xyz)
 
 
 def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig) -> PairPoints:
-    """Triangulate all pairs of same-joint detections of different views (A y = 0 with C = 2 in the paper).
+    """Triangulate all pairs of same-joint detections of different views (A y = 0 with C = 2 in the
+    paper).
 
-    The linear system is written in normalised image coordinates and solved for the inhomogeneous point. Points
-    behind a camera, with a reprojection error above `gate_m` or with almost parallel rays are dropped.
+    The linear system is in normalised image coordinates and solved for the inhomogeneous point.
+    Points behind a camera, above the reprojection error `gate_m`, or from almost parallel rays are
+    dropped.
     """
     view, joint, *_ = detections.columns
     by_joint = np.argsort(joint, kind="stable")
@@ -129,14 +139,14 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
 
 
 class _Rays(NamedTuple):
-    """Detections as triangulation takes them."""
+    """Detections in the form that triangulation takes."""
 
     of_view: Index
     """(D,) index of the camera."""
     xy: Array
     """(D, 2) normalised image coordinates."""
     ray: Array
-    """(D, 3) the way of the ray, in the world."""
+    """(D, 3) direction of the ray in the world, not normalised."""
     length: Array
     """(D,) length of the ray's direction."""
     normal: Array
@@ -146,10 +156,10 @@ class _Rays(NamedTuple):
 
 
 def vote(points: PairPoints, detections: Detections, views: int, config: CandidateConfig) -> Candidates:
-    """Cluster the points of each joint around its most confident ones (the paper's set S_i).
+    """Cluster the points of each joint around the most confident ones (the paper's set S_i).
 
-    The paper picks the most confident point, gives it all its neighbours within rho, removes them and starts
-    again.
+    As in the paper: pick the most confident point, add all neighbours within rho, remove them, and
+    repeat.
     """
     if len(points.xyz) == 0:
         none = np.zeros(0, dtype=np.intp)
@@ -158,7 +168,7 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     _, cluster = np.unique(seed, return_inverse=True)
     count = cluster.max() + 1
     votes = np.bincount(cluster, minlength=count)
-    # The centre of the cluster is weighted by confidence: one bad view must not drag the point of four good ones.
+    # Confidence weights: one bad view must not move a point that four good views agree on.
     weight = points.score**2 if config.weighted_centre else np.ones(len(points.score))
     total = np.bincount(cluster, weight, count)
     xyz = np.stack([np.bincount(cluster, weight * x, count) / total for x in points.xyz.T], axis=1)
@@ -168,7 +178,8 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     confidence = np.bincount(support[:, 0], detections.confidence[support[:, 1]], count)
     score = confidence / np.bincount(support[:, 0], minlength=count)
     strong = votes >= _needed_votes(views, config)
-    # A detection that made a strong candidate is explained: what it makes with others' is a crossing of rays.
+    # Detections of strong candidates are explained: their other points are chance crossings of
+    # rays.
     explained = np.zeros(len(detections), dtype=bool)
     explained[support[strong[support[:, 0]], 1]] = True
     unexplained = np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0
@@ -179,13 +190,17 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
 
 
 def _needed_votes(views: int, config: CandidateConfig) -> int:
-    """Votes that make a candidate strong: `min_votes`, fewer if pairs are fewer, more if there are very many."""
+    """Votes for a strong candidate: `min_votes`, fewer if there are fewer pairs, more with very
+    many views.
+    """
     seen_by = int(views * config.min_view_fraction)
     return min(max(config.min_votes, seen_by * (seen_by - 1) // 2), views * (views - 1) // 2)
 
 
 def _support(cluster: Index, detection: Index, detections: Detections) -> Index:
-    """Rows (candidate, detection), sorted: in each view the detection that made most of the candidate's points."""
+    """Rows (candidate, detection), sorted: per view the detection with most of the candidate's
+    points.
+    """
     key, points = np.unique(cluster * len(detections) + detection, return_counts=True)
     cluster, detection = np.divmod(key, len(detections))
     view = detections.view[detection]
@@ -198,8 +213,9 @@ def _support(cluster: Index, detection: Index, detections: Detections) -> Index:
 
 @kernel("i1 i1", _Rays, "f3 f2 f0 f0 f0 i2 f2")
 def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m, pair, xyz):
-    """Fill in `pair` and `xyz`, as far as there is room; `order` (D,) is by joint, and each one's stops at `stop`
-    (D,). Points are of rays that pass each other at less than `gap_m`. Returns how many there are.
+    """Fill in `pair` and `xyz`, as far as the arrays reach; returns the number of points. `order`
+    (D,) sorts detections by joint, `stop` (D,) ends each one's joint. Rays must pass each other at
+    less than `gap_m`.
     """
     count, x = 0, np.empty(3)
     for n in range(len(order)):
@@ -222,20 +238,22 @@ def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m,
             if _off_m(cameras[one], rays.xy[i], x) < gate_m and _off_m(cameras[other], rays.xy[j], x) < gate_m:
                 if count < len(pair):
                     pair[count, 0], pair[count, 1] = i, j
-                    xyz[count, 0], xyz[count, 1], xyz[count, 2] = x[0], x[1], x[2]  # a slice compiles for seconds
+                    xyz[count, 0], xyz[count, 1], xyz[count, 2] = x[0], x[1], x[2]  # slicing compiles slowly
                 count += 1
     return count
 
 
 @part
 def _off_m(camera, xy, x):
-    """The reprojection error as a length at the point's depth, metres; infinite behind the camera."""
+    """Reprojection error as a length at the point's depth, metres; infinite behind the camera."""
     u, v, depth = project(camera, x)
     return math.hypot(u - xy[0], v - xy[1]) * depth if depth > 0 else math.inf
 
 
 def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
-    """The seed (M,) whose cluster each point joins, as points are picked one by one by confidence."""
+    """Index of the seed (M,) of each point's cluster; points are picked by descending
+    confidence.
+    """
     order = np.argsort(-points.score, kind="stable")
     along = np.lexsort((points.xyz[:, 0], points.joint))
     place, seed = np.empty_like(along), np.full(len(along), -1, dtype=np.intp)
@@ -246,8 +264,8 @@ def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
 
 @kernel("i1 i1 i1 f2 i1 f0 i1")
 def _pick_seeds(order, along, place, xyz, joint, radius_m, seed):
-    """Fill in `seed` (M,). Points are picked in `order`; `along` are those of a joint by their first coordinate,
-    and `place` where each one is there, so that only those beside it are looked at.
+    """Fill in `seed` (M,). Points are picked in `order`; `along` sorts them by joint and first
+    coordinate, and `place` is the rank of each in it, so that only near points are compared.
     """
     for i in order:
         if seed[i] >= 0:

@@ -1,6 +1,6 @@
-"""Which joints hang together: 3D candidates linked by part affinities, and people grown along them from the hip.
+"""People grown from the hip along part affinities that link 3D candidates.
 
-Stage I (e) of the paper (section 3.1): the affinities tell whose joint a candidate in somebody's box is.
+Stage I (e) of the paper (section 3.1): affinities decide to which person a candidate belongs.
 """
 
 from dataclasses import dataclass
@@ -19,40 +19,45 @@ from shapepose_fg.proposal.candidates import Candidates
 
 @dataclass(frozen=True)
 class GrowthConfig(Settings):
-    """How candidates are linked, and a person is grown."""
+    """Settings for links between candidates and for growing people."""
 
     doubt: Share = 0.2
-    """Affinity below which a view speaks against a limb: unrelated pairs are mostly 0, true ones above 0.4."""
+    """Affinity below which a view contradicts a limb: unrelated pairs are mostly 0, true ones above
+    0.4."""
     view_weight: Annotated[float, Interval(ge=0, le=1000000.0)] = 0.5
-    """What a view that supports a candidate counts, times its confidence, beside the affinities of its limbs:
-    where these leave a choice, a point that five views agree on is a joint, and a crossing of two rays is not."""
+    """Weight of each supporting view, times its confidence, relative to the affinities of limbs. If
+    these leave a choice, a point that five views agree on is preferred to a crossing of two
+    rays."""
     max_limb_m: Metres = 0.75
-    """No limb is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
+    """Maximum length of a limb, m: the trunk of a tall adult, hip to neck, is about 0.65 m."""
     sweeps: RepeatsOrNone = 2
-    """How often the joints are chosen again once all their neighbours are known."""
+    """Number of further passes over all joints, once their neighbours are known."""
     bridge_m: MetresOrNone = 0.55
-    """Beyond a joint that nobody saw, the next is sought within this distance a bone of the last known one: from
-    hip to ankle of a tall adult it is 0.9 m. 0: it is not sought, as in the paper."""
+    """Maximum distance per bone, m, over which a joint beyond an unseen one is searched for from
+    the last known joint: hip to ankle of a tall adult is 0.9 m. 0: no search, as in the paper."""
 
 
 @dataclass(frozen=True)
 class Links:
-    """Limbs between 3D candidates, as the part affinities of all views support them."""
+    """Limbs between 3D candidates, scored by the part affinities of all views."""
 
     ends: Index
-    """(L, 2) two candidates, joined by a limb of the skeleton, first joint of the limb first."""
+    """(L, 2) two candidates, linked by a limb of the skeleton, in the order of the
+    limb's joints."""
     score: Array
-    """(L,) sum over the views that see both of (affinity - doubt): positive when the views agree."""
+    """(L,) sum of (affinity - doubt) over the views that see both; positive if the views agree."""
 
 
 def link(candidates: Candidates, detections: Detections, config: GrowthConfig) -> Links:
-    """Sum the part affinities of all views between the detections that support two candidates."""
+    """Link candidates: sum the part affinities between their supporting detections over
+    all views.
+    """
     owner, detection = candidates.support.T
     by_detection = np.argsort(detection, kind="stable")
     owners, counts = owner[by_detection], np.bincount(detection, minlength=len(detections))
     start = np.cumsum(counts) - counts
     head, tail = detections.pairs.T
-    # Each affinity speaks for every pair of candidates that its two detections support.
+    # Each affinity counts for every pair of candidates that its two detections support.
     repeat = counts[head] * counts[tail]
     which = np.repeat(np.arange(len(head)), repeat)
     step = np.arange(len(which)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
@@ -72,8 +77,9 @@ def link(candidates: Candidates, detections: Detections, config: GrowthConfig) -
 def grow(anchors: Index, candidates: Candidates, links: Links, skeleton: Skeleton, config: GrowthConfig) -> Index:
     """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
 
-    First outwards from the hip, level by level of the skeleton's tree, then `sweeps` times all joints at once,
-    each with the sum of the links to all its chosen neighbours; last, beyond joints that nobody saw.
+    Joints are chosen outwards from the hip, level by level of the skeleton's tree; then `sweeps`
+    times all at once, by the sum of links to all chosen neighbours; last come joints beyond unseen
+    ones.
     """
     people, joints = len(anchors), len(skeleton)
     chosen = np.full((people, joints), -1, dtype=np.intp)
@@ -113,10 +119,11 @@ def _bridge(
     skeleton: Skeleton,
     config: GrowthConfig,
 ) -> bool:
-    """Fill empty joints of `chosen`: linked ones, and strong ones beyond a gap; says whether there were any.
+    """Fill empty joints of `chosen` with linked candidates, and strong ones beyond a gap; returns
+    whether any was found.
 
-    A joint that one view saw, or none, has no candidate, and its children no link to the person. A strong
-    candidate that is linked to nobody belongs to the nearest person who lacks it.
+    A joint seen by fewer than two views has no candidate, so its children have no link to the
+    person. A strong candidate without any link is assigned to the nearest person who lacks it.
     """
     empty = (chosen < 0)[:, candidates.joint]
     free = candidates.joint >= 0
@@ -129,7 +136,7 @@ def _bridge(
         distance = np.linalg.norm(start[:, candidates.joint] - candidates.xyz, axis=-1)
         gap = bones[:, candidates.joint]
         nearness = 1.0 - distance / (config.bridge_m * gap)
-        # Without a gap the affinities had their say, and said no.
+        # Without a gap, the affinities have already rejected the candidate.
         score = np.where(empty & loose & (gap > 1) & (nearness > 0), nearness + evidence, score)
     person, candidate = np.nonzero(score > 0)
     slot = person * chosen.shape[1] + candidates.joint[candidate]
@@ -139,7 +146,7 @@ def _bridge(
 
 
 def _nearest_known(chosen: Index, skeleton: Skeleton) -> tuple[Index, Index]:
-    """The nearest joint towards the root (P, J) that a person has, and how many bones away (P, J) it is."""
+    """Nearest ancestor joint (P, J) that each person has, and the number of bones (P, J) to it."""
     ancestor = np.full(chosen.shape, skeleton.root)
     bones = np.ones(chosen.shape, dtype=np.intp)
     parent = np.array(skeleton.parents)
@@ -154,14 +161,14 @@ def _nearest_known(chosen: Index, skeleton: Skeleton) -> tuple[Index, Index]:
 def _support(chosen: Index, ends: Index, score: Array, count: int) -> Array:
     """(P, C) sum of the links from each person's chosen candidates to every candidate."""
     has = np.zeros((len(chosen), count + 1), dtype=bool)
-    np.put_along_axis(has, chosen, True, axis=1)  # -1 marks the spare last column
+    np.put_along_axis(has, chosen, True, axis=1)  # -1 sets the spare last column
     person, edge = np.nonzero(has[:, ends[:, 0]])
     key = person * count + ends[edge, 1]
     return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
 
 
 def _choose(chosen: Index, support: Array, evidence: Array, candidates: Candidates, joints: Index) -> None:
-    """Set `chosen` of these joints to the best supported candidates, one candidate serving one person."""
+    """Set `chosen` for these joints to the best supported candidates, each for one person."""
     person, candidate = np.nonzero(support > 0)
     of_these = np.isin(candidates.joint[candidate], joints)
     person, candidate = person[of_these], candidate[of_these]

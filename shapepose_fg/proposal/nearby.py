@@ -1,8 +1,9 @@
-"""Whose a detection is: by how near it is to a person's joint, and by its affinities to what the person has.
+"""Scores of detections for people's joints: nearness to the joint, and affinities to the person's
+other detections.
 
-One rule for the proposals of a frame, for hypotheses of who may be there, and for people who are followed. They
-differ in how near is near, and in what is sought of joints whose place is not known. Lists of what is possible,
-not tables of everybody and everything: most detections are nowhere near most people.
+The same rule serves the proposals of a frame, hypotheses of people, and tracked people; they differ
+in the distance limits and in the treatment of joints without a position. Possible pairs are stored
+as sparse lists, because most detections are far from most people.
 """
 
 from dataclasses import dataclass
@@ -19,49 +20,49 @@ from shapepose_fg.core.pieces import project
 from shapepose_fg.core.skeleton import Skeleton
 
 LEAST_AFFINITY = 0.3
-"""What counts as affinity where no neighbour is seen, and half of the least score: unrelated pairs are mostly 0,
-true ones above 0.4."""
+"""Affinity assumed if no neighbour is detected, and half of the minimum score: unrelated pairs are
+mostly 0, true ones above 0.4."""
 OVERLAP_M = 0.025
-"""Two people's projected joints closer than this overlap, as a length at their depth: the one detection there
-serves both. A detector is 2 to 3 cm off."""
+"""Distance of two people's projected joints, as a length at their depth, m, below which one
+detection serves both. A detector's error is 2 to 3 cm."""
 
 
 class Sight(NamedTuple):
-    """A frame as kernels take it: V cameras, D detections, and the limbs of J joints."""
+    """A frame in the form that kernels take: V cameras, D detections, and the limbs of J joints."""
 
     kinds = "f3 f1 f2 i1 i1 f2 f1 i1 f1 i1 i1 f1 i1 i1 b1"
     cameras: Array
     """(V, 3, 4) K [R | t] of each view."""
     focal: Array
-    """(V,) pixels."""
+    """(V,) focal lengths, pixels."""
     sizes: Array
-    """(V, 2) width and height of the pictures, pixels."""
+    """(V, 2) width and height of the images, pixels."""
     of_view: Index
-    """(D,) which view saw each detection."""
+    """(D,) view of each detection."""
     of_joint: Index
     """(D,) index of the joint of each detection."""
     xy: Array
     """(D, 2) undistorted pixels."""
     confidence: Array
-    """(D,) the detector's score."""
+    """(D,) confidence of the detector."""
     order: Index
     """(D,) `Detections.order`."""
     rank: Array
     """(D,) `Detections.rank`."""
     begin: Index
-    """(D + 1,); `other` and `value` are (2 E,): see `Detections.ties`."""
+    """(D + 1,) offsets; `other` and `value` are (2 E,): see `Detections.ties`."""
     other: Index
     value: Array
     limb: Index
-    """(J + 1,) where the limbs of each joint begin."""
+    """(J + 1,) offset of each joint's limbs in `limb_ends`."""
     limb_ends: Index
     """(2 L,) the joints at their other ends."""
     swings: Mask
-    """(J,) joints of arms and legs beyond shoulders and hips."""
+    """(J,) joints of arms and legs except shoulders and hips."""
 
     @classmethod
     def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "Sight":
-        """What a rig saw."""
+        """Build it from detections and cameras."""
         view, joint, xy, _, _ = detections.columns
         confidence = np.require(detections.confidence, float, ["C", "W"])
         seen = view, joint, xy, confidence, detections.order, detections.rank, *detections.ties
@@ -69,37 +70,41 @@ class Sight(NamedTuple):
 
 
 class Claims(NamedTuple):
-    """What speaks for each of N detections being people's."""
+    """Scores of N possible pairs of person and detection."""
 
     tied: Array
-    """(N,) mean affinity to what the person has at the other ends of the joint's limbs; 0 where there is none."""
+    """(N,) mean affinity to the person's detections at the other ends of the joint's limbs; 0
+    without any."""
     score: Array
-    """(N,) nearness and affinity."""
+    """(N,) nearness plus affinity."""
     likely: Mask
-    """(N,) where these are enough."""
+    """(N,) whether the score suffices."""
 
 
 @dataclass(frozen=True)
 class Nearby:
-    """N detections that may be people's, sorted by joint and view, then by world, then by person."""
+    """N possible pairs of person and detection, sorted by joint and view, then world,
+    then person.
+    """
 
     first: Index
-    """(J V + 1,) where those of each joint and view begin."""
+    """(J V + 1,) offset of the pairs of each joint and view."""
     person: Index
-    """(N,) whose joint it is."""
+    """(N,) person."""
     detection: Index
-    """(N,) which of the frame's."""
+    """(N,) index of the detection in the frame."""
     distance_m: Array
-    """(N,) from the joint's projection, metres at its depth."""
+    """(N,) distance from the joint's projection, metres at its depth."""
 
     def claimed(
         self, nearness: Array, lost: Mask, sure: float, own: Index, world: Index, sight: Sight
     ) -> tuple[Index, Claims]:
-        """The detections (A, J, V) that people get, -1 for none, who are thought to have `own` (A, J, V): the best
-        score first, each detection once in a `world` (A,), each person one for a joint and view.
+        """Assign detections (A, J, V) to people, -1 for none, given their present ones `own` (A, J,
+        V): greedy by score, each detection once in a `world` (A,), one per person, joint and view.
 
-        The score is `nearness` (N,), 1 on the joint and 0 far from it, and mean affinity to the person's own. Of
-        joints that are `lost` (N,) only affinity tells, and so much of it must be there.
+        The score is `nearness` (N,), 1 on the joint and 0 far from it, plus mean affinity to the
+        person's own detections. For `lost` (N,) joints only the affinity is used, which must be at
+        least `sure`.
         """
         N, chosen = len(self.person), np.empty(own.shape, dtype=np.intp)
         claims = Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool))
@@ -109,7 +114,8 @@ class Nearby:
         return chosen, claims
 
     def with_tied(self, own: Index, unplaced: Mask, sight: Sight) -> "Nearby":
-        """Add detections of `unplaced` joints (A, J) that affinities tie to people's detections `own` (A, J, V).
+        """Add detections of `unplaced` joints (A, J) with affinities to people's detections `own`
+        (A, J, V).
 
         Their distance is infinite.
         """
@@ -129,12 +135,16 @@ class Nearby:
         return Nearby(first, person[order], detection[order], distance_m[order])
 
     def share(self, tied: Array, chosen: Index) -> None:
-        """Let a detection on a joint, `tied` (N,) to its person, serve this one too where nothing is `chosen`."""
+        """Where nothing is `chosen`, share a detection that lies on the joint and is `tied` (N,) to
+        the person.
+        """
         share(self.first, self.person, self.detection, self.distance_m, tied, chosen)
 
 
 def nearby(places: Array, reach_m: Array, world: Index, sight: Sight) -> Nearby:
-    """Detections within `reach_m` (A, J) of `places` (A, J, 3), metres, of people of a `world` (A,)."""
+    """Detections within `reach_m` (A, J) of joints at `places` (A, J, 3), metres; people have a
+    `world` (A,).
+    """
     people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(places)
     slots = places.shape[1] * len(sight.cameras) + 1
     first, begins = np.zeros((2, slots), dtype=np.intp)
@@ -149,8 +159,8 @@ def nearby(places: Array, reach_m: Array, world: Index, sight: Sight) -> Nearby:
 
 
 def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight) -> tuple[Array, Index]:
-    """Mean affinity (N,) of each `detection` (N,) to what a `person` (N,) has of `candidate` (A, J, V) at the
-    other ends of the joint's limbs, and how many (N,) of these there are.
+    """Mean affinity (N,) of each `detection` (N,) to the detections `candidate` (A, J, V) of
+    `person` (N,) at the other ends of the joint's limbs, and their number (N,).
     """
     mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
     tie(person, detection, candidate, sight, mean, neighbours)
@@ -159,8 +169,8 @@ def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight
 
 @cache
 def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index, Mask]:
-    """The joints at the other ends of each joint's limbs, one after the other, and where each joint's begin; and
-    which joints are beyond shoulders and hips.
+    """Offsets of each joint's limbs, the joints at their other ends, concatenated, and a mask of
+    joints beyond shoulders and hips.
     """
     joint, other = np.nonzero(skeleton.adjacency)
     paired = np.array(skeleton.mirror) != np.arange(len(skeleton))
@@ -170,16 +180,16 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index, Mask]:
 
 @cache
 def limbs_of(skeleton: Skeleton) -> Index:
-    """(L, 2) the limbs of core joints, and the spine: what hides others."""
+    """(L, 2) limbs between core joints, and the spine; these occlude others."""
     core = set(skeleton.core)
     return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
 
 
 @kernel("f3 f2 i1", Sight, "i1 i1 i1 i1 f1")
 def find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m):
-    """Fill in what `nearby` returns, as far as there is room; returns how much there is.
+    """Fill in the results of `nearby`, as far as the arrays reach; returns the number of pairs.
 
-    Into `first` (J V + 1,) goes where detections of each joint and view begin in `sight.order`.
+    `first` (J V + 1,) gets the offset of each joint and view in `sight.order`.
     """
     views, count, xy, order, cameras = len(sight.cameras), 0, sight.xy, sight.order, sight.cameras
     of_joint, of_view, focal = sight.of_joint, sight.of_view, sight.focal
@@ -198,7 +208,7 @@ def find_near(places, reach_m, people, sight, first, begins, person, detection, 
             m_per_px = depth / focal[v]
             reach_px = 1.000001 * reach / m_per_px
             low, high = first[slot], stop
-            while low < high:  # the first that is not too far to the left
+            while low < high:  # binary search for the left end
                 middle = (low + high) // 2
                 if xy[order[middle], 0] < x - reach_px:
                     low = middle + 1
@@ -240,19 +250,21 @@ def claim(
     first, person, detection, nearness, lost, sure, own, world, sight, tied, score, likely, key, queue, taken,
     chosen,
 ):  # fmt: skip
-    """Fill in what `Nearby.claimed` returns; `key` and `queue` (N,) and `taken` (D,) are room to work in."""
+    """Fill in the results of `Nearby.claimed`; `key` and `queue` (N,) and `taken` (D,) are
+    workspace.
+    """
     people, joints, views = chosen.shape
     rank, count = sight.rank, first[len(first) - 1]
     tie(person[:count], detection[:count], own, sight, tied, queue)
     for e in range(count):
         neighbours = queue[e]
-        # Where no neighbour is seen, the affinities say nothing: neither for nor against.
+        # Without detected neighbours the affinities are neutral.
         score[e] = nearness[e] + (tied[e] if neighbours > 0 else LEAST_AFFINITY)
         if lost[e]:
             likely[e] = neighbours > 0 and tied[e] >= sure
         else:
             likely[e] = score[e] >= 2 * LEAST_AFFINITY
-        # People whom the detector has grouped have affinities of exactly 1: equals are told apart.
+        # People grouped by the detector have affinities of exactly 1: ties are broken by rank.
         key[e] = np.rint(score[e] * 1e9) / 1e9 + 1e-10 * rank[detection[e]]
     for a in range(people):
         for j in range(joints):
@@ -260,23 +272,23 @@ def claim(
                 chosen[a, j, v] = -1
     for slot in range(len(first) - 1):
         j, v, end = slot // views, slot % views, first[slot]
-        while end < first[slot + 1]:  # worlds stand one after the other, and do not compete
+        while end < first[slot + 1]:  # worlds do not compete
             of, length = world[person[end]], 0
             while end < first[slot + 1] and world[person[end]] == of:
                 if likely[end]:
                     queue[length] = end
                     length += 1
                 end += 1
-            while length > 0:  # who are each other's best come together, and then who are of the rest
+            while length > 0:  # match mutual best pairs, then repeat for the rest
                 length = _together(queue, length, person, detection, key, taken, chosen, j, v)
 
 
 @part
 def _together(queue, length, person, detection, key, taken, chosen, j, v):
-    """Give each person whose best detection has nobody better that detection; returns how many of the `queue`,
-    rising, are left of others.
+    """Assign each person's best detection if no better person wants it; returns the number of
+    entries left at the front of the `queue`, which is ascending.
 
-    `taken` is the best for each detection, and -2 for those that are given.
+    `taken` is the best entry for each detection, -2 if it is assigned.
     """
     for n in range(length):
         taken[detection[queue[n]]] = -1
@@ -305,7 +317,9 @@ def _together(queue, length, person, detection, key, taken, chosen, j, v):
 
 @kernel("i1 i1 i1 f1 f1 i3")
 def share(first, person, detection, distance_m, tied, chosen):
-    """`Nearby.share`: the nearest of each person's detections of a joint and view."""
+    """Implements `Nearby.share`, with the nearest of each person's detections of a
+    joint and view.
+    """
     views = chosen.shape[2]
     for slot in range(len(first) - 1):
         j, v, e = slot // views, slot % views, first[slot]

@@ -1,4 +1,4 @@
-"""Hypotheses from pairs of 2D people: those of two views whose joints' rays pass each other."""
+"""Hypotheses of people from pairs of 2D people in two views: joint rays that intersect."""
 
 from dataclasses import replace
 
@@ -11,28 +11,32 @@ from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, sizes
 
 _LEAST_JOINTS = 3
-"""Joints of two 2D people that meet, and hang together: two hips may meet by chance."""
+"""Minimum number of connected joints at which rays of two 2D people intersect: two hips may do so
+by chance."""
 _LEAST_SHARE = 0.25
-"""Least share of the joints seen by both views whose rays meet. Below it, halves of two people may be joined."""
+"""Minimum share of the joints seen by both views with intersecting rays; below it, halves of two
+people are mixed."""
 _LEAST_AFFINITY = 0.2
-"""Affinities below tie nobody together: unrelated pairs are mostly 0, true ones above 0.4 (as `growth.doubt`)."""
+"""Minimum affinity that groups detections: unrelated pairs are mostly 0, true ones above 0.4 (as
+`growth.doubt`)."""
 _SAME_M = 0.2
-"""Hypotheses nearer than this in most of the lesser one's joints become the same person."""
+"""Distance, m, below which joints of two hypotheses agree."""
 _SAME_SHARE = 0.8
-"""These are most."""
+"""Share of the smaller hypothesis's joints that must agree for the two to be duplicates."""
 _MOST = 64
-"""Hypotheses that are looked at in a round, the heaviest first. In simulated crowds of eight before four and six
-cameras as many people are found as with 256, with a third fewer phantoms, and in 70 ms a frame for 190 with six
-cameras; 32 loses people."""
+"""Maximum number of hypotheses per round, those with the highest weight. In simulated crowds of
+eight before four and six cameras this finds as many people as 256, with a third fewer false
+positives, in 70 ms instead of 190 ms per frame with six cameras; 32 loses people."""
 _PASSES = 3
-"""How often detections are chosen around the joints, and joints triangulated."""
+"""Number of alternations between assignment of detections and triangulation."""
 
 
 def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
-    """People who may be there by the detections that are `free` (D,), each with all that it would explain.
+    """Hypotheses of people from the `free` (D,) detections, each with all detections that it would
+    explain.
 
-    The pair points of two 2D people's joints, in parts that bones connect, are where a person may be; views that
-    neither of the two is from join in.
+    Triangulated joints of two 2D people, in connected parts, give a hypothesis; detections of
+    further views are then assigned to it.
     """
     group = _groups(free, frame)
     places, owners = _meeting(points, group, frame)
@@ -56,7 +60,9 @@ def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
 
 
 def _groups(free: Mask, frame: Frame) -> Index:
-    """(D,) which 2D person each free detection is of; -1 for those of none, and of persons of few joints."""
+    """(D,) index of the 2D person of each free detection; -1 for none, or a person with too few
+    joints.
+    """
     detections = frame.detections
     tied = free[detections.pairs].all(axis=1) & (detections.affinity >= _LEAST_AFFINITY)
     tied = replace(detections, pairs=detections.pairs[tied], affinity=detections.affinity[tied])
@@ -67,7 +73,9 @@ def _groups(free: Mask, frame: Frame) -> Index:
 
 
 def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Index]:
-    """Places (M, J, 3) at which enough joints of two 2D people meet, and which two (M, 2) these are."""
+    """Joints (M, J, 3) at which rays of two 2D people intersect in sufficient number, and the two
+    people (M, 2).
+    """
     count, joints = group.max(initial=-1) + 1, len(frame.skeleton)
     ends = np.sort(group[points.pair], axis=1)
     both = (ends >= 0).all(axis=1)
@@ -84,8 +92,8 @@ def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Ind
 
 
 def _different(places: Array, weight: Array) -> Index:
-    """Which of `places` (H, J, 3) stay when those that become the same person are one, heaviest first."""
-    # Equal weights are told apart by place: the order of cameras and detections must not decide.
+    """Indices of `places` (H, J, 3) without duplicates, in descending order of `weight`."""
+    # Ties are broken by position: the order of cameras and detections must not matter.
     order = np.lexsort((*np.nansum(places, axis=1).T, -np.round(weight, 9)))
     stays = np.empty(_MOST, dtype=np.intp)
     return stays[: _sieve(np.ascontiguousarray(places), order, stays)]
@@ -93,7 +101,9 @@ def _different(places: Array, weight: Array) -> Index:
 
 @kernel("f3 i1 i1")
 def _sieve(places, order, stays):
-    """Fill in who `stays`, of all in `order`, as far as there is room; returns how many do."""
+    """Fill in the indices that stay, going through `order`, as far as the array reaches; returns
+    their number.
+    """
     count, least = 0, _SAME_M * _SAME_M
     for h in order:
         alone = True

@@ -1,4 +1,4 @@
-"""Who is in each picture: candidates grouped by their part affinities, greedily, as OpenPose does."""
+"""2D people in each view: candidates grouped greedily by part affinities, as OpenPose does."""
 
 import numpy as np
 
@@ -8,9 +8,10 @@ from shapepose_fg.core.detections import Detections
 
 
 def without_repeats(found: Detections) -> tuple[Detections, Index]:
-    """The detections with what is listed twice listed once, and which of `found` each of them is.
+    """The detections without duplicates, and the index of each in `found`.
 
-    Some detectors give a person twice, or two people with the same arm: each view saw it once.
+    Some detectors give a person twice, or two people with the same arm; a view can see each only
+    once.
     """
     places = np.column_stack([found.view, found.joint, found.xy])
     order = np.lexsort((-found.confidence, *places.T))
@@ -30,10 +31,11 @@ def without_repeats(found: Detections) -> tuple[Detections, Index]:
 
 
 def group_people(found: Detections) -> list[Index]:
-    """Candidates grouped into people, greedily: the rows (N,) of each group, single candidates included.
+    """Group candidates into people, greedily: the rows (N,) of each group, single candidates
+    included.
 
-    As OpenPose does, by the affinities alone: pairs in falling order; a pair joins its two groups unless
-    both have a candidate of one kind of joint, so that nobody gets two left knees.
+    As OpenPose does, by affinities only: pairs in descending order; a pair joins its two groups
+    unless both have a candidate of the same joint, so that no person gets two left knees.
     """
     _, joint, _, pairs, affinity = found.columns
     count = len(found)
@@ -46,10 +48,11 @@ def group_people(found: Detections) -> list[Index]:
 
 @kernel("i2 i1 i1 i1 i1 b2 i1 i1")
 def _group(pairs, joint, group, after, last, has, order, stop):
-    """`group_people`: its groups one after the other into `order` (N,), their ends into `stop`; their number.
+    """Implements `group_people`: writes the groups, concatenated, into `order` (N,), their ends
+    into `stop`; returns their number.
 
-    To begin with each is a `group` (N,) of its own, with none `after` (N,) it, the `last` (N,) of it itself, and
-    `has` (N, J), which kinds of joints a group has, is False.
+    At the start each candidate is its own `group` (N,) and its `last` (N,), `after` (N,) is -1, and
+    `has` (N, J), the joints of each group, is False.
     """
     count = len(joint)
     for row in range(count):

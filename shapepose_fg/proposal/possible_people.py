@@ -1,4 +1,4 @@
-"""People who may be there: the detections that each would explain, and where the joints then are."""
+"""Hypotheses of people: the detections that each would explain, and the triangulated joints."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -15,45 +15,47 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, nearby
 
 _NEAR_M = 0.06
-"""How closeness to a joint falls off: sigma of a Gaussian, as a length at the joint's depth, as in `assign`."""
+"""Standard deviation of the nearness score, as a length at the joint's depth, m; as in `assign`."""
 _FAR_M = 0.15
-"""No detection whose ray passes a joint at more is the joint's."""
+"""Maximum distance of a joint from the ray of its detection, m."""
 _SURE_AFFINITY = 0.5
-"""Mean affinity that takes a detection for a joint whose place nobody knows."""
+"""Minimum mean affinity of a detection for a joint without a position."""
 _KERNEL_M = 0.03
-"""Scale of the Cauchy kernel with which joints are triangulated: what a detector is off, measured."""
+"""Scale of the Cauchy kernel for triangulation, m: the measured error of a detector."""
 _ROUNDS = 2
-"""How often a joint is triangulated with weights made anew."""
+"""Number of reweighted triangulations of a joint."""
 _STRETCH = (1.0, 0.9, 0.8)
-"""One bone, two and three: how much of their summed longest lengths they span at most."""
+"""Maximum distance over one, two and three bones, as a share of their summed maximum lengths."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What is given of one frame."""
+    """Input of one frame."""
 
     detections: Detections
-    """What the detector saw."""
+    """Detections of the frame."""
     rig: Rig
     """The cameras."""
     skeleton: Skeleton
     """The detector's joints."""
     longest_m: Array
-    """(J,) the longest distance of a joint to its parent on the skeleton."""
+    """(J,) maximum distance of each joint from its parent on the skeleton, metres."""
 
     @cached_property
     def sight(self) -> Sight:
-        """The frame's arrays as the kernels take them."""
+        """The frame in the form that kernels take."""
         return Sight.of(self.detections, self.rig, self.skeleton)
 
     @cached_property
     def rays(self) -> Array:
-        """(D, 3) directions of length one, in the world, in which the detections lie."""
+        """(D, 3) unit directions of the detections' rays, in the world."""
         return self.rig.rays(self.detections.view, self.detections.xy)
 
     @property
     def spans(self) -> tuple[Index, Array]:
-        """Pairs of joints (E, 2) at most three bones apart, and how far they are at most (E,), metres."""
+        """Pairs of joints (E, 2) at most three bones apart, and their maximum distances (E,),
+        metres.
+        """
         return _spans(self.skeleton, tuple(self.longest_m.tolist()))
 
 
@@ -66,7 +68,7 @@ def _spans(skeleton: Skeleton, longest_m: tuple[float, ...]) -> tuple[Index, Arr
     parents = [skeleton.parents[joint] for joint in children]
     bones[children, parents] = bones[parents, children] = 1
     length[children, parents] = length[parents, children] = np.array(longest_m)[children]
-    for over in joints:  # the shortest ways, as Floyd and Warshall find them
+    for over in joints:  # shortest paths (Floyd-Warshall)
         bones = np.minimum(bones, bones[:, [over]] + bones[over])
         length = np.minimum(length, length[:, [over]] + length[over])
     near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
@@ -76,17 +78,20 @@ def _spans(skeleton: Skeleton, longest_m: tuple[float, ...]) -> tuple[Index, Arr
 
 @dataclass(frozen=True)
 class PossiblePeople(Rows):
-    """H people who may be there."""
+    """H hypotheses of people."""
 
     places: Array
-    """(H, J, 3) where two views or more put the joints, metres; NaN elsewhere."""
+    """(H, J, 3) joints triangulated from two or more views, metres; NaN elsewhere."""
     chosen: Index
-    """(H, J, V) the detections that each would explain, -1 for none."""
+    """(H, J, V) detections that each would explain, -1 for none."""
     gap_m: Array
-    """(H, J, V) how far from the joint the detection's ray passes; NaN where there is none, or no place."""
+    """(H, J, V) distance of the joint from the detection's ray, metres; NaN without a detection or
+    joint."""
 
     def completed(self, person: int, part: "PossiblePeople") -> "PossiblePeople":
-        """Return the hypotheses with the joints that `person` lacks taken from `part`, a single one."""
+        """Return the hypotheses with the missing joints of `person` taken from the single
+        hypothesis `part`.
+        """
         lacks = np.zeros((*self.places.shape[:2], 1), dtype=bool)
         lacks[person] = np.isnan(self.places[person, :, :1]) & np.isfinite(part.places[0, :, :1])
         both = zip(vars(self).values(), vars(part).values(), strict=True)
@@ -94,17 +99,18 @@ class PossiblePeople(Rows):
 
     @classmethod
     def none(cls, frame: Frame) -> "PossiblePeople":
-        """Nobody."""
+        """No hypotheses."""
         shape = (0, len(frame.skeleton), len(frame.rig))
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
 
 
 def settled(places: Array, own: Index, frame: Frame, passes: int, *, exclusive: bool = False) -> PossiblePeople:
-    """People at `places` (H, J, 3) who are thought to have detections `own` (H, J, V), -1 for none: detections
-    chosen, joints triangulated, several times in turn.
+    """Alternate assignment of detections and triangulation, `passes` times, starting at `places`
+    (H, J, 3) with detections `own` (H, J, V), -1 for none.
 
-    With `exclusive` each detection is one person's; without, each takes what it would explain. Joints that no
-    bones connect to most of the others go: they are somebody else's.
+    With `exclusive` each detection is assigned to one person; else each hypothesis takes all it
+    would explain. Joints not connected to most others by plausible bones are removed: they belong
+    to another person.
     """
     for _ in range(passes):
         chosen = _claimed(places, own, frame, exclusive=exclusive)
@@ -119,7 +125,9 @@ def settled(places: Array, own: Index, frame: Frame, passes: int, *, exclusive: 
 
 
 def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Index:
-    """(H, J, V) the detections nearest to the joints; where no place is known, those of affinity to the own."""
+    """(H, J, V) detections nearest to the joints; for joints without a position, by affinity to the
+    own ones.
+    """
     H, J, _ = own.shape
     world = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)
     near = nearby(places, np.full((H, J), _FAR_M), world, frame.sight)
@@ -135,10 +143,11 @@ def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Ind
 
 
 def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
-    """Joints (H, J, 3) nearest to the rays of their detections `chosen` (H, J, V), and the gaps (H, J, V), metres.
+    """Triangulate joints (H, J, 3) from detections `chosen` (H, J, V); also returns distances to
+    the rays (H, J, V), metres.
 
-    Weighted by confidence, under a Cauchy kernel. NaN for joints that fewer than two views see; a ray that meets
-    its joint behind the camera is infinitely far.
+    Weighted by confidence and a Cauchy kernel. NaN for joints seen by fewer than two views; the
+    distance is infinite behind the camera.
     """
     places, gap_m = np.full((*chosen.shape[:2], 3), np.nan), np.full(chosen.shape, np.nan)
     confidence = frame.detections.confidence
@@ -148,7 +157,7 @@ def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
 
 @kernel("i3 f2 f1 f2 f1 f3 f3")
 def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
-    """Fill in places and gaps of `triangulated`; `weight` (V,) is room to work in."""
+    """Fill in the results of `triangulated`; `weight` (V,) is workspace."""
     people, joints, views = chosen.shape
     for h in range(people):
         for j in range(joints):
@@ -168,7 +177,7 @@ def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
 
 @part
 def _nearest(chosen, rays, weight, centres, place):
-    """The point that is nearest to weighted rays of views: sum w (1 - r r^T) (x - c) = 0."""
+    """Least-squares point nearest to weighted rays: sum w (1 - r r^T) (x - c) = 0."""
     xx = yy = zz = 1e-9
     xy = xz = yz = px = py = pz = 0.0
     for v in range(len(chosen)):
@@ -185,7 +194,7 @@ def _nearest(chosen, rays, weight, centres, place):
 
 @part
 def _gap(ray, centre, place):
-    """How far a ray passes a place, metres; infinite behind the camera."""
+    """Distance of a ray from a point, metres; infinite behind the camera."""
     x, y, z = place[0] - centre[0], place[1] - centre[1], place[2] - centre[2]
     depth = x * ray[0] + y * ray[1] + z * ray[2]
     squared = x * x + y * y + z * z - depth * depth
@@ -193,9 +202,10 @@ def _gap(ray, centre, place):
 
 
 def gaps(places: Array, chosen: Index, frame: Frame) -> Array:
-    """(H, J, V) how far the rays of detections `chosen` (H, J, V) pass `places` (H, J, 3), metres; NaN for none.
+    """(H, J, V) distances of the rays of detections `chosen` (H, J, V) from `places` (H, J, 3),
+    metres; NaN for none.
 
-    A ray that meets its joint behind the camera is infinitely far.
+    Infinite if the joint is behind the camera.
     """
     if len(frame.rays) == 0:
         return np.full(chosen.shape, np.nan)
@@ -206,9 +216,10 @@ def gaps(places: Array, chosen: Index, frame: Frame) -> Array:
 
 
 def connected(places: Array, frame: Frame) -> Index:
-    """(H, J) which joints of `places` (H, J, 3) hang together by bones no longer than people's.
+    """(H, J) connected components of the joints at `places` (H, J, 3), under bones of plausible
+    length.
 
-    The number of the part's first joint; -1 where a joint has no place.
+    A component has the number of its first joint; -1 for joints without a position.
     """
     part = np.where(np.isfinite(places[..., 0]), np.arange(places.shape[1]), -1)
     _connect(np.ascontiguousarray(places), *frame.spans, part)
@@ -217,7 +228,7 @@ def connected(places: Array, frame: Frame) -> Index:
 
 @kernel("f3 i2 f1 i2")
 def _connect(places, pairs, most, part):
-    """Give joints that hang together the least number `part` (H, J) of them."""
+    """Give all joints of a component the smallest number `part` (H, J) among them."""
     for h in range(len(places)):
         changed = True
         while changed:
@@ -237,7 +248,7 @@ def _connect(places, pairs, most, part):
 
 
 def sizes(part: Index) -> Index:
-    """(H, J) how many joints each part of `connected` has, at the number of the part."""
+    """(H, J) number of joints of each component of `connected`, at the component's number."""
     people, joints = part.shape
     row, column = np.nonzero(part >= 0)
     return np.bincount(row * joints + part[row, column], minlength=people * joints).reshape(people, joints)

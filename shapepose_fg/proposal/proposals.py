@@ -1,4 +1,4 @@
-"""Who is there: people anchored at hip candidates and grown along the skeleton by part affinities.
+"""People from hip candidates, grown along the skeleton by part affinities.
 
 Stage I (d) and the first half of (e) of the paper (section 3.1, "Human Proposal Generation").
 """
@@ -16,56 +16,61 @@ from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 
 _HIP_WIDTH_M = 0.4
-"""Two hips of one person are not farther apart: their middle is a root where no two views saw one."""
+"""Maximum distance of two hips of a person, m; their midpoint is a root if fewer than two views saw
+one."""
 _OWN_DETECTIONS = 2
-"""What a candidate needs of its own to be looked at after the first people were found: others made these."""
+"""Minimum number of a candidate's detections that no found person uses."""
 
 
 @dataclass(frozen=True)
 class ProposalConfig(Settings):
-    """When a hip candidate is a person, and which candidates are that person's joints."""
+    """Settings for people from hip candidates, and for their joints."""
 
     evidence: bool = True
-    """Whether people are sought as pairs of 2D people, and judged by evidence (`selection.py`). In the paper, hips
-    of three votes anchor people: all the settings below are for that."""
+    """Whether people are hypotheses from pairs of 2D people, scored by evidence (`selection.py`).
+    In the paper, hips of three votes anchor people; the settings below are for that."""
     min_probability: Share = 0.3
-    """Least probability of a new person; time, or a body, tells more."""
+    """Minimum existence probability of a new person; later frames, or a body, decide."""
 
     box_horizontal_m: Metres = 1.0
-    """Half the width of the box around the hip: arms and legs stretched reach 1 m from it."""
+    """Half the width of the box around the hip, m: stretched arms and legs reach 1 m from it."""
     box_vertical_m: Metres = 1.2
-    """Half the height of the box: a raised hand is 1.2 m above the hip."""
+    """Half the height of the box, m: a raised hand is 1.2 m above the hip."""
     min_parts: Share = 0.6
-    """Least fraction of the core joints (trunk, arms, legs) with a candidate in the box. The paper asks for 90 %,
-    and so loses people whose forearm nobody sees (17 of 840 on Shelf, in plain sight of five views): its phantoms,
-    which that is to keep out, fail `min_grown_parts` here, or lose their detections to others when these are given
-    out again. 0.6 is an upper body."""
+    """Minimum fraction of the core joints (trunk, arms, legs) with a candidate in the box. The
+    paper requires 90 %, and so loses people with an unseen forearm (17 of 840 on Shelf, in plain
+    sight of five views). The false positives that it means to reject fail `min_grown_parts` here,
+    or lose their detections in the reassignment. 0.6 is an upper body."""
     min_confidence: Share = 0.2
-    """Least mean confidence of the box's best candidates: clutter that a detector doubts stays below."""
+    """Minimum mean confidence of the box's best candidates; rejects clutter of low confidence."""
     separation_m: Metres = 0.2
-    """Non-maximum suppression: of two anchors closer than this the better one stays. A pelvis is about 20 cm
-    deep and 30 cm wide: the middles of two are not closer even when people hug."""
+    """Non-maximum suppression: of two anchors closer than this, m, the better one stays. A pelvis
+    is about 20 cm deep and 30 cm wide: its centre is not closer to another's even in a hug."""
     min_grown_parts: Share = 0.4
-    """Least fraction of the core joints that must have a strong candidate linked to the hip: one whose upper body
-    alone shows has 0.6. On simulated people in close motion real ones have over 0.47, and most phantoms, whose
-    joints belong to others, have less than 0.4. The paper asks for none."""
+    """Minimum fraction of the core joints with a strong candidate linked to the hip; a person with
+    only the upper body visible has 0.6. Among simulated people in close interaction real ones have
+    over 0.47, and most false positives, with joints of others, less than 0.4. The paper requires
+    none."""
     min_observed_parts: Share = 0.35
-    """Least fraction of the core joints that two views must see when each detection is one person's: 6 of 15. Of
-    one whose upper body alone shows there are 9. The paper asks for none."""
+    """Minimum fraction of the core joints that two views must see when each detection is assigned
+    to one person: 6 of 15. A person with only the upper body visible has 9. The paper requires
+    none."""
     weak_anchors: bool = True
-    """Whether weak hips, and middles between two hips, anchor people too where strong joints are left over that
-    nobody claims. In the paper only hips of three votes do."""
+    """Whether weak hips, and midpoints between two hips, also anchor people where strong joints
+    remain unassigned. In the paper only hips of three votes do."""
 
     most_people: Count = 64
-    """People that are looked for in a frame, and hips between which nobody saw a mid-hip: the best come first."""
+    """Maximum number of people in a frame, and limit on pairs of hips for midpoints; the best come
+    first."""
     growth: GrowthConfig = field(default_factory=GrowthConfig)
-    """How a person is grown from the hip."""
+    """Settings for growing people from the hip."""
 
     @classmethod
     def paper(cls) -> "ProposalConfig":
-        """As written in section 3.1: hips of three votes whose box holds 90 % of the parts.
+        """The settings of section 3.1: hips of three votes with 90 % of the parts in the box.
 
-        Non-maximum suppression is all that stands against phantoms: 60 cm is the best of 20 to 80 on `tune`.
+        Only non-maximum suppression rejects false positives: 60 cm is the best of 20 to 80 on
+        `tune`.
         """
         return cls(
             evidence=False,
@@ -80,17 +85,17 @@ class ProposalConfig(Settings):
 
 @dataclass(frozen=True)
 class Proposals:
-    """People found in one frame, each with a candidate per joint."""
+    """People found in one frame, each with at most one candidate per joint."""
 
     candidate: Index
     """(P, J) index of the 3D candidate of each joint, -1 where there is none."""
     places: Array
-    """(P, J, 3) where the joints are thought to be, metres: the candidates, and the middle of the hips as the root
-    of a person whose root no two views saw; NaN elsewhere."""
+    """(P, J, 3) positions of the joints, metres: the candidates, and the midpoint of the hips as
+    the root of a person without a root candidate; NaN elsewhere."""
     score: Array
     """(P,) mean confidence of the box's best candidates."""
     dropped: dict[str, int]
-    """How many anchors were dropped, by reason."""
+    """Number of dropped anchors by reason."""
 
     def __len__(self) -> int:
         return len(self.candidate)
@@ -99,11 +104,11 @@ class Proposals:
 def propose(
     candidates: Candidates, detections: Detections, skeleton: Skeleton, up: Array, config: ProposalConfig
 ) -> Proposals:
-    """Find the people of a frame: anchors at the root joint, their boxes checked, their joints grown.
+    """Find the people of a frame: anchors at root candidates, checked by their boxes, then grown.
 
-    Strong root candidates come first (the paper's hips). What they leave over may be people whose root few views
-    saw: weak root candidates anchor them, and in the end the middles between two hips. `up` is the (3,) unit
-    vector that points up. Two people do not share a candidate.
+    Strong root candidates come first (the paper's hips). Among what remains, people with a hardly
+    visible root are anchored by weak root candidates, and last by midpoints between two hips. `up`
+    is the (3,) unit vector upwards. Two people do not share a candidate.
     """
     search = Search(
         candidates, link(candidates, detections, config.growth), detections, skeleton, up, config, Counter()
@@ -129,7 +134,7 @@ def propose(
 
 @dataclass(frozen=True)
 class Search:
-    """The search for people in one frame."""
+    """State of the search for people in one frame."""
 
     candidates: Candidates
     links: Links
@@ -140,7 +145,9 @@ class Search:
     dropped: Counter[str]
 
     def anchors(self, roots: Index, taken: Index) -> Index:
-        """The root candidates `roots` whose box holds enough confident parts and that stand apart, best first."""
+        """Candidates among `roots` with enough confident parts in their box, after suppression,
+        best first.
+        """
         parts, score = self.boxes(roots)
         enough = parts >= self.config.min_parts
         confident = score >= self.config.min_confidence
@@ -154,13 +161,15 @@ class Search:
         return kept
 
     def boxes(self, roots: Index) -> tuple[Array, Array]:
-        """Fraction (H,) of the core parts in the box around each root, and mean confidence (H,) of the best."""
+        """Fraction (H,) of the core parts in the box around each root, and mean confidence (H,) of
+        the best ones.
+        """
         candidates, config = self.candidates, self.config
         offset = candidates.xyz[None] - candidates.xyz[roots, None]
         height = offset @ self.up
         horizontal = np.linalg.norm(offset - height[..., None] * self.up, axis=-1)
         in_box = (horizontal < config.box_horizontal_m) & (np.abs(height) < config.box_vertical_m)
-        in_box &= candidates.joint >= 0  # not those that `among` hid
+        in_box &= candidates.joint >= 0  # not hidden by `among`
         best = np.zeros((len(roots), len(self.skeleton)))
         root, candidate = np.nonzero(in_box)
         np.maximum.at(best, (root, candidates.joint[candidate]), candidates.score[candidate])
@@ -168,7 +177,9 @@ class Search:
         return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
 
     def linked(self, anchors: Index) -> tuple[Index, Index]:
-        """The anchors that enough strong joints are linked to, and what each chose (P, J)."""
+        """The anchors with enough strong joints linked to them, and the candidates (P,
+        J) of each.
+        """
         chosen = grow(anchors, self.candidates, self.links, self.skeleton, self.config.growth)
         core = chosen[:, self.skeleton.core]
         strong = (core >= 0) & self.candidates.strong[core]
@@ -176,14 +187,15 @@ class Search:
         if linked.all():
             return anchors, chosen
         self.dropped["too few joints linked to the hip"] += int((~linked).sum())
-        # What the dropped had taken goes back to those whom it belongs to.
+        # Candidates of dropped anchors become available to others.
         kept = anchors[linked]
         return kept, grow(kept, self.candidates, self.links, self.skeleton, self.config.growth)
 
     def unclaimed(self, chosen: Index) -> Mask | None:
-        """(C,) the candidates that nobody chose, if there are strong ones of enough joints to be a person.
+        """(C,) mask of the candidates that no person uses; None if too few of them are strong for a
+        person.
 
-        A candidate needs `_OWN_DETECTIONS`: others made what somebody chose.
+        A candidate needs `_OWN_DETECTIONS` unused detections.
         """
         owner, detection = self.candidates.support.T
         used = np.zeros(len(self.detections), dtype=bool)
@@ -203,12 +215,12 @@ class Search:
         return replace(self, candidates=hidden, links=links, dropped=Counter())
 
     def people(self, taken: Index) -> Index:
-        """Anchors, strong or weak, of people beside those `taken`."""
+        """Anchors, strong or weak, of further people, given those `taken`."""
         roots = np.flatnonzero(self.candidates.joint == self.skeleton.root)
         return self.linked(self.anchors(roots, taken))[0]
 
     def with_middles(self, free: Mask) -> "Search":
-        """Add root candidates where nobody saw one: in the middle of two free hips, linked to both."""
+        """Add root candidates at midpoints of two free hips, linked to both."""
         candidates, count = self.candidates, len(self.candidates)
         right, left = self.skeleton.hips
         first, second = (np.flatnonzero(free & (candidates.joint == hip)) for hip in (right, left))
@@ -241,10 +253,10 @@ class Search:
 def standing_apart(
     anchors: Index, taken: Index, candidates: Candidates, detections: Detections, config: ProposalConfig
 ) -> Index:
-    """Non-maximum suppression: `anchors` that stand apart from better ones and from `taken`, best first.
+    """Non-maximum suppression: `anchors` apart from better ones and from `taken`, best first.
 
-    A detection counts for one anchor only: what is left of a candidate without those that made better anchors
-    decides how good it is.
+    A detection counts for one anchor only: an anchor's score excludes the detections of better
+    ones.
     """
     both = np.concatenate([taken, anchors])
     views = int(detections.view.max(initial=0)) + 1
@@ -255,7 +267,7 @@ def standing_apart(
     distance = np.linalg.norm(candidates.xyz[both, None] - candidates.xyz[both][None], axis=-1)
     open_ = np.ones(len(both), dtype=bool)
     kept = []
-    while open_.any():  # a handful of people
+    while open_.any():  # a few iterations
         waiting = np.flatnonzero(open_[: len(taken)])
         best = waiting[0] if len(waiting) > 0 else np.where(open_, weight.sum(axis=1), -1.0).argmax()
         kept.append(best)

@@ -1,6 +1,6 @@
-"""Who is there: hypotheses chosen by evidence, each detection explained once.
+"""Selection of people among hypotheses by evidence; each detection is explained once.
 
-Evidence is what only this person explains, against what should be seen of that person and is not.
+Evidence is what only this person explains, less what should be seen of the person and is not.
 """
 
 from dataclasses import dataclass
@@ -14,66 +14,69 @@ from shapepose_fg.proposal.pairs_of_people import pooled
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, settled
 
 _ROUNDS = 8
-"""How often people are sought at most, among what those who were found leave: 2D people are put together anew."""
+"""Maximum number of searches, each among what the people found so far leave unexplained."""
 _PASSES = 2
-"""How often detections are given out around the joints of those who were chosen."""
+"""Number of reassignments of detections around the joints of selected people."""
 _SHARED = 0.2
-"""Largest share of its joints that a missing part may have in common with the person that it completes."""
+"""Maximum share of its joints that a missing part may have in common with the person it
+completes."""
 _SCALE = 0.27
-"""Evidence to log-odds: logistic fit to 1561 hypotheses on simulated crowds (two to six cameras); 1240 on the real
-operating room of MVOR gave 0.23."""
+"""Scale from evidence to log-odds: logistic fit to 1561 hypotheses on simulated crowds (two to six
+cameras); a fit to 1240 in the real operating room of MVOR gives 0.23."""
 _PRIOR = -1.75
 """Log-odds of a hypothesis without evidence; the same fit (-1.2 in the operating room)."""
 PRIOR_WITH_BODY = -0.3
-"""Log-odds of a hypothesis without evidence, after a body was fitted to its joints and detections reassociated."""
+"""Log-odds of a hypothesis without evidence, after a body fit and reassociation of detections."""
 _GAP_M = 0.03
-"""How a detection's worth falls off with the gap between its ray and the joint: sigma of a Gaussian."""
+"""Standard deviation, m, of the weight of a detection by the distance of its ray from the joint."""
 _SINGLE = 0.1
-"""What a detection counts whose joint no other view sees: the person may be anywhere along it."""
+"""Weight of a detection of a joint that no other view sees, since its depth is unknown."""
 _BESIDE = 0.5
-"""What one counts whose joint's other detections are somebody else's."""
+"""Weight of a detection of a joint whose other detections belong to others."""
 _MISSED = 0.2
-"""Price of a place where a joint should be seen and is not, in a view that sees the person else."""
+"""Cost of an expected but missing joint, in a view that sees other joints of the person."""
 _HIDDEN = 0.07
-"""Price of such a place in a view that does not see the person at all: something may hide the person."""
+"""Cost of a missing joint in a view that does not see the person at all, who may be occluded."""
 _TAKEN = 0.07
-"""Price of a detection that is better explained by somebody else."""
+"""Cost of a detection that another person explains better."""
 _BROKEN = 0.5
-"""Price of a bone that is longer or shorter than people's."""
+"""Cost of a bone outside the range of human bones."""
 _SHORT, _LONG = 0.4, 1.15
-"""Lengths of a bone that nobody has, as shares of its longest."""
+"""Range of human bones, as shares of the maximum length."""
 _USUAL = 0.59
-"""Length of people's bones, as a share of the longest: simulated people's core bones have 0.53 to 0.64."""
+"""Mean length of bones, as a share of the maximum length: 0.53 to 0.64 for core bones of simulated
+people."""
 _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
-"""Sigma of its logarithm, in people and in phantoms."""
+"""Standard deviation of its logarithm, for people and for false positives."""
 _PHANTOMS_SHIFT = 0.08
-"""Phantoms' bones are longer by this, in the logarithm."""
+"""Mean excess of the logarithm for false positives."""
 _PLACED_M = 0.03
-"""What two joints' errors add to a bone's sigma."""
+"""Standard deviation of a bone's length from the errors of its two joints, m."""
 _ASTRAY = 0.1
-"""Share of people's bones that have phantoms' lengths: a joint is wrong. All these from 5779 hypotheses of
-simulated crowds before two to six cameras."""
+"""Share of people's bones distributed like those of false positives, because a joint is wrong. All
+these are from 5779 hypotheses of simulated crowds before two to six cameras."""
 _BONE = 0.15
-"""What a unit of a bone's log-likelihood counts: bones are not independent. In crowds before three to six
-cameras 1 to 4 points more people are found than without, with fewer phantoms, which 0.3 and 0.6 make again."""
+"""Weight of a bone's log-likelihood ratio; bones are not independent. In crowds before three to six
+cameras it finds 1 to 4 points more people with fewer false positives, while 0.3 and 0.6 give more
+of these."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for and against each of H people, but for what others explain."""
+    """Evidence for and against each of H hypotheses, before any detection is assigned to others."""
 
     chosen: Index
     """(H, J, V) the detections that each explains, -1 for none."""
     worth: Array
-    """(H, J, V) how much a detection speaks for the person: confidence, affinity, and how near its ray passes."""
+    """(H, J, V) weight of each detection: confidence, affinity, and nearness of its ray."""
     expected: Mask
-    """(H, J, V) places in the pictures where a joint should be."""
+    """(H, J, V) whether the joint is expected in the image."""
     bones: Array
-    """(H,) how much the lengths of the bones speak for a person."""
+    """(H,) log-likelihood ratio of the bone lengths, weighted."""
 
     @classmethod
     def of(cls, people: PossiblePeople, frame: Frame) -> "Evidence":
-        """The evidence of a frame."""
+        """Compute the evidence for hypotheses in a frame."""
         chosen, detections = people.chosen, frame.detections
         has, worth = chosen >= 0, np.zeros(chosen.shape)
         whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
@@ -87,7 +90,7 @@ class Evidence:
         return cls(chosen, worth, expected, _bones(people, frame))
 
     def score(self, taken: Mask) -> Array:
-        """(H,) evidence for each person where others explain the detections `taken` (D,)."""
+        """(H,) score of each hypothesis if others explain the detections `taken` (D,)."""
         has = self.chosen >= 0
         own = has & ~taken[self.chosen] if len(taken) > 0 else has
         views, owned_views = has.sum(axis=2, keepdims=True), own.sum(axis=2, keepdims=True)
@@ -101,7 +104,9 @@ class Evidence:
 
 
 def _bones(people: PossiblePeople, frame: Frame) -> Array:
-    """(H,) how much the lengths of bones between joints that two views see speak for each person, or against."""
+    """(H,) weighted log-likelihood ratio of the lengths of bones between joints that
+    two views see.
+    """
     parents, root = list(frame.skeleton.parents), frame.skeleton.root
     share = np.linalg.norm(people.places - people.places[:, parents], axis=-1) / frame.longest_m
     share[:, root] = np.nan
@@ -113,18 +118,20 @@ def _bones(people: PossiblePeople, frame: Frame) -> Array:
     sigma = np.hypot(_SPREAD, _PLACED_M / (_USUAL * frame.longest_m[core]))
     mine = np.exp(-0.5 * (off / sigma) ** 2) / sigma
     phantoms = np.exp(-0.5 * ((off - _PHANTOMS_SHIFT) / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
-    # Far from both, the first vanishes and what is astray decides.
+    # Far from both distributions `mine` vanishes, and `_ASTRAY` bounds the ratio.
     ratio = (1 - _ASTRAY) * mine / np.maximum(phantoms, 1e-300) + _ASTRAY
     return np.asarray(_BONE * np.log(ratio).sum(axis=1, where=known) - _BROKEN * broken, dtype=np.float64)
 
 
 def probability(score: Array, prior: float = _PRIOR) -> Array:
-    """How probable it is that people of so much evidence (H,) are there."""
+    """(H,) existence probability by score (H,)."""
     return 1 / (1 + np.exp(-(_SCALE * score + prior)))
 
 
 def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeople, Array]:
-    """The people of a frame who are there with a probability of at least `least`, and these probabilities (P,)."""
+    """Select the people of a frame with probability at least `least`; also returns their
+    probabilities (P,).
+    """
     people, sure = PossiblePeople.none(frame), np.zeros(0)
     for _ in range(_ROUNDS):
         taken = np.zeros(len(frame.detections), dtype=bool)
@@ -140,13 +147,15 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
 def _greedy(
     pool: PossiblePeople, people: PossiblePeople, taken: Mask, frame: Frame, least: float
 ) -> PossiblePeople | None:
-    """`people`, who have the detections `taken` (D,), and who else of the pool is there, the surest first.
+    """`people`, who use the detections `taken` (D,), and further ones from the pool, most probable
+    first.
 
-    Who can be a missing part of somebody becomes that. None where nobody is there besides.
+    A hypothesis that fits as a missing part of a person completes that person. None if there is
+    none to add.
     """
     evidence, taken, before = Evidence.of(pool, frame), taken.copy(), people
     open_ = np.ones(len(pool), dtype=bool)
-    while open_.any():  # once a person or part
+    while open_.any():  # one person or part per iteration
         score = np.where(open_, evidence.score(taken), -np.inf)
         best = np.array([score.argmax()])
         if probability(score[best])[0] < least:
@@ -160,7 +169,9 @@ def _greedy(
 
 
 def _given_out(people: PossiblePeople, frame: Frame, least: float) -> tuple[PossiblePeople, Array]:
-    """The people with each detection given to one of them; who has too little goes, the least sure first."""
+    """Assign each detection to one of the people; drops people with too little evidence, the least
+    probable first.
+    """
     while True:
         people = settled(people.places, people.chosen, frame, _PASSES, exclusive=True)
         sure = existence(people, frame)
@@ -170,15 +181,17 @@ def _given_out(people: PossiblePeople, frame: Frame, least: float) -> tuple[Poss
 
 
 def existence(people: PossiblePeople, frame: Frame, prior: float = _PRIOR) -> Array:
-    """(P,) how probable each of the people is, where what two explain is nobody's own."""
+    """(P,) existence probability of each person; shared detections are not evidence."""
     owners = np.bincount(people.chosen[people.chosen >= 0], minlength=len(frame.detections))
     return probability(Evidence.of(people, frame).score(owners > 1), prior)
 
 
 def _whole(places: Array, people: Array, frame: Frame) -> int | None:
-    """Which of `people` (P, J, 3) has `places` (J, 3) as a missing part, legs of a trunk, say; None for nobody.
+    """Index of the person among `people` (P, J, 3) that lacks the part `places` (J, 3), e.g. legs
+    of a trunk; None for none.
 
-    They have hardly a joint in common, and bones would connect them. Two real people have both.
+    Part and person share few joints, and bones could connect them. For two real people this does
+    not hold.
     """
     has, of = np.isfinite(places[:, 0]), np.isfinite(people[..., 0])
     pairs, most = frame.spans

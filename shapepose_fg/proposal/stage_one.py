@@ -1,4 +1,4 @@
-"""Stage I: the people of one frame, by evidence or by their hips."""
+"""Stage I: the people of one frame, by evidence or from their hips."""
 
 from dataclasses import dataclass, replace
 
@@ -19,38 +19,40 @@ from shapepose_fg.proposal.selection import choose
 from shapepose_fg.proposal.thinning import thinned_candidates, thinned_points
 
 _POINTS_OF_FEW, _CANDIDATES_OF_FEW = 1000, 50
-"""Points and candidates of one joint at the most where few people are wanted."""
+"""Maximum number of points and of candidates per joint, if few people are expected."""
 
 
 @dataclass(frozen=True)
 class StageOne:
-    """How people are found in one frame: their 2D observations, and where their joints are to begin with."""
+    """Finds people in single frames: their 2D observations and initial joints."""
 
     skeleton: Skeleton
     """The detector's joints."""
     candidates: CandidateConfig
-    """Pairs of views to 3D joint candidates."""
+    """Settings for 3D joint candidates."""
     proposals: ProposalConfig
-    """Candidates to people, and people to their 2D observations."""
+    """Settings for people from candidates, and their 2D observations."""
     book: Notebook
-    """Where it takes notes."""
+    """Collects notes and timings."""
 
     def by_hips(self) -> "StageOne":
-        """Return a stage that grows people from their hips, as in the paper, without judging them by evidence."""
+        """Return a variant that grows people from their hips, as in the paper, without scores by
+        evidence.
+        """
         return replace(self, proposals=replace(self.proposals, evidence=False))
 
     def of_few(self) -> "StageOne":
-        """`by_hips` where few people are wanted, of however many there are: little is kept."""
+        """Return `by_hips` for a search for few people: fewer points and candidates are kept."""
         few = replace(self.candidates, most_points=_POINTS_OF_FEW, most_candidates=_CANDIDATES_OF_FEW)
         return replace(self.by_hips(), candidates=few)
 
     def of_the_rest(self) -> "StageOne":
-        """`of_few` for what evidence leaves over: hips that two views saw."""
+        """Return `of_few` for what evidence leaves unexplained: hips seen by two views."""
         few = self.of_few()
         return replace(few, candidates=replace(few.candidates, min_votes=1))
 
     def __call__(self, detections: Detections, rig: Rig) -> Observations:
-        """The people of a frame."""
+        """Find the people of a frame."""
         if not self.proposals.evidence:
             return self._by_hips(detections, rig)
         once, index = without_repeats(detections)
@@ -60,12 +62,12 @@ class StageOne:
             people, _ = choose(points, frame, self.proposals.min_probability)
             most = self.proposals.most_people
             self.book.thin("people", len(people) > most)
-            people = people.rows(np.arange(min(len(people), most)))  # the surest come first
+            people = people.rows(np.arange(min(len(people), most)))  # most probable first
         chosen = np.where(people.chosen >= 0, np.append(index, -1)[people.chosen], -1)
         return Observations.of(chosen, detections, people.places)
 
     def _points(self, detections: Detections, rig: Rig) -> PairPoints:
-        """Pairs of detections, triangulated; not too many."""
+        """Triangulated pairs of detections, thinned."""
         with self.book.stage("triangulate"):
             every = triangulate_pairs(detections, rig, self.candidates)
             points = thinned_points(every, self.candidates)
@@ -73,7 +75,7 @@ class StageOne:
         return points
 
     def _by_hips(self, detections: Detections, rig: Rig) -> Observations:
-        """As the paper has it: votes, hips that anchor people, and joints linked to them."""
+        """The variant of the paper: votes, hips as anchors, and joints linked to them."""
         points, skeleton, book = self._points(detections, rig), self.skeleton, self.book
         if not np.isin(points.joint, skeleton.root).any() and not np.isin(skeleton.hips, points.joint).all():
             return Observations.of(

@@ -1,8 +1,8 @@
-"""What is left out of a frame with more detections than people could make, so that no frame takes for ever.
+"""Limits on the detections and candidates of a frame, so that its cost is bounded.
 
-Every detection meets those of the same joint in all other views, and each candidate that comes of it meets
-everybody: the work grows with the square of both. Ordinary crowds (a dozen people before thirty cameras) stay
-below both bounds.
+Every detection is paired with those of the same joint in all other views, and every candidate
+compared with every person: cost grows with the square of both. Ordinary crowds (a dozen people
+before thirty cameras) stay below all limits.
 """
 
 from dataclasses import dataclass, replace
@@ -18,34 +18,34 @@ from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPo
 from shapepose_fg.proposal.view_faults import without_faults
 
 _LEAST_IN_A_VIEW = 8
-"""Detections of a joint that a view may always have, however many views there are."""
+"""Minimum limit of detections per joint and view, with any number of views."""
 
 
 @dataclass(frozen=True)
 class ThinnedFrames(DerivedFrames):
-    """A recording whose frames have no more detections than are allowed, in an order of their own.
+    """A recording with thinned frames, whose detections are in a canonical order.
 
-    They are sorted by where they are, so that nothing depends on the order in which cameras, people and detections
-    are given: of equal ones the first is taken in many places.
+    They are sorted by position, so that results do not depend on the order of cameras, people and
+    detections: ties are often broken by order.
     """
 
     rig: Rig
     """Its V cameras."""
     config: CandidateConfig
-    """How many are allowed."""
+    """Settings with the limits."""
 
     def __getitem__(self, frame: int, /) -> Detections:
         return thinned(self.frames[frame], self.rig, self.config)[0]
 
     def is_thinned(self, frame: int) -> bool:
-        """Whether detections of a frame were left out."""
+        """Whether detections of a frame were removed by the limits."""
         return kept_detections(self.frames[frame], len(self.rig), self.config) is not None
 
 
 def thinned(every: Detections, rig: Rig, config: CandidateConfig) -> tuple[Detections, bool]:
-    """What stays of a frame's detections, in an order of their own, and whether there were too many.
+    """Thin a frame's detections and sort them; also returns whether the limits were exceeded.
 
-    What a view shows to be wrong is left out, too (`view_faults`).
+    Faulty detections are also removed (`view_faults`).
     """
     order = np.lexsort((every.confidence, every.joint, *every.xy.T))
     found = every.rows(order)
@@ -56,10 +56,10 @@ def thinned(every: Detections, rig: Rig, config: CandidateConfig) -> tuple[Detec
 
 
 def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> Mask | None:
-    """(D,) the detections that stay; None where all do.
+    """(D,) mask of the detections to keep; None for all.
 
-    Of each joint each view keeps its most confident ones, as many as make at most `config.most_pairs` pairs of
-    views.
+    Each view keeps its most confident detections of each joint, so that there are at most
+    `config.most_pairs` pairs over all views.
     """
     joints = int(detections.joint.max(initial=0)) + 1
     group = detections.view * joints + detections.joint
@@ -70,7 +70,7 @@ def kept_detections(detections: Detections, views: int, config: CandidateConfig)
 
 
 def thinned_points(points: PairPoints, config: CandidateConfig) -> PairPoints:
-    """The points that stay: of each joint the `config.most_points` most confident."""
+    """The `config.most_points` most confident points of each joint."""
     if np.bincount(points.joint, minlength=1).max() <= config.most_points:
         return points
     keep = _best(points.joint, config.most_points, (-points.score,))
@@ -78,9 +78,9 @@ def thinned_points(points: PairPoints, config: CandidateConfig) -> PairPoints:
 
 
 def thinned_candidates(candidates: Candidates, detections: Detections, config: CandidateConfig) -> Candidates:
-    """The candidates that stay: of each joint `config.most_candidates`, and fewer where they have too many links.
+    """At most `config.most_candidates` candidates per joint, fewer if there are too many links.
 
-    Strong ones stay first, then those with most votes and confidence.
+    Strong ones are kept first, then those with most votes and confidence.
     """
     most = config.most_candidates
     kept = _with_most(candidates, most)
@@ -91,17 +91,18 @@ def thinned_candidates(candidates: Candidates, detections: Detections, config: C
 
 
 _MOST_LINKS = 2_000_000
-"""Pairs of candidates that affinities speak of: 12 people before 30 cameras have 50,000."""
+"""Maximum number of pairs of candidates with affinities: 12 people before 30 cameras
+have 50,000."""
 
 
 def _count_links(candidates: Candidates, detections: Detections) -> int:
-    """How many pairs of candidates the affinities of a frame speak of."""
+    """Number of pairs of candidates linked by the affinities of a frame."""
     supports = np.bincount(candidates.support[:, 1], minlength=len(detections))
     return int(supports[detections.pairs].prod(axis=1).sum())
 
 
 def _with_most(candidates: Candidates, most: int) -> Candidates:
-    """At most so many candidates of each joint, the best ones."""
+    """The best candidates of each joint, at most `most`."""
     if np.bincount(candidates.joint, minlength=1).max() <= most:
         return candidates
     keep = _best(candidates.joint, most, (-candidates.score, -candidates.votes, ~candidates.strong))
@@ -112,7 +113,9 @@ def _with_most(candidates: Candidates, most: int) -> Candidates:
 
 
 def _best(group: Index, most: int, order: tuple[NDArray[Any], ...]) -> Mask:
-    """(N,) the first `most` of each group by `order` (last key first), then as they stand."""
+    """(N,) mask of the first `most` of each group by `order` (last key first); ties keep their
+    order.
+    """
     ranked = np.lexsort((*order, group))
     sizes = np.bincount(group)
     place = np.arange(len(group)) - np.repeat(np.cumsum(sizes) - sizes, sizes)

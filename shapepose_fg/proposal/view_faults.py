@@ -1,4 +1,6 @@
-"""Detections that their own view shows to be wrong: people found twice, joints moved onto the picture's border."""
+"""Faulty detections that a single view reveals: duplicated people, joints clipped to the image
+border.
+"""
 
 import numpy as np
 
@@ -8,22 +10,22 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.proposal.people_2d import group_people
 
 _LEAST_JOINTS = 3
-"""Number of common joints from which on two 2D people are compared."""
+"""Minimum number of common joints for two 2D people to be compared."""
 _SAME = 0.03
-"""Median distance of the common joints of two detections of one person, as a share of the person's size in the
-picture: two boxes around one person differ by a hundredth or two, people in line with the camera by more."""
+"""Median distance of the common joints of duplicates, as a share of the person's size in the image:
+two boxes around one person differ by 1 to 2 %, two people on one viewing ray by more."""
 _SAME_OF_PICTURE = 0.005
-"""Such a distance as a share of the picture's width: small people differ by a few pixels."""
+"""Minimum of this limit as a share of the image width: small people differ by a few pixels."""
 _BORDER_PX = 1.0
-"""Distance from the edge of the picture up to which a joint is on the edge, px."""
+"""Distance from the edge of the image within which a joint is on the edge, px."""
 _LINE_PX = 0.01
-"""Difference up to which coordinates are the same number, px: the inverse of a lens is exact to less."""
+"""Difference below which coordinates are equal, px: the inverse of the distortion is more exact."""
 _DISTINCT = 0.9
-"""Share of different numbers among coordinates from which on the detector does not round to a grid."""
+"""Share of distinct coordinates above which the detector does not round to a grid."""
 
 
 def without_faults(found: Detections, rig: Rig) -> Detections:
-    """The detections of a frame without joints on the border and without second detections of a person."""
+    """The detections of a frame without clipped joints and duplicated people."""
     for wrong in (clipped, doubled):
         faulty = wrong(found, rig)
         found = found.only(~faulty) if faulty.any() else found
@@ -31,10 +33,11 @@ def without_faults(found: Detections, rig: Rig) -> Detections:
 
 
 def clipped(found: Detections, rig: Rig) -> Mask:
-    """(D,) detections of joints that lie beyond the border of the picture, and were moved onto it.
+    """(D,) mask of detections of joints outside the image that were clipped to its border.
 
-    The border is the edge of the calibrated picture; or, where the detector was given a part of it, a line that
-    limits all joints of a view, and on which two or more are to the last digit while no others agree so.
+    The border is the edge of the calibrated image. For a detector run on a crop, it is a line that
+    bounds all joints of a view, with two or more of them exactly on it while the other coordinates
+    are distinct.
     """
     measured = found.xy.copy()
     for view, camera in enumerate(rig.cameras):
@@ -55,10 +58,12 @@ def clipped(found: Detections, rig: Rig) -> Mask:
 
 
 def doubled(found: Detections, rig: Rig) -> Mask:
-    """(D,) detections of the less certain of two 2D people in the same place of a view: it is one person."""
+    """(D,) mask of the detections of duplicated 2D people: of two at the same place, the less
+    confident.
+    """
     again = np.zeros(len(found), dtype=bool)
     groups = [group for group in group_people(found) if len(group) >= _LEAST_JOINTS]
-    # The most certain first; of equals whichever the order of the detections puts first.
+    # Most confident first; ties keep the order of detections.
     groups.sort(key=lambda group: -float(found.confidence[group].sum()))
     view = found.view[[group[0] for group in groups]]
     if len(groups) == len(np.unique(view)):

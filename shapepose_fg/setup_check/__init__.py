@@ -1,1 +1,3 @@
-"""Whether cameras and detections fit each other, and what it looks like where they do not."""
+"""The check of a set-up: whether cameras and detections are consistent, and the likely mistake if
+not.
+"""

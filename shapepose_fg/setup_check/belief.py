@@ -1,4 +1,6 @@
-"""Whom to believe: cameras that a reconstruction is better without, and cameras that contradict each other."""
+"""Decides which cameras a reconstruction must exclude, and which contradict each other without a
+clear culprit.
+"""
 
 from collections.abc import Sequence
 
@@ -10,14 +12,16 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import match
 
 _WORSE = 0.2
-"""A camera is left out whose score is so much lower than it would be if it was right: it sees people 3 % of their
-size, 5 cm, beside where it should, on average."""
+"""Drop of a camera's score, against the corrected camera, above which it is excluded: it sees
+people 3 % of their size, 5 cm, from where it should, on average."""
 _OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED)
-"""What is wrong with all cameras alike, or hardly matters, or is seen to elsewhere."""
+"""Kinds that affect all cameras alike, matter little, or are handled elsewhere."""
 
 
 def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: range) -> Trust:
-    """What is believed of cameras as they were `given`, after `findings`; `right` is without these mistakes."""
+    """Trust in the cameras as `given`, after `findings`; `right` is the look with these mistakes
+    corrected.
+    """
     wrong: list[Spell] = []
     whole = frames.start, frames.stop
     doubted = False
@@ -33,7 +37,7 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
         if each.kind == Kind.DUPLICATE:
             views = (min(each.cameras[::-1], key=lambda view: given.scores[view] - 1e-6 * view),)
         first, last = (end if said is None else said for said, end in zip(each.frames, whole, strict=True))
-        if given.cameras_used == 2 or len(views) >= given.cameras_used:  # nothing says which of them is wrong
+        if given.cameras_used == 2 or len(views) >= given.cameras_used:  # the culprit is unknown
             return Trust(doubted=tuple((view, first, last) for view in range(given.view_count)))
         sure = each.kind in (Kind.UNFIT, Kind.DUPLICATE)
         wrong += [(v, first, last) for v in views if sure or _worse(given, right, v, range(first, last))]
@@ -45,7 +49,9 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
 
 
 def _worse(given: Look, right: Look, view: int, frames: range) -> bool:
-    """Whether a camera sees people of the others far from where it would if it was right."""
+    """Whether the camera's score for the others' people is much lower than with the mistakes
+    corrected.
+    """
     others = right.others(view)
     others = others.rows((others.frame >= frames.start) & (others.frame < frames.stop))
     was, now = (

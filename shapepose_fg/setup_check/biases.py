@@ -1,9 +1,9 @@
-"""What people say of small changes of cameras, whatever lasting biases the detector has.
+"""Likelihood of small changes of cameras, marginalised over persistent biases of the detector.
 
-A detector may put a joint of a view always beside where it is: by the joint, by person and joint, and it shifts or
-enlarges whole people. Such biases are unknowns with Gaussian priors, and so are the joints' places. They are
-eliminated from the linearised residuals (Schur complements): what remains is information about cameras, and how
-likely the residuals are, for each of several sizes of biases.
+A detector may have persistent errors: per joint, per person and joint, or a shift or scaling of
+whole people in a view. Such biases, and the joints' positions, are unknowns with Gaussian priors.
+They are eliminated from the linearised residuals (Schur complements), which leaves the information
+about the cameras and the marginal likelihood of the residuals, for each of several sizes of biases.
 """
 
 from collections.abc import Sequence
@@ -18,52 +18,57 @@ from shapepose_fg.setup_check.fit import TURN, Q, by_parameters, seen_by
 from shapepose_fg.setup_check.matching import median_over
 
 LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
-"""Sigmas of a lasting bias of a joint of a person in a view, parts of the person's size. On four recordings real
-detectors have 0.0025 to 0.02 (scripts/measure_biases.py)."""
+"""Standard deviations of a persistent bias of a person's joint in a view, as shares of the person's
+size. On four recordings real detectors have 0.0025 to 0.02 (scripts/measure_biases.py)."""
 COMMON = (0.1, 1.0, 10.0)
-"""Sigma of a bias that all people have in common over that of one person's."""
+"""Standard deviation of the bias common to all people, relative to that of one person."""
 SHIFT, LARGER = 1.0, 3.0
-"""Sigmas of the shift of a whole person, and of the enlargement (a part of 1), over that of a joint; real ones are
-0.3 to 3."""
+"""Standard deviations of the shift of a whole person, and of the relative scaling, over that of a
+joint; real ones are 0.3 to 3."""
 _INDEPENDENT = 0.1
-"""Joints of one person, and of frames that follow each other, err alike: of ten detections one is independent."""
+"""Share of independent detections: errors of a person's joints, and of consecutive frames, are
+correlated."""
 _WEAK = 1e-6
-"""The information that a joint's place has without any view, over what it has: two rays may be parallel."""
+"""Relative information added to each joint's position, since two rays may be parallel."""
 
 
 @dataclass(frozen=True)
 class Marginal:
-    """How likely residuals r = J theta are under one size of the biases: log + g' theta - theta' H theta / 2."""
+    """Log-likelihood of residuals r = J theta for one size of biases: log + g' theta - theta' H
+    theta / 2.
+    """
 
     H: Array
-    """(C, C) information about cameras' parameters and single people's biases (`Residuals`)."""
+    """(C, C) information about cameras' parameters and individual people's biases (`Residuals`)."""
     g: Array
-    """(C,) its vector."""
+    """(C,) information vector."""
     log: float
-    """The likelihood's logarithm where these are 0, up to what all sizes of biases share."""
+    """Log-likelihood at theta = 0, up to a constant common to all sizes of biases."""
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Detections of N people of single frames, J joints, V cameras; P different people, K parts of a recording."""
+    """Detections of N people in single frames, J joints, V cameras; P identities, K parts of a
+    recording.
+    """
 
     xy: Array
     """(N, J, V, 2) undistorted pixels; 0 where there is none."""
     weight: Array
     """(N, J, V) robust weight of each, 1 / pixels^2; 0 where there is none."""
     size_px: Array
-    """(N, V) the person's size in each picture."""
+    """(N, V) the person's size in each picture, pixels."""
     points: Array
-    """(N, J, 3) where the cameras by which people were grouped put the joints."""
+    """(N, J, 3) joints, triangulated by the cameras with which people were associated."""
     person: Index
-    """(N,) who each is, 0 to P - 1."""
+    """(N,) identity of each person, 0 to P - 1."""
     part: Index
-    """(N,) part of the recording, 0 to K - 1: cameras may be turned otherwise in each."""
+    """(N,) part of the recording, 0 to K - 1; cameras may have another rotation in each."""
 
     @classmethod
     def of(cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index) -> "Residuals":
-        """Make residuals of what is `observed`. Weights are by how far a residual is from its median over the
-        person's frames.
+        """Build residuals from the arrays of `observed`. Robust weights use each residual's
+        deviation from its median over the person's frames.
         """
         xy, confidence, size = seen
         scale, lasting = np.nan_to_num(size, nan=1.0)[:, None, :, None], np.zeros_like(xy)
@@ -82,11 +87,13 @@ class Residuals:
 
     @property
     def parts(self) -> int:
-        """K."""
+        """Number of parts, K."""
         return _count(self.part)
 
     def camera(self, view: int, which: list[int], share: Array | float = 1.0) -> Array:
-        """(C, n) directions of parameters of a camera (`fit.PARAMETERS`), turns by a `share` (K,) in each part."""
+        """(C, n) directions of a camera's parameters (`fit.PARAMETERS`); rotations weighted by
+        `share` (K,) per part.
+        """
         V, K = self.size_px.shape[1], self.parts
         directions = np.zeros((V, Q - 3 + 3 * K, Q))
         for axis in TURN:
@@ -96,7 +103,9 @@ class Residuals:
         return np.concatenate([every, np.zeros((3 * V * _count(self.person), len(which)))])
 
     def of_person(self, person: int, view: int) -> Array:
-        """(C, 3) directions of a person's shift right and down, parts of the size, and enlargement in a view."""
+        """(C, 3) directions of a person's shift right and down, as shares of the size, and of the
+        scaling, in a view.
+        """
         V, P = self.size_px.shape[1], _count(self.person)
         directions = np.zeros((P, 3 * V, 3))
         directions[person, [2 * view, 2 * view + 1, 2 * V + view], [0, 1, 2]] = 1.0
@@ -106,14 +115,16 @@ class Residuals:
     def marginals(
         self, views: Views, levels: Sequence[float] = LEVELS, shift: float = SHIFT, larger: float = LARGER
     ) -> list[Marginal]:
-        """What is said against the cameras `views`, for each size of biases: `levels`, and in each `COMMON`."""
+        """Marginal likelihoods around the cameras `views` for each size of biases: `levels`, each
+        with all of `COMMON`.
+        """
         information = self._information(views)
         return [each for n in levels for each in self._marginals(information, n, shift * n, larger * n)]
 
     def _rows(self, views: Views) -> Array:
-        """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the enlargement, and residuals.
+        """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the scaling, and residuals.
 
-        All are weighted, and without what moves along with the joint's place.
+        All are weighted, with the joint's position eliminated.
         """
         N, J, V = self.weight.shape
         points, root = self.points, np.sqrt(self.weight)[..., None, None]
@@ -138,7 +149,9 @@ class Residuals:
         return rows - A @ (inverse @ rows)
 
     def _information(self, views: Views) -> Array:
-        """(P, J, n, n) squares of the rows of each person's joint, with a turn in each part."""
+        """(P, J, n, n) normal matrices of the rows of each person's joint, with a rotation per
+        part.
+        """
         rows, V, J, K = self._rows(views), len(views), self.weight.shape[1], self.parts
         found = np.zeros((_count(self.person), J, *[V * (Q - 3 + 3 * K) + 3 * V + 1] * 2))
         for person, part in sorted({*zip(self.person.tolist(), self.part.tolist(), strict=True)}):
@@ -152,10 +165,10 @@ class Residuals:
         return found
 
     def _marginals(self, information: Array, level: float, shift: float, larger: float) -> list[Marginal]:
-        """One for each of `COMMON`, of biases with these sigmas."""
+        """Marginals for each of `COMMON`, with biases of these standard deviations."""
         P, J, _, V = *information.shape[:3], self.size_px.shape[1]
         C = V * (Q - 3 + 3 * self.parts)
-        # In this order: what people have in common, cameras, single people's shifts and enlargements, residual.
+        # Order: common biases, cameras, individual people's shifts and scalings, residual.
         common = 2 * V * J
         total, log = np.zeros((common + C + 3 * V * P + 1, common + C + 3 * V * P + 1)), 0.0
         prior = np.repeat([shift**-2, larger**-2], [2 * V, V])
@@ -165,7 +178,8 @@ class Residuals:
             known = of_own[:, :, own] + np.eye(2 * V) / level**2
             left = information[person] - of_own.swapaxes(1, 2) @ np.linalg.solve(known, of_own)
             log -= 0.5 * float(np.linalg.slogdet(known * level**2)[1].sum())
-            # A joint's bias is the person's own, the shift of the whole person, and what all people have.
+            # A joint's bias is the sum of the person's own, the shift of the whole person, and the
+            # common bias.
             whole = np.zeros((common + left.shape[1], common + left.shape[1]))
             whole[common:, common:] = left.sum(axis=0)
             for joint in range(J):

@@ -1,6 +1,6 @@
-"""What is wrong with a set-up: one finding after the other, gross mistakes first.
+"""Diagnosis of a set-up: finds mistakes one after the other, gross ones first.
 
-Duplicates, the people's build and the sizes of pictures are told without comparing places.
+Duplicates, people's build and picture sizes are tested without comparing positions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,10 +29,11 @@ from shapepose_fg.setup_check.over_time import parted
 from shapepose_fg.setup_check.small import Problem
 
 _SAME_PX = 0.6
-"""Detections of one picture, stored with a pixel's accuracy, lie no farther apart."""
+"""Maximum distance, px, between detections of one picture stored with pixel accuracy."""
 _SAME_SHARE = 0.8
 _SAME_PLACE, _SAME_ANGLE_DEG = 0.002, 0.05
-"""Poses that differ by less, of the cameras' mean distance and in degrees, are one: no stand is so exact."""
+"""Maximum differences of two equal poses, as a share of the cameras' mean distance and in degrees;
+no two stands agree so well."""
 _BONES = (
     ("Shoulder", "Hip", 0.311, 0.52),
     ("Hip", "Knee", 0.227, 0.15),
@@ -40,13 +41,14 @@ _BONES = (
     ("Shoulder", "Elbow", 0.155, 0.08),
     ("Elbow", "Wrist", 0.153, 0.10),
 )
-"""Lengths between joints as parts of stature, of the body model's mean person, and how much each tells: the best
-linear estimate for four people, by the model's shape space and a detector that is off by 2 cm."""
+"""Lengths between joints as shares of stature, for the body model's mean person, and their weights:
+the best linear estimator for four people, given the model's shape space and a detector error of 2
+cm."""
 _AXES: tuple[Axis, ...] = ("x", "-x", "y", "-y", "z", "-z")
 
 
 def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
-    """Pairs of cameras with one pose, or with the same detections."""
+    """Pairs of cameras with equal poses or equal detections."""
     spread = np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1).mean()
     findings = []
     for first, second in combinations(range(len(rig)), 2):
@@ -60,7 +62,7 @@ def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
 
 
 def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> bool:
-    """Whether two cameras saw the same pixels; as the pictures were, with the bend of their lenses."""
+    """Whether two cameras have the same detections, compared in distorted pixels."""
     every = evidence.sightings
     every = every.rows(np.isin(every.frame, evidence.anchors))
     one, other = (every.rows(every.view == view) for view in (first, second))
@@ -76,7 +78,9 @@ def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> b
 
 
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
-    """Cameras whose videos, or pictures, are not of the calibrated size; `given` as `find_footage` takes it."""
+    """Cameras with videos or pictures of another than the calibrated size; `given` as for
+    `find_footage`.
+    """
     return _unlike(
         {
             name: glance(path)[0] if path.suffix.lower() in VIDEOS and path.is_file() else open_footage(path).size
@@ -87,12 +91,14 @@ def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
 
 
 def detected_sizes(file: Path, rig: Rig) -> tuple[Finding, ...]:
-    """Cameras that `detect` was told another calibrated size of, by the footage.json that it wrote."""
+    """Cameras for which `detect` was given another calibrated size, according to its
+    footage.json.
+    """
     return _unlike({each.name: each.placement.calibrated_size for each in read_used_footage(file)}, rig)
 
 
 def _unlike(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> tuple[Finding, ...]:
-    """Cameras whose pictures have other `sizes`, by name, than the calibrated."""
+    """Cameras for which `sizes`, by name, differ from the calibrated ones."""
     found = [(view, sizes.get(each.name, each.image_size)) for view, each in enumerate(rig.cameras)]
     return tuple(
         Finding(Kind.PICTURE_SIZE, (view,), shift_px=((float(width), float(height)),))
@@ -103,14 +109,15 @@ def _unlike(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> tuple[Finding, ..
 
 @dataclass(frozen=True)
 class Build:
-    """What people look like, in the calibration's frame and unit."""
+    """Build of the people, in the calibration's frame and unit."""
 
     stature: float
-    """Median stature that their bones say, the calibration's unit; NaN where too few are seen."""
+    """Median stature computed from the bones, in the calibration's unit; NaN if too few
+    are seen."""
     up: Array
-    """(3,) mean direction from their hips to their necks; its length is 1 where all stand alike, else less."""
+    """(3,) mean unit vector from hips to neck; its length is 1 if all are parallel, else less."""
     count: int
-    """People and frames that it is made of."""
+    """Number of people, one per frame, that were used."""
 
     @property
     def axis(self) -> Axis:
@@ -119,7 +126,9 @@ class Build:
 
     @property
     def are_children(self) -> bool:
-        """Whether all or most are as tall as children, which adults in a rig that is too small are as well."""
+        """Whether the median stature is a child's, which also occurs for adults in a rig that is
+        scaled too small.
+        """
         return self.count >= MIN_SIGHTINGS and _SHORTEST <= self.stature < _CHILD
 
 
@@ -149,53 +158,56 @@ def build_of(points: Array, skeleton: Skeleton) -> Build:
 
 
 _MOST_FINDINGS, _MOST_BIASED = 4, 3
-"""More mistakes than this are not told apart."""
+"""Maximum number of findings, and of biased people, that are distinguished."""
 _UNFIT = 0.15
-"""A camera that fits the others' people no better, and nothing explains it, does not fit."""
+"""Score below which a camera without any explanation does not fit."""
 _CROWD = 8.0
-"""With more people in a picture, who hide each other, cameras that do not fit are no mistake of the set-up."""
+"""Mean number of people per picture above which occlusions, not mistakes, explain low scores."""
 MIN_SIGHTINGS = 20
-"""With fewer people seen, nothing is said of a camera."""
+"""Minimum number of people seen for any statement on a camera."""
 _LEAST_DEG, _LEAST_FOCAL = 0.25, 0.04
-"""Smaller turns and focal lengths of one camera are not named."""
+"""Minimum rotation, degrees, and change of focal length of one camera that are reported."""
 _NOBODY = 0.05
-"""With fewer people than this for each sighting, cameras see no people in common."""
+"""Minimum people placed per sighting; with fewer, cameras see no people in common."""
 _STOPPED = 0.02
-"""Share of pictures shown twice from which on a camera is named: fewer fill up dropped frames."""
+"""Share of repeated pictures above which a camera is reported; fewer replace dropped frames."""
 _LAG_ROUNDS, _LAG_NEAR = 6, 8
 _SHORTEST, _TALLEST = 0.45, 2.4
-"""Median statures outside of which the calibration's unit is wrong, not the people, metres: newborn children are
-0.5 m tall, the tallest people 2.5, and bones tell a stature to a tenth."""
+"""Range of plausible median statures, metres; outside, the calibration's unit is wrong. Newborns
+are 0.5 m tall, the tallest people 2.5 m, and stature from bones is accurate to a tenth."""
 _CHILD = 1.2
-"""Median stature below which the people are children, metres, or else the calibration's lengths are too short."""
+"""Median stature, metres, below which the people are children, or the calibration's lengths too
+short."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that the check found, and what it was made of."""
+    """All findings of the check, and the data they are based on."""
 
     findings: tuple[Finding, ...]
     look: Look
-    """The set-up as it was given."""
+    """The set-up as given."""
     corrected: Look
-    """The set-up with the findings put right, but for small errors."""
+    """The set-up with the findings corrected, except small errors."""
     lags: tuple[Lag, ...] = ()
-    """Each camera's offset in time that remains; none with too few people."""
+    """Remaining time offset of each camera; empty with too few people."""
     build: Build | None = None
-    """The people, in the corrected set-up."""
+    """Build of the people in the corrected set-up."""
     biased: tuple[Finding, ...] = ()
-    """Single people whom a camera sees beside where they are; nothing of the set-up."""
+    """Biases of single people in a view, which are no mistakes of the set-up."""
     trust: Trust = BELIEVED
-    """Which cameras a reconstruction is better without."""
+    """Cameras that a reconstruction should exclude or doubt."""
 
 
 def put_right(detections: DetectionSequence, rig: Rig, frames: range) -> tuple[Look, Look, list[Finding]]:
-    """The set-up as it is given, the same with gross mistakes of cameras put right, and these mistakes."""
+    """The set-up as given, with gross mistakes of cameras corrected, and these mistakes."""
     evidence = gather(detections, frames, len(rig))
     given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
     findings += _blind(given) + _stopped(given)
-    look = given if evidence is given.evidence else replace(given, evidence=evidence)  # what it found stays
+    look = (
+        given if evidence is given.evidence else replace(given, evidence=evidence)
+    )  # the duplicates found remain in the scores
     rng, enough = np.random.default_rng(0), len(rig) > 1 and len(look.sightings) >= MIN_SIGHTINGS
     while enough and len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
         findings.append(change.finding)
@@ -204,7 +216,7 @@ def put_right(detections: DetectionSequence, rig: Rig, frames: range) -> tuple[L
 
 
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
-    """What is wrong with cameras and detections of a recording, all of its `frames` by default."""
+    """Diagnose cameras and detections of a recording in `frames`, by default all."""
     frames = range(len(detections)) if frames is None else frames
     given, look, findings = put_right(detections, rig, frames)
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
@@ -222,7 +234,7 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
             break
         view = max(late, key=lambda view: remaining[view].gain)
         before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
-        if abs(settled[0].lag[view]) > look.evidence.most_lag:  # it would run on: chance, and no offset
+        if abs(settled[0].lag[view]) > look.evidence.most_lag:  # a diverging offset is chance
             break
         look, problem = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
@@ -234,13 +246,15 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     findings += [*(small if look.cameras_used > 2 else []), *unfit]
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
-    findings += order or _of_people(build, rig)  # joints that are others say nothing of unit and up
+    findings += order or _of_people(build, rig)  # with wrong joints, unit and up axis cannot be tested
     trust = trust_of(findings, given, refined, frames)
     return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 
 
 def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
-    """Cameras that are listed twice, and what was seen without one of each two, which fits the others less."""
+    """Duplicated cameras, and the evidence without the one of each pair that fits the
+    others less.
+    """
     findings, evidence, gone = list[Finding](), look.evidence, set[int]()
     for found in duplicates(rig, evidence):
         if gone.isdisjoint(found.cameras):
@@ -253,7 +267,7 @@ def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
 
 
 def _blind(look: Look) -> list[Finding]:
-    """Cameras without people, where others have some; or that no camera sees any."""
+    """Cameras without any people though others see some; or the finding that no camera sees any."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
     if seen.sum() == 0:
         return _nobody(look)
@@ -263,20 +277,21 @@ def _blind(look: Look) -> list[Finding]:
 
 
 def _stopped(look: Look) -> list[Finding]:
-    """Cameras whose recording stops."""
+    """Cameras with repeated pictures."""
     share = look.evidence.stopped
     return [Finding(Kind.STOPPED, (v,), float(share[v])) for v in np.flatnonzero(share >= _STOPPED).tolist()]
 
 
 def _nobody(look: Look) -> list[Finding]:
-    """No person could be placed."""
+    """Finding that no person could be placed."""
     return [Finding(Kind.NOBODY, (), amount=float(len(look.sightings)))]
 
 
 def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
-    """The recording with a camera late by about `frames`, and its residuals.
+    """The look with a camera late by about `frames`, and its residuals.
 
-    People who move mostly one way look as if the camera was turned, so offset and turn are found in turns.
+    People who move mostly in one direction make a time offset look like a rotation, so that the two
+    are estimated alternately.
     """
     for _ in range(_LAG_ROUNDS):
         look = look.later(view, frames)
@@ -289,7 +304,7 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
 
 
 def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]:
-    """The findings with an offset in time; a second one of the same camera mends the first."""
+    """The findings with a time offset; it is added to an earlier one of the same camera."""
     same = [f for f in findings if f.kind == Kind.LATE and f.cameras == (view,)]
     total = sum(f.amount for f in same) + frames
     rest = [f for f in findings if f not in same]
@@ -297,7 +312,9 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
 
 
 def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], list[Finding]]:
-    """Small errors of cameras that are surer than no error, and than a detector's bias; and such biases."""
+    """Small errors of cameras that are more probable than no error and than detector biases; and
+    such biases.
+    """
     biased = list[Finding]()
     while True:
         told = [(each.person, each.finding) for each in problem.causes if each.finding is not None]
@@ -321,7 +338,7 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
 
 
 def _unfit(look: Look, known: set[int]) -> list[Finding]:
-    """Cameras that fit nothing, without any explanation."""
+    """Cameras that do not fit, without any explanation."""
     seen = np.bincount(look.sightings.view, minlength=look.view_count)
     everybody = tuple(np.flatnonzero(seen).tolist())
     crowd = float(seen.sum()) / max(len(everybody) * len(look.evidence.anchors), 1)
@@ -338,7 +355,7 @@ def _unfit(look: Look, known: set[int]) -> list[Finding]:
 
 
 def _of_people(build: Build, rig: Rig) -> list[Finding]:
-    """What people say of the unit and of the up axis."""
+    """Findings on the unit and the up axis, from the people's build."""
     if build.count < MIN_SIGHTINGS:
         return []
     right = _SHORTEST <= build.stature <= _TALLEST

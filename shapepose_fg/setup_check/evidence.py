@@ -1,4 +1,4 @@
-"""What the check looks at: people seen at some frames of a recording, and the cameras as they are taken to be."""
+"""Evidence of the check: people seen in some frames of a recording, and the assumed cameras."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -29,45 +29,49 @@ from shapepose_fg.setup_check.matching import (
 )
 
 _STEPS = 6
-"""Gauss-Newton steps of a robust triangulation; errors fall under a hundredth of a pixel in four."""
+"""Gauss-Newton steps of a robust triangulation; errors are below 0.01 px after four."""
 KERNEL = 0.02
-"""Width of the Cauchy kernel, as a part of a person's size in the picture: a detector errs by 3 cm of 170."""
+"""Width of the Cauchy kernel, as a share of a person's size in the picture: a detector errs by 3 cm
+of 170."""
 
 
 ANCHORS = 100
-"""Frames that are looked at, spread over the recording."""
+"""Number of frames used, spread over the recording."""
 _WHOLE = 600
-"""A recording of so many frames is looked at whole, for offsets in time."""
+"""Maximum number of frames of a recording that is used completely, for time offsets."""
 _LAG_ANCHORS = 16
-"""Number of frames of a longer recording whose neighbours are looked at."""
+"""Number of frames of a longer recording with neighbours used."""
 MOST_LAG = 60
-"""Largest offset in time that is looked for, frames; less in a short recording."""
+"""Maximum time offset searched for, frames; less in a short recording."""
 _MOST_PAIRS = 25_000
-"""Pairs of sightings that are compared at most: with more people and cameras fewer frames are looked at."""
+"""Maximum number of compared pairs of sightings; with more people and cameras fewer frames are
+used."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The people that were seen, whatever the calibration."""
+    """The sightings of people, independent of the calibration."""
 
     anchors: Index
-    """(F,) frames that are looked at."""
+    """(F,) frames used."""
     sightings: Sightings
-    """At these frames, and at their neighbours."""
+    """Sightings in these frames and their neighbours."""
     most_lag: int
-    """Largest offset in time that can be told."""
+    """Maximum time offset that can be detected, frames."""
     other_side: Index
-    """(J,) the core joint on the other side of the body; the joint itself where there is none."""
+    """(J,) core joint on the other side of the body; the joint itself if central."""
     stopped: Array
-    """(V,) in what part of these frames each camera shows the picture before once more."""
+    """(V,) share of these frames in which each camera repeats its previous picture."""
 
     def thinned(self, frames: int) -> "Evidence":
-        """Return the evidence with fewer frames that are looked at."""
+        """Return the evidence with about `frames` of the frames used."""
         return replace(self, anchors=self.anchors[:: max(1, len(self.anchors) // frames)])
 
 
 def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence:
-    """The people that V cameras, `views`, saw at frames spread over a recording; no picture counts twice."""
+    """Sightings of V cameras, `views`, in frames spread over a recording, without repeated
+    pictures.
+    """
     count = len(frames)
     if count <= _WHOLE:
         wanted = np.arange(frames.start, frames.stop)
@@ -76,7 +80,7 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     else:
         most = MOST_LAG
         spread = np.unique(np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp))
-        if sum(len(detections[t]) > 0 for t in spread.tolist()) < ANCHORS // 4:  # people are there now and then
+        if sum(len(detections[t]) > 0 for t in spread.tolist()) < ANCHORS // 4:  # people are present only at times
             there = np.array([t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp)
             spread = there[np.unique(np.linspace(0, len(there) - 1, ANCHORS).astype(np.intp))]
         around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
@@ -101,24 +105,27 @@ def _other_side(skeleton: Skeleton) -> Index:
 
 @dataclass(frozen=True)
 class Structure:
-    """P people, J joints, V cameras."""
+    """Triangulated joints: P people, J joints, V cameras."""
 
     points: Array
     """(P, J, 3) in the world, the calibration's unit; NaN where fewer than two cameras saw a joint."""
     xy: Array
     """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
     miss_px: Array
-    """(P, J, V) distance of each projection from its detection, pixels; NaN where there is none."""
+    """(P, J, V) reprojection error, pixels; NaN without a detection."""
     depth: Array
-    """(P, J, V) depth of each joint before each camera, the calibration's unit."""
+    """(P, J, V) depth of each joint in each camera, in the calibration's unit."""
     size_px: Array
-    """(P, V) the person's size in each picture."""
+    """(P, V) the person's size in each picture, pixels."""
     weight: Array
-    """(P, J, V) robust weight of each detection, in 1 / pixels^2 of a unit of its noise; 0 where there is none."""
+    """(P, J, V) robust weight of each detection, 1 / pixels^2, up to its noise; 0 without a
+    detection."""
 
 
 def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]:
-    """Detections (P, J, V, 2), confidences (P, J, V) and sizes (P, V) of groups; NaN, 0 and NaN for none."""
+    """Detections (P, J, V, 2), confidences (P, J, V) and sizes (P, V) of groups; NaN, 0 and NaN if
+    missing.
+    """
     there = groups.member >= 0
     xy = np.where(there[..., None, None], sightings.xy[groups.member], np.nan)
     confidence = np.where(there[..., None], sightings.confidence[groups.member], 0.0)
@@ -127,7 +134,9 @@ def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]
 
 
 def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: int = _STEPS) -> Structure:
-    """Robust triangulation of what is `observed`, two cameras or more: linear, then reweighted Gauss-Newton."""
+    """Robust triangulation of the arrays of `observed`, two or more views: linear, then reweighted
+    Gauss-Newton.
+    """
     seen = ~np.isnan(xy[..., 0])
     prior = np.where(seen, confidence, 0.0) / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
@@ -150,7 +159,9 @@ def _triangulate(
     depth: Array,
     weight: Array,
 ) -> None:
-    """`triangulate` with K [R t] as `cameras` (V, 3, 4), and their `focal` lengths (V,)."""
+    """Kernel of `triangulate`, with K [R t] as `cameras` (V, 3, 4), and their `focal` lengths (V,),
+    pixels.
+    """
     A, b, x, step_m = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     views, room = len(cameras), np.empty(len(cameras))
     for p in range(prior.shape[0]):
@@ -185,23 +196,23 @@ def _triangulate(
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A recording looked at with one idea of its cameras, which changes as mistakes are found."""
+    """A recording under one hypothesis on its cameras, which changes as mistakes are found."""
 
     evidence: Evidence
-    """The people that were seen."""
+    """The sightings of people."""
     views: Views
-    """What the V cameras are thought to be."""
+    """The V assumed cameras."""
     lag: Index
-    """(V,) frames by which each is thought to be late."""
+    """(V,) assumed delay of each camera, frames."""
     _others: dict[tuple[int, ...], Others] = field(init=False, default_factory=dict)
 
     @classmethod
     def given(cls, evidence: Evidence, rig: Rig) -> "Look":
-        """With the cameras as the user gives them."""
+        """The look with the cameras as given by the user."""
         return cls(evidence, Views.of(rig), np.zeros(len(rig), dtype=np.intp))
 
     def camera(self, view: int) -> Pinhole:
-        """One of the cameras."""
+        """One of the assumed cameras."""
         return Pinhole(self.views.K[view], self.views.cTw[view])
 
     def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Look":
@@ -212,7 +223,7 @@ class Look:
         return replace(self, views=replace(self.views, K=K, cTw=cTw))
 
     def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "Look":
-        """Return the look with other detections of one camera."""
+        """Return the look with changed detections of one camera."""
         every = self.evidence.sightings
         mine = np.flatnonzero(every.view == view)
         xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
@@ -222,54 +233,54 @@ class Look:
         )
 
     def later(self, view: int, frames: int) -> "Look":
-        """Return the look with one camera known to be late by so many frames more."""
+        """Return the look with one camera assumed late by `frames` more."""
         lag = self.lag.copy()
         lag[view] += frames
         return replace(self, lag=lag)
 
     @cached_property
     def shifted(self) -> Sightings:
-        """All sightings, at the frames at which they would have been taken without the offsets."""
+        """All sightings, with frames corrected for the delays."""
         every = self.evidence.sightings
         return replace(every, frame=every.frame - self.lag[every.view])
 
     @cached_property
     def sightings(self) -> Sightings:
-        """Those at the frames that are looked at."""
+        """Sightings in the frames used."""
         return self.shifted.rows(np.isin(self.shifted.frame, self.evidence.anchors))
 
     @cached_property
     def pairs(self) -> Pairs:
-        """Which of them may be one person."""
+        """Pairs of these sightings that may be one person."""
         return Pairs.of(self.sightings, self.views)
 
     @property
     def view_count(self) -> int:
-        """V."""
+        """Number of cameras, V."""
         return len(self.views)
 
     @property
     def cameras_used(self) -> int:
-        """How many cameras saw anybody."""
+        """Number of cameras with sightings."""
         return len(np.unique(self.sightings.view))
 
     def seen_by(self, view: int, every_frame: bool = False) -> Sightings:
-        """What one camera saw."""
+        """Sightings of one camera."""
         sightings = self.shifted if every_frame else self.sightings
         return sightings.rows(sightings.view == view)
 
     def groups(self, without: tuple[int, ...] = ()) -> Groups:
-        """People as they are found without some of the cameras."""
+        """People associated without some of the cameras."""
         views = tuple(view for view in range(self.view_count) if view not in without)
         return self.pairs.groups(len(self.sightings), views)
 
     def structure(self, without: tuple[int, ...] = (), steps: int = 6) -> tuple[Groups, Structure]:
-        """These people, and where they are."""
+        """These people with their triangulated joints."""
         groups = self.groups(without)
         return groups, triangulate(*observed(groups, self.sightings), self.views, steps)
 
     def others(self, *without: int) -> Others:
-        """The people that all cameras but these see."""
+        """People seen by all cameras except these."""
         if without not in self._others:
             groups, structure = self.structure(without, steps=2)
             self._others[without] = Others(groups.frame, structure.points)
@@ -277,14 +288,16 @@ class Look:
 
     @cached_property
     def scores(self) -> Array:
-        """(V,) how well each camera fits the people that the others see (`Match.score`)."""
+        """(V,) score of each camera for the people that the others see (`Match.score`)."""
         views = range(self.view_count)
         if self.cameras_used < 3:
             return np.full(self.view_count, self._pair_score)
         return np.array([match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views])
 
     def beside_biases(self, view: int) -> float:
-        """How well a camera fits the others' people, as `Match.score`, where the detector's errors last."""
+        """Score of a camera for the others' people, as `Match.score`, corrected for persistent
+        errors of the detector.
+        """
         others, seen, camera = self.others(view), self.seen_by(view), self.camera(view)
         person, sighting, error = distances(others.frame, others.points, seen, camera)
         near = least_of_each(person, error)
@@ -301,7 +314,7 @@ class Look:
 
     @property
     def _pair_score(self) -> float:
-        """How well two cameras fit each other, where there are no more."""
+        """Score of two cameras for each other, if there are no more."""
         views = np.unique(self.sightings.view).tolist()
         if len(views) < 2:
             return 0.0
@@ -309,14 +322,16 @@ class Look:
         return float((1 - error / GATE).sum() / max(possible, 1))
 
     def pair(self, first: int, second: int) -> tuple[Groups, Array, int]:
-        """P people that two cameras see, by how much their rays miss (P,), and how many could be matched."""
+        """P people seen by two cameras, distances of their rays (P,), and the number of possible
+        matches.
+        """
         groups = self.pairs.groups(len(self.sightings), (first, second))
         possible = possible_matches(self.seen_by(first).frame, self.seen_by(second).frame)
         return groups, self.pairs.errors_of(groups, first, second), possible
 
     @cached_property
     def total(self) -> float:
-        """How well everything fits: 1 if every sighting is a person without error, 0 if none is anybody."""
+        """Total score: 1 if every sighting is part of a person without error, 0 if none is."""
         groups, structure = self.structure(steps=3)
         error = np.moveaxis(structure.miss_px / structure.size_px[:, None], 1, 2)
         median = median_of(error)

@@ -1,4 +1,4 @@
-"""What may be wrong with a set-up, and how it is said: which camera, what it looks like, and what to do."""
+"""Findings of the check, and their description: the camera, the likely mistake, and the cure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from shapepose_fg.core.camera import Rig
 
 
 class Kind(StrEnum):
-    """What a mistake looks like."""
+    """Kind of a mistake."""
 
     TURNED = "turned"
     MOVED = "moved"
@@ -38,32 +38,33 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong with a set-up."""
+    """One mistake of a set-up."""
 
     kind: Kind
-    """What it looks like."""
+    """Kind of the mistake."""
     cameras: tuple[int, ...]
-    """Cameras that it is about; none where it is about people, all where all share it."""
+    """Cameras with the mistake; empty if it is about people, all if they share it."""
     amount: float = 0.0
-    """Degrees, frames (positive is late), the factor of a focal length or picture, the stature in metres, the part
-    of a person's size."""
+    """Degrees, frames (positive is late), factor of a focal length or picture size, stature in
+    metres, or share of a person's size, by kind."""
     shift_px: tuple[tuple[float, float], ...] = ()
-    """For each camera, how far its principal point seems to be off: right and down, pixels."""
+    """For each camera, the apparent error of its principal point: right and down, pixels."""
     moved: float = 0.0
-    """How far the camera was moved, metres."""
+    """Apparent translation of the camera, metres."""
     axis: str = ""
-    """The axis that is up for the people."""
+    """World axis that is up, judging by the people."""
     frames: tuple[int | None, int | None] = (None, None)
-    """The first frame in which it is so, and the one after the last; None where the recording begins or ends."""
+    """First affected frame, and the one after the last; None for the recording's
+    beginning or end."""
     sure: float = 1.0
-    """The probability that it is this, and not another mistake or none, as far as the detections tell."""
+    """Probability of this finding, against other mistakes and none."""
     joints: tuple[str, ...] = ()
-    """The layout that people fit, and the one that they were read as; or only which joints are exchanged, "" where
-    it is no single exchange."""
+    """The layout that fits people and the one used for reading; or the exchanged joints only, "" if
+    it is not a single exchange."""
     same: str = ""
-    """In what alone two cameras are one, if not in both: "pose" or "detections"."""
+    """What two cameras have in common, if not both: "pose" or "detections"."""
     instead: "tuple[Finding, ...]" = ()
-    """What else it may be, likeliest first; their `sure` are their probabilities."""
+    """Alternative findings, most probable first; their `sure` are their probabilities."""
 
 
 SURE = 0.95
@@ -71,7 +72,9 @@ SURE = 0.95
 
 
 def one_of(found: Sequence[Finding]) -> Finding:
-    """The likeliest of findings, which exclude each other, with the others that are not unlikely beside it."""
+    """The most probable of mutually exclusive findings, with the not improbable others as
+    alternatives.
+    """
     sure: dict[tuple[Kind, tuple[int, ...]], float] = {}
     first: dict[tuple[Kind, tuple[int, ...]], Finding] = {}
     for each in sorted(found, key=lambda each: -each.sure):
@@ -83,7 +86,7 @@ def one_of(found: Sequence[Finding]) -> Finding:
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
-    """What was found, as it is printed, with what else it may be."""
+    """The finding as a sentence, with its alternatives."""
     said = _words(finding, rig)
     said += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
     for each in finding.instead:
@@ -92,7 +95,7 @@ def sentence(finding: Finding, rig: Rig) -> str:
 
 
 def _words(finding: Finding, rig: Rig) -> str:
-    """The sentence without its probability."""
+    """The sentence without probability and alternatives."""
     words, amount = _WORDS[finding.kind], finding.amount
     names = [rig.names[view] for view in finding.cameras]
     all_of_them = len(names) == len(rig) > 2
@@ -175,7 +178,7 @@ def _duplicate(finding: Finding, side_px: int) -> str:
 
 
 ADULT_M = 1.7
-"""Mean stature of adults, metres, of the body model as of the world's women and men."""
+"""Mean stature of adults, metres, in the body model and in the world's population."""
 _UNITS = (
     (1e-3, "m", "mm"),
     (1e3, "mm", "m"),
@@ -184,7 +187,7 @@ _UNITS = (
     (0.1, "cm", "mm"),
     (10, "mm", "cm"),
 )
-"""What a length that comes out so many times too large was in truth, and what it was read as."""
+"""Apparent scale of lengths, with the true unit and the unit assumed when reading."""
 
 
 def _unit(finding: Finding, side_px: int) -> str:
@@ -278,26 +281,26 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.PICTURE_SIZE: "the pictures of {first} have {found} pixels, but the calibration is for {calibrated};"
     " give --image-placement, or calibrate with these pictures",
 }
-"""What is said of each: words that `sentence` fills in, or what chooses them by the finding and the longer side of
-its camera's picture."""
+"""Sentence of each kind: a template for `sentence`, or a function that chooses it by the finding
+and the longer side of the camera's picture, pixels."""
 
 
 def _when(first: int | None, last: int | None) -> str:
-    """In which frames."""
+    """The affected frames in words."""
     if first is None:
         return "in all frames" if last is None else f"before frame {last}"
     return f"from frame {first} on" if last is None else f"in frames {first} to {last - 1}"
 
 
 def _shift(x: float, y: float) -> str:
-    """A shift in a picture, in words."""
+    """A shift in a picture in words."""
     parts = [(abs(x), "right" if x > 0 else "left"), (abs(y), "down" if y > 0 else "up")]
     told = [f"{size:.0f} px {way}" for size, way in parts if size >= 0.5]
     return " and ".join(told) or "less than a pixel"
 
 
 def _length(metres: float) -> str:
-    """A length in a unit that suits it."""
+    """A length in a suitable unit."""
     if metres < 0.01:
         return f"{1e3 * metres:.2g} mm"
     if metres < 1:

@@ -1,4 +1,4 @@
-"""How well one camera fits the people that the others see, and which change of it would fit them."""
+"""Fit of one camera to the people that the others see, and estimates of changes that improve it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,27 +14,28 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pinhole, Sightings, distances, same_frame
 
 PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
-"""Parameters of a camera: a turn about its own axes (rad) where it stands, a move along them (unit of the
-calibration), the principal point (px), and the logarithm of the focal length."""
+"""Parameters of a camera: rotation about its own axes (rad) at a fixed centre, translation along
+them (unit of the calibration), principal point (px), and logarithm of the focal length."""
 Q = len(PARAMETERS)
 TURN, MOVE, CENTRE, FOCAL, POSE = [0, 1, 2], [3, 4, 5], [6, 7], [8], [0, 1, 2, 3, 4, 5]
 _MOST_ZOOM = 5.0
-"""A step of the focal length's logarithm beyond this is no camera's, and would soon be no number."""
+"""Maximum step of the focal length's logarithm; larger ones are implausible and would overflow."""
 _TRIES = 40
-"""Pairs of a person and a sighting that are tried as one another: half of them are, with two people."""
+"""Number of pairs of a person and a sighting that are tried; with two people, half of them are
+correct."""
 _ROUNDS = 6
-"""Rounds of matching and solving."""
+"""Number of rounds of matching and fitting."""
 _WIDTH = 0.03
-"""Width of the Cauchy kernel, as a part of a person's size in the picture."""
+"""Width of the Cauchy kernel, as a share of a person's size in the picture."""
 _STEPS = 4
-"""Steps between matchings."""
+"""Number of steps between matchings."""
 CORNER = np.array([-0.5, -0.5])
-"""The corner of a picture: pixels are counted from the middle of the first."""
+"""Coordinates of a picture's corner, px; the origin is the centre of the first pixel."""
 
 
 @dataclass(frozen=True)
 class Others(Rows):
-    """The people that all cameras but some see."""
+    """People seen by all cameras except some."""
 
     frame: Index
     """(P,) frame of each person."""
@@ -43,39 +44,42 @@ class Others(Rows):
 
 
 Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
-"""What fits a camera to joints in the world (N, 3) and in its picture (N, 2) exactly."""
+"""Function that fits a camera to joints in the world (N, 3) and in its picture (N, 2), or returns
+None."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Which sightings of a camera are which people."""
+    """Matches between a camera's sightings and people."""
 
     person: Index
-    """(E,)."""
+    """(E,) rows of the people."""
     sighting: Index
     """(E,) rows of the camera's sightings."""
     error: Array
-    """(E,) median distance, as a part of the person's size in the picture."""
+    """(E,) median distance, as a share of the person's size in the picture."""
     possible: int
-    """How many could have been matched: in every frame the smaller number, of people or sightings."""
+    """Number of possible matches: in every frame the smaller of the counts of people
+    and sightings."""
 
     @property
     def score(self) -> float:
-        """How much of what could be matched is: 1 where all is without error, 0 where nothing is near."""
+        """Quality of the matches: 1 if all possible ones exist without error, 0 without any."""
         return float((1 - self.error / GATE).sum() / max(self.possible, 1))
 
 
 _LASTS = 45
-"""Frames after which a detector's errors are new: their correlation is 0.75 to 0.85 after one frame and 0.35 after
-a second (measured on Shelf and on simulated recordings)."""
+"""Number of frames after which a detector's errors are independent: their correlation is 0.75 to
+0.85 after one frame and 0.35 after a second (measured on Shelf and on simulated recordings)."""
 _JOINTS = 5
-"""Independent joints of a person: errors of one person in one view have two to three times the variance."""
+"""Number of independent joints per person; joint errors of one person in one view are
+correlated."""
 ERROR = 0.03
-"""A detector's usual error, as a part of a person's size."""
+"""Usual error of a detector, as a share of a person's size."""
 
 
 def independent(others: Others) -> float:
-    """How many independent joints people who are seen at some frames are worth."""
+    """Number of independent joints among people seen in some frames, given the correlations."""
     if len(others) == 0:
         return 0.0
     frames = np.unique(others.frame)
@@ -83,12 +87,14 @@ def independent(others: Others) -> float:
 
 
 def likelihood(score: float, worth: float, freedom: int) -> float:
-    """The likelihood's logarithm, up to a constant, of errors with this mean (`Match.score`), less BIC's price."""
+    """Log-likelihood, up to a constant, of errors with this mean (`Match.score`), less BIC's
+    penalty.
+    """
     return worth * score * GATE / ERROR - 0.5 * freedom * float(np.log(max(worth, 2.0)))
 
 
 def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Match:
-    """Each sighting with the person nearest to it, where it is the nearest to that person too."""
+    """Mutual nearest neighbours of people and sightings, within the gate."""
     person, sighting, error = distances(others.frame, others.points, seen, camera, lag)
     best_of_person, best_of_sighting = np.full(len(others), np.inf), np.full(len(seen), np.inf)
     np.minimum.at(best_of_person, person, error)
@@ -98,7 +104,7 @@ def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Mat
 
 
 def possible_matches(first: Index, second: Index) -> int:
-    """Pairs that there can be: in every frame the smaller count."""
+    """Number of possible pairs: in every frame the smaller count."""
     frames, counts = np.unique(first, return_counts=True)
     other, other_counts = np.unique(second, return_counts=True)
     _, i, j = np.intersect1d(frames, other, assume_unique=True, return_indices=True)
@@ -106,7 +112,9 @@ def possible_matches(first: Index, second: Index) -> int:
 
 
 def tries(others: Others, seen: Sightings, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
-    """Joints in the world (N, 3) and in the picture (N, 2) of people and sightings that may be one another."""
+    """Yield joints in the world (N, 3) and in the picture (N, 2) for random candidate pairs of
+    people and sightings.
+    """
     person, sighting = same_frame(others.frame, seen.frame)
     both = ~np.isnan(others.points[person][..., 0]) & ~np.isnan(seen.xy[sighting][..., 0])
     enough = np.flatnonzero(both.sum(axis=1) >= MIN_JOINTS + 3)
@@ -115,7 +123,9 @@ def tries(others: Others, seen: Sightings, rng: np.random.Generator) -> Iterator
 
 
 def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera, turned where it stands so that it looks best at `points` (N, 3) along the pixels `xy` (N, 2)."""
+    """The camera rotated about its centre for the best fit of directions to `points` (N, 3) and
+    pixels `xy` (N, 2).
+    """
     centre = -camera.cTw[:, :3].T @ camera.cTw[:, 3]
     away = points - centre
     away = away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -126,7 +136,9 @@ def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 
 def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera at the pose from which it sees `points` (N, 3) at `xy` (N, 2)."""
+    """The camera with the pose that projects `points` (N, 3) to `xy` (N, 2), by PnP; None on
+    failure.
+    """
     scale = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()
     if not scale > 0:
         return None
@@ -139,7 +151,9 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 
 def centred_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera whose principal point lies where it sees `points` (N, 3) at `xy` (N, 2), median."""
+    """The camera with its principal point shifted by the median error of `points` (N, 3) against
+    `xy` (N, 2).
+    """
     at, depth = camera.project(points)
     if not (depth > 0).all():
         return None
@@ -149,7 +163,9 @@ def centred_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
 
 
 def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinhole | None:
-    """The camera `scaled` by how much farther from `centre` (2,) than it says `points` (N, 3) are seen at `xy`."""
+    """The camera `scaled` about `centre` (2,) for the best fit of projected `points` (N, 3) to `xy`
+    (N, 2).
+    """
     at, depth = camera.project(points)
     if not (depth > 0).all():
         return None
@@ -159,7 +175,9 @@ def scaled_to(points: Array, xy: Array, camera: Pinhole, centre: Array) -> Pinho
 
 
 def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
-    """Pixels `factor` times as far from `centre` (2,): another focal length, or about `CORNER` picture size."""
+    """Scale pixels by `factor` about `centre` (2,): another focal length, or for `CORNER` another
+    picture size.
+    """
     K = camera.K.copy()
     K[:2, :2] *= factor
     K[:2, 2] = centre + factor * (K[:2, 2] - centre)
@@ -169,7 +187,7 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
 def best_of(
     others: Others, seen: Sightings, camera: Pinhole, pairs: Sequence[tuple[Array, Array]], fitted: Fitted
 ) -> Pinhole | None:
-    """Return the camera that fits all people best, of those that fit one person exactly."""
+    """Return the camera with the best score for all people, among exact fits to single people."""
     step = max(1, len(others) // 40)
     few = others.rows(slice(None, None, step))
     tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
@@ -180,7 +198,9 @@ def best_of(
 
 
 def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]) -> Pinhole:
-    """The camera, some of its parameters (`PARAMETERS`) fitted to the people that it matches."""
+    """The camera with some of its parameters (`PARAMETERS`) fitted to the people that
+    it matches.
+    """
     for _ in range(_ROUNDS):
         found = match(others, seen, camera)
         if len(found.person) == 0:
@@ -193,7 +213,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
 
 
 def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
-    """The camera, fitted robustly (Cauchy) to points (N, 3) seen at xy (N, 2)."""
+    """The camera fitted robustly (Cauchy) to points (N, 3) observed at xy (N, 2)."""
     ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
         return camera
@@ -223,8 +243,8 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
 
 
 def seen_by(points: Array, views: Views) -> tuple[Array, Array, Array]:
-    """Where cameras see `points` (N, J, 3): pixels, places before them (N, J, V, 2 and 3), and the derivatives of
-    pixels by these places (N, J, V, 2, 3).
+    """Projections of `points` (N, J, 3): pixels (N, J, V, 2), coordinates in the cameras (N, J, V,
+    3), and derivatives of pixels by these (N, J, V, 2, 3).
     """
     at = np.einsum("vab,njb->njva", views.cTw[:, :, :3], points) + views.cTw[:, :, 3]
     at[..., 2] = np.where(np.abs(at[..., 2]) < 1e-9, 1e-9, at[..., 2])
@@ -233,7 +253,9 @@ def seen_by(points: Array, views: Views) -> tuple[Array, Array, Array]:
 
 
 def by_parameters(xy: Array, at: Array, by_point: Array, views: Views) -> Array:
-    """(N, J, V, 2, Q) derivatives of pixels by the cameras' `PARAMETERS`, where they are as `seen_by` says."""
+    """(N, J, V, 2, Q) derivatives of pixels by the cameras' `PARAMETERS`, from the results of
+    `seen_by`.
+    """
     J = np.empty((*xy.shape, Q))
     J[..., TURN], J[..., MOVE] = np.cross(at[..., None, :], by_point), by_point
     J[..., CENTRE], J[..., FOCAL] = np.eye(2), (xy - views.K[:, :2, 2])[..., None]
@@ -241,14 +263,14 @@ def by_parameters(xy: Array, at: Array, by_point: Array, views: Views) -> Array:
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:
-    """By how many degrees a camera is turned, and how far moved, against another pose, both (3, 4)."""
+    """Rotation in degrees and distance of centres between two poses (3, 4)."""
     cosine = (np.trace(cTw[:, :3] @ other[:, :3].T) - 1) / 2
     centres = [-each[:, :3].T @ each[:, 3] for each in (cTw, other)]
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))), float(np.linalg.norm(centres[0] - centres[1]))
 
 
 def changed(views: Views, change: Array) -> Views:
-    """The cameras with `change` (V, Q) made to their parameters."""
+    """The cameras with `change` (V, Q) applied to their parameters."""
     cTw = exp_so3(change[:, 0:3]) @ views.cTw
     cTw[:, :, 3] += change[:, 3:6]
     K = views.K.copy()

@@ -1,4 +1,6 @@
-"""Mistakes of a set-up, each tried as a change that would put it right: late cameras, and gross mistakes."""
+"""Hypotheses on mistakes of a set-up, each tested as a correction: time offsets, and gross
+mistakes.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -25,44 +27,44 @@ from shapepose_fg.setup_check.over_time import stories
 from shapepose_fg.setup_check.small import ONE, Problem, named, probable
 
 _AGREEMENT, _LEAST_GAIN, _LIKELY_LAG, _SMALL = 0.12, 0.004, 12.0, 8
-"""An offset in time is named if it takes away enough of what people move in it, and 7 mm on average, or if the
-likelihood's logarithm rises by the third and it has no more frames than the fourth: sound simulated recordings of
-25 rigs came to 8. Farther off, people who stand come by chance to where they were."""
+"""Criteria for a time offset: sufficient agreement, and a gain of 7 mm on average; or the third as
+a gain in log-likelihood with at most as many frames as the fourth. Correct simulated recordings of
+25 rigs reached 8. At larger offsets, standing people come by chance to where they were."""
 _FOLLOWED = 0.05
-"""The agreement of those who are near with and without it: -0.02 to 0.02 in sound simulated recordings that have
-some other offset by chance, 0.12 and more in late ones."""
+"""Minimum agreement of people near with and without the offset: -0.02 to 0.02 in correct simulated
+recordings with a chance offset, 0.12 and more in late ones."""
 _HALF = 0.2
-"""A half of the recording in which people move this share of all that they move has a say."""
+"""Minimum share of all motion in a half of the recording for that half to count."""
 _STRIDE = 4
-"""Offsets are tried at every fourth frame first."""
+"""Step of the first search of offsets, frames."""
 _MOST_PEOPLE = 400
-"""People that are enough to tell an offset by."""
+"""Number of people sufficient for estimating an offset."""
 _LEAST_FRAMES = 40
-"""In fewer frames people hardly move far enough to tell a small offset in time from chance: in 20 frames of the
-built-in scene a camera that is in time looked 4 frames early."""
+"""Minimum number of frames. In fewer, people hardly move enough to separate a small time offset
+from chance: in 20 frames of the built-in scene a correct camera looked 4 frames early."""
 
 
 @dataclass(frozen=True)
 class Lag:
-    """An offset of a camera in time."""
+    """Time offset of a camera."""
 
     frames: int
-    """What the others show at frame t, the camera shows at t + frames: positive is late."""
+    """The camera shows at t + frames what the others show at frame t; positive is late."""
     gain: float
-    """By how much the joints' errors fall, as a part of the people's size: mean over all joints."""
+    """Mean decrease of the joints' errors, as a share of people's size."""
     likely: float
-    """Gain of the likelihood's logarithm."""
+    """Gain in log-likelihood."""
     agreement: float
-    """The gain over how far the joints move within the offset: near 1 if it is the offset, near -1 if there is
-    none, 0 without motion. Of the half of the frames in which it is less: an offset is in both halves, while
-    in one of them people may come by chance to where they were."""
+    """The gain relative to the motion of the joints within the offset: near 1 for a true offset,
+    near -1 without any, 0 without motion. The minimum over both halves of the frames: a true offset
+    is in both, while in one of them people may come by chance to where they were."""
     followed: float
-    """Agreement of people who are seen near enough with and without the offset: with people who hide each other,
-    more are near by chance at some offset."""
+    """Agreement of people seen near enough both with and without the offset; when people occlude
+    each other, others are near by chance at some offset."""
 
     @property
     def is_offset(self) -> bool:
-        """Whether it is more than chance."""
+        """Whether the offset is significant."""
         plain = self.agreement > _AGREEMENT and self.gain > _LEAST_GAIN
         small = abs(self.frames) <= _SMALL and self.likely > _LIKELY_LAG
         return self.followed > _FOLLOWED and (plain or (self.agreement > 0 and small))
@@ -72,14 +74,16 @@ NONE = Lag(0, 0.0, 0.0, 0.0, 0.0)
 
 
 def lags(look: Look) -> list[Lag]:
-    """Each camera's offset in time against the others; none is told in a short recording that fits as it is."""
+    """Time offset of each camera against the others; none in a short recording."""
     if len(np.unique(look.evidence.sightings.frame)) < _LEAST_FRAMES:
         return [NONE] * look.view_count
     return [lag_of(look, view) for view in range(look.view_count)]
 
 
 def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
-    """A camera's offset in time against the others, up to `most` frames: where its sightings fit people best."""
+    """Time offset of a camera against the others, up to `most` frames, at which its sightings fit
+    people best.
+    """
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
     others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
     worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
@@ -97,20 +101,21 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
 
 
 def _worth(lag: Lag) -> float:
-    """What an offset takes away, where it is one in both halves of the frames."""
+    """Gain of an offset that is consistent in both halves of the frames, else -inf."""
     return lag.gain if lag.agreement >= 0 else -np.inf
 
 
 @dataclass(frozen=True)
 class _Nearest:
-    """Each person's nearest sighting at some offset."""
+    """Nearest sighting of each person at one offset."""
 
     there: Mask
-    """(P,) whether the camera has that frame at all."""
+    """(P,) whether the camera has sightings in that frame."""
     sighting: Index
-    """(P,) -1 where none is within the gate."""
+    """(P,) row of the sighting; -1 if none is within the gate."""
     error: Array
-    """(P, J) distance of each joint, a part of the size, no more than GATE; NaN where the joint is not seen."""
+    """(P, J) distance of each joint as a share of the size, at most GATE; NaN if the joint is not
+    seen."""
 
 
 def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
@@ -130,14 +135,14 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
 
 
 def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest) -> Lag:
-    """How much better people fit at an offset than without: joints of people that both have, or one has."""
+    """Compare the fit with and without an offset, on joints of people seen in either case."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
     error_a, error_b = still.error[usable], moved.error[usable]
-    # Who is out of the gate at one of the offsets has moved by that much.
+    # People outside the gate at one of the offsets have moved at least by the gate.
     error_a = np.where((a < 0)[:, None] & ~np.isnan(error_b), GATE, error_a)
     error_b = np.where((b < 0)[:, None] & ~np.isnan(error_a), GATE, error_b)
-    xy = np.concatenate([seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)])  # the last for nobody
+    xy = np.concatenate([seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)])  # the last row is for no sighting
     size = np.append(seen.size_px, np.inf)
     with np.errstate(invalid="ignore"):
         way = np.linalg.norm(xy[a] - xy[b], axis=-1) / np.minimum(size[a], size[b])[:, None]
@@ -162,7 +167,7 @@ _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
     Kind.TRANSPOSED: lambda R, t: (R.T, t),
     Kind.AXES: lambda R, t: (np.diag([1.0, -1.0, -1.0]) @ R, t * (1.0, -1.0, -1.0)),
 }
-"""What a pose is after the usual misunderstandings of its file: of one camera, or of all."""
+"""Effect of common misinterpretations of a pose from a file, of one camera or of all."""
 _FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
@@ -170,44 +175,49 @@ _FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
     (Kind.FOCAL, lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]), FOCAL),
     (Kind.RESIZED, lambda points, xy, camera: fit.scaled_to(points, xy, camera, fit.CORNER), []),
 )
-"""What is fitted of one camera: to one person exactly, then its parameters (`fit.PARAMETERS`) to all."""
+"""Corrections of one camera: an exact fit to one person, then parameters (`fit.PARAMETERS`) fitted
+to all."""
 _FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
-"""Sizes of pictures that are made of others, for all cameras alike."""
+"""Factors of picture sizes that are tested for all cameras."""
 
 GOOD = 0.45
-"""A camera that matches the others' people so well is where it is said to be, but for small errors."""
+"""Score for the others' people above which a camera's pose is correct, except for small errors."""
 GOOD_PAIR = 0.65
-"""Score from which on two cameras fit each other; higher, because their rays have only to meet: sound pairs had
-0.67 and more, most of those with one that was mirrored, or turned by 8 degrees half-way, less."""
+"""Score above which two cameras fit each other; it is higher, because rays only need to intersect:
+correct pairs had 0.67 and more, and most pairs with a mirrored camera, or one rotated by 8 degrees
+half-way, less."""
 GAIN, _LIKELY = 0.12, 10.0
-"""What a change must bring of a camera's score, and of the likelihood's logarithm, to be named."""
+"""Minimum gain of a change in a camera's score, and in log-likelihood."""
 _EXPLAINED = 0.65
-"""Everything fits so well where nothing but detectors err, or little more: no other explanation is sought."""
+"""Total score above which no other explanation than detector errors is searched for."""
 _FEW = 40
-"""Frames that are enough for what all cameras share."""
+"""Number of frames sufficient for mistakes common to all cameras."""
 _PRICE = 0.02
-"""What a fitted parameter must bring of the score: half a centimetre of a person's joints is 0.02."""
+"""Minimum gain in score per fitted parameter: half a centimetre of a person's joints is 0.02."""
 _SLIGHT = 0.08
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change of the set-up, and what it brings."""
+    """A change of the set-up, and its effect."""
 
     finding: Finding
-    """What is wrong if the change is right."""
+    """The mistake that the change corrects."""
     look: Look
-    """The recording after it."""
+    """The look after the change."""
     score: float
-    """How well the camera fits the others after it (`Match.score`); all cameras, for what all share."""
+    """Score of the camera after the change (`Match.score`); total score for changes of
+    all cameras."""
     freedom: int = 0
-    """Parameters that were fitted."""
+    """Number of fitted parameters."""
     fitted: Kind | None = None
-    """Which of a camera's (`small.ONE`)."""
+    """Fitted kind of one camera (`small.ONE`), if any."""
 
 
 def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
-    """The change that explains best why cameras do not see the same people; None where they do, or none does."""
+    """The change that best explains why cameras see different people; None if they agree or nothing
+    explains it.
+    """
     fits = look.scores
     weak = np.flatnonzero(fits < (GOOD if look.view_count > 2 else GOOD_PAIR)).tolist()
     tried: list[Change] = []
@@ -244,13 +254,14 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
 
 
 def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
-    """The best of changes and what each is `judged`, with its probability, and what else it may be.
+    """The best of the changes with scores of `judged`, with its probability and alternatives.
 
-    A change that moves a camera must be likelier than a detector's bias, else it is none.
+    A change that moves a camera must be more probable than biases of the detector, else it is
+    rejected.
     """
     if len(found) == 0:
         return None
-    # All that is seen bears on it: as many independent joints as people and cameras have.
+    # Evidence counts all independent joints of people and cameras.
     gains = np.array([gain for gain, _ in found]) * GATE / ERROR
     gains *= look.view_count * max(independent(look.others(view)) for view in range(look.view_count))
     weights = np.exp(gains - gains.max()) / np.exp(gains - gains.max()).sum()
@@ -261,7 +272,8 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
     best, (view, *_) = changes[0], changes[0].finding.cameras
     if best.look.evidence is not look.evidence or best.look.lag is not look.lag:
         return replace(best, finding=one_of([each.finding for each in changes]))
-    # Which of a camera's parameters are wrong shows in single joints, with the people free.
+    # Which parameters of a camera are wrong is decided on single joints, with the people's
+    # positions free.
     rivals = [each for each in changes if each.fitted is not None and each.finding.cameras == best.finding.cameras]
     problem = Problem.of(best.look, look.views)
     if best.fitted is None:
@@ -285,17 +297,17 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
 
 
 def _slight(finding: Finding) -> bool:
-    """Whether it is too small to be gross: no pictures are made 4 % smaller."""
+    """Whether a scale change is too small for a gross mistake: no pictures are resized by 4 %."""
     return finding.kind in (Kind.FOCAL, Kind.RESIZED) and abs(np.log(finding.amount)) < _SLIGHT
 
 
 def judged(look: Look, change: Change) -> float:
-    """How much better everything fits after a change, less the price of its parameters."""
+    """Gain in total score by a change, less the penalty for its parameters."""
     return change.look.total - look.total - _PRICE * change.freedom / look.view_count
 
 
 def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
-    """Changes of one camera that fit it to the people that the others see, the best of each kind."""
+    """Changes of one camera that fit it to the people of the others, the best of each kind."""
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     if len(others) == 0 or len(seen) == 0:
         return
@@ -320,13 +332,16 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
         else:
             finding = named(kind, view, look.views, after.views)
         score = match(others, seen, best).score
-        # Cameras are knocked more often than lenses change: a shift does not win by having one parameter less.
+        # Cameras are bumped more often than lenses change: a shift must not win by having one
+        # parameter less.
         freedom = len(TURN) if kind == Kind.PRINCIPAL_POINT else max(len(columns), 1)
         yield Change(finding, after, score, freedom, kind if kind in ONE else None)
 
 
 def _in_mirror(look: Look, view: int) -> list[Change]:
-    """One camera's pictures mirrored: before joints were detected in them, left for right, or afterwards."""
+    """Mirrored pictures of one camera: before detection, which exchanges left and right, or
+    afterwards.
+    """
     width = np.broadcast_to(look.views.image_sizes, (look.view_count, 2))[view, 0]
 
     def mirrored(seen: Sightings, joints: Index) -> Sightings:
@@ -343,7 +358,7 @@ def _in_mirror(look: Look, view: int) -> list[Change]:
 
 
 def _of_two(look: Look, first: int, second: int) -> Change:
-    """Two cameras exchanged, as the people that all others see say it; scored 0 where they see none."""
+    """Two cameras exchanged, scored by the people that all others see; 0 if they see none."""
     others = look.others(first, second)
     change = look.with_cameras({first: look.camera(second), second: look.camera(first)})
     score = min(match(others, look.seen_by(view), change.camera(view)).score for view in (first, second))
@@ -351,7 +366,7 @@ def _of_two(look: Look, first: int, second: int) -> Change:
 
 
 def _of_all(look: Look) -> Iterator[Change]:
-    """Mistakes that all cameras share."""
+    """Mistakes common to all cameras."""
     everybody = tuple(range(look.view_count))
     for kind in _MISREAD:
         yield _misread(look, kind, everybody)
@@ -361,17 +376,17 @@ def _of_all(look: Look) -> Iterator[Change]:
 
 
 def _misread(look: Look, kind: Kind, views: tuple[int, ...]) -> Change:
-    """The poses of some cameras misunderstood, by how well all fit."""
+    """Misinterpreted poses of some cameras, with the total score."""
     return _whole(look, Finding(kind, views), {view: misread(kind, look.camera(view)) for view in views})
 
 
 def _whole(look: Look, finding: Finding, cameras: dict[int, Pinhole]) -> Change:
-    """A change that is judged by how well everything fits."""
+    """A change with the total score."""
     change = look.with_cameras(cameras)
     return Change(finding, change, change.total)
 
 
 def misread(kind: Kind, camera: Pinhole) -> Pinhole:
-    """The camera with its pose after one of the usual misunderstandings."""
+    """The camera with its pose after a common misinterpretation."""
     R, t = _MISREAD[kind](camera.cTw[:, :3], camera.cTw[:, 3])
     return Pinhole(camera.K, np.column_stack([R, t]))

@@ -1,6 +1,6 @@
-"""Whether the joints of a recording are the ones that its skeleton says, told by how people's joints lie.
+"""Tests the joint order of a recording's skeleton against the proportions of bodies.
 
-Cameras agree on the points whatever they are called: a wrong order fits every calibration, but no body.
+Cameras agree on points whatever their names: a wrong order fits every calibration, but no body.
 """
 
 from collections.abc import Sequence
@@ -18,27 +18,28 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.matching import people_of
 
 _MOST_PEOPLE = 150
-"""People that are compared, in pictures and in space; more tell nothing new."""
+"""Maximum number of people compared, in pictures and in 3D."""
 _FEWEST = 20
-"""With fewer nothing is said."""
+"""Minimum number of people for any statement."""
 _FEWEST_JOINTS = 7
-"""Joints in the trunk and limbs below which an order is not told."""
+"""Minimum number of joints in trunk and limbs for any statement."""
 _GAIN, _SHARE = 0.02, 0.8
-"""Least gain in space, nats a pair of joints, and least share of people who gain. In 198 clips of motion capture
-an exchange gains up to 0.035 over the right order, in at most 0.7 of the frames; undoing the exchange of two
-joints gains 0.02 to 0.5."""
+"""Minimum gain in 3D, nats per pair of joints, and minimum share of people who gain. In 198
+motion-capture clips an exchange gains up to 0.035 over the right order, in at most 0.7 of the
+frames; undoing a true exchange of two joints gains 0.02 to 0.5."""
 _GAIN_2D, _SHARE_2D = 0.01, 0.85
-"""Least gain and share of people in pictures, where people are not placed in space, or badly."""
+"""Minimum gain and share of people in pictures, if people have no or poor 3D positions."""
 _OTHER_LAYOUT = 0.1
-"""Least gain of a known layout, nats a pair; right ones gain 0.7 to 1.7, but for two that differ in two joints."""
+"""Minimum gain of a known layout, nats per pair; correct ones gain 0.7 to 1.7, except between two
+layouts that differ in two joints."""
 _FACING = 0.25
-"""Share of people who look forwards, below which left and right are exchanged: 0.77 to 1 in motion capture,
-0.67 and more of real detections."""
+"""Share of people facing forwards below which left and right are exchanged: 0.77 to 1 in motion
+capture, 0.67 and more for real detections."""
 _ARMS, _LEGS = ("Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle")
 
 
 def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
-    """What is wrong with the joints' names, if anything; `look` has the set-up with other mistakes put right."""
+    """Findings on the names of joints; `look` has the set-up with other mistakes corrected."""
     skeleton = detections.skeleton
     pictures = _people(detections, look, skeleton)
     told = _other_layout(pictures, skeleton) if len(pictures) >= _FEWEST else None
@@ -66,7 +67,9 @@ def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
 
 
 def _words(names: Sequence[str], order: Sequence[int]) -> tuple[str, ...]:
-    """What of the names (J) is exchanged, where entry k of `order` is the place of what is called `names[k]`."""
+    """The exchanged joints among the names (J) in words; entry k of `order` is the index of the
+    true `names[k]`.
+    """
     moved = {names[place]: names[k] for k, place in enumerate(order) if place != k}
     swapped = all(moved.get(to) == name for name, to in moved.items())
     pairs = [(name, to) for name, to in moved.items() if name < to]
@@ -86,7 +89,7 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequence[int]) -> bool:
-    """Whether people surely fit a body better in another order of their joints."""
+    """Whether people fit a body significantly better with another order of their joints."""
 
     def gain(people: Array) -> tuple[float, float]:
         more = fit_of_order(people[:, order], names) - fit_of_order(people, names)
@@ -106,7 +109,9 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
 
 
 def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
-    """The known layout that people (N, K, 2) fit surely better than the skeleton's own; None for none."""
+    """The known layout that fits people (N, K, 2) significantly better than the skeleton's; None
+    for none.
+    """
     own = keypoint_names(skeleton)
     found = fit_of_order(people, own)
     best, gain = None, _OTHER_LAYOUT
@@ -121,7 +126,7 @@ def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
 
 
 def _backwards(points: Array, names: Sequence[str]) -> bool:
-    """Whether people (P, J, 3) bend knees and elbows, and look, where their backs should be."""
+    """Whether knees, elbows and noses of people (P, J, 3) point backwards."""
     nowhere = np.full((len(points), 3), np.nan)
 
     def joint(name: str) -> Array:
@@ -141,7 +146,9 @@ def _backwards(points: Array, names: Sequence[str]) -> bool:
 
 
 def _sides(names: Sequence[str]) -> list[list[tuple[int, int]]]:
-    """Groups of pairs of joints that are exchanged together: of arms, of legs, and of their ends."""
+    """Groups of pairs of joints that may be exchanged jointly: of arms, of legs, and of
+    their ends.
+    """
     groups = [
         [
             (names.index("R" + part), names.index("L" + part))
@@ -154,7 +161,7 @@ def _sides(names: Sequence[str]) -> list[list[tuple[int, int]]]:
 
 
 def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Array:
-    """(N, K, 2) people in pictures at frames that are looked at, keypoint by keypoint, NaN where not seen."""
+    """(N, K, 2) people in pictures in some of the frames used, by keypoint, NaN where not seen."""
     names = keypoint_names(skeleton)
     place = np.array([names.index(joint) if joint in names else -1 for joint in skeleton.joints])
     frames = look.evidence.anchors[:: max(1, len(look.evidence.anchors) // 30)].tolist()
@@ -163,5 +170,5 @@ def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Ar
 
 
 def _some(people: Array) -> Array:
-    """At most `_MOST_PEOPLE` of them, spread."""
+    """At most `_MOST_PEOPLE` of them, evenly spread."""
     return people[:: -(-len(people) // _MOST_PEOPLE) if len(people) > 0 else 1]

@@ -1,7 +1,7 @@
-"""Who was seen by which camera, and which sightings are one person, if the cameras are where they are said to be.
+"""Sightings of people by single cameras, and their association under assumed cameras.
 
-Nothing here has a unit: an error is a part of the person's own size in the picture, so that a calibration in the
-wrong unit matches as well as the right one.
+All errors are relative to the person's size in the picture, so that matches do not depend on the
+calibration's unit.
 """
 
 from collections.abc import Iterable
@@ -19,32 +19,35 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.people_2d import group_people
 
 MIN_JOINTS = 5
-"""A person with fewer core joints in view says too little about the camera."""
+"""Minimum number of core joints in view for a person to be used."""
 _STATURE_PER_SPREAD = 3.4
-"""Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 if spread evenly."""
+"""Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for a
+uniform spread."""
 
 
 @dataclass(frozen=True)
 class Sightings(Rows):
-    """S people as single cameras saw them, J core joints each."""
+    """S sightings of people by single cameras, J core joints each."""
 
     frame: Index
     """(S,) frame of the recording."""
     view: Index
-    """(S,) camera in the rig."""
+    """(S,) index of the camera in the rig."""
     xy: Array
     """(S, J, 2) joints, undistorted pixels; NaN where not seen."""
     confidence: Array
-    """(S, J) the detector's score; 0 where not seen."""
+    """(S, J) confidence of the detector; 0 where not seen."""
 
     @cached_property
     def size_px(self) -> Array:
-        """(S,) how large a person is in the picture, about the height of one who stands, pixels."""
+        """(S,) size of each person in the picture, about the height if standing, pixels."""
         return size_of(self.xy)
 
     @classmethod
     def of(cls, detections: DetectionSequence, frames: Iterable[int]) -> "Sightings":
-        """The 2D people of some `frames`, grouped by affinities of their own picture; the core joints only."""
+        """The 2D people of some `frames`, grouped by affinities within each view; core
+        joints only.
+        """
         joints = len(detections.skeleton.core)
         none = Sightings(
             np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints))
@@ -55,12 +58,12 @@ class Sightings(Rows):
 
 @dataclass(frozen=True)
 class Pinhole:
-    """One camera without its lens."""
+    """A camera without lens distortion."""
 
     K: Array
-    """(3, 3)."""
+    """(3, 3) intrinsics."""
     cTw: Array
-    """(3, 4)."""
+    """(3, 4) camera from world."""
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Pixels (..., 2) and depths (...) of `points` (..., 3) in the world."""
@@ -70,7 +73,7 @@ class Pinhole:
 
 
 def size_of(xy: Array) -> Array:
-    """(...) size of people whose joints xy (..., J, 2) lie so, pixels; 1 where nothing is seen."""
+    """(...) size of people with joints xy (..., J, 2), pixels; 1 if nothing is seen."""
     seen = ~np.isnan(xy[..., :1])
     count = np.maximum(seen.sum(axis=-2), 1)
     here = np.where(seen, xy, 0.0)
@@ -80,10 +83,11 @@ def size_of(xy: Array) -> Array:
 
 
 def people_of(found: Detections, place: Index, count: int, least: int) -> tuple[Index, Array, Array]:
-    """The 2D people of one frame of whom `least` joints are seen: views (N,), pixels (N, K, 2) and scores (N, K).
+    """The 2D people of one frame with at least `least` joints: views (N,), pixels (N, K, 2) and
+    confidences (N, K).
 
-    K is the `count` of joints; pixels are NaN and scores 0 where not seen. `place` (J,) says where among the K
-    each of the detector's joints is, -1 for none.
+    K is the `count` of joints; pixels are NaN and confidences 0 where not seen. `place` (J,) is the
+    index among the K of each of the detector's joints, -1 for none.
     """
     groups = [rows[place[found.joint[rows]] >= 0] for rows in group_people(found)]
     groups = [rows for rows in groups if len(rows) >= least]
@@ -108,13 +112,14 @@ def _of_frame(found: Detections, frame: int, skeleton: Skeleton) -> Sightings:
 
 
 _MOST_IN_A_PICTURE = 24
-"""People of a picture that are compared with others', the surest: chance meetings, and the time that they take,
-grow with the square of how many there are."""
+"""Maximum number of people per picture that are compared, the most confident ones: chance matches,
+and the time, grow with the square of the number."""
 GATE = 0.15
-"""Two sightings whose joints miss each other by more than this part of the person's size are not one person: a
-detector errs by 3 cm of 170, and a calibration that is worth naming by three times that (docs/setup_checks.md)."""
+"""Maximum distance between the joints of two sightings of a person, as a share of the person's
+size. A detector errs by 3 cm of 170; the smallest reported error of a calibration is three times
+that (docs/setup_checks.md)."""
 _MIN_ANGLE = np.deg2rad(4.0)
-"""Least angle between two rays of a pair that places a person: below it depth is guessed."""
+"""Minimum angle between the two rays of a pair, rad; below it the depth is poorly observed."""
 
 
 @dataclass(frozen=True)
@@ -122,31 +127,35 @@ class Groups(Rows):
     """P people: the sighting of each camera."""
 
     frame: Index
-    """(P,) frame."""
+    """(P,) frame of each person."""
     member: Index
-    """(P, V) the sighting of each camera, -1 where it does not see the person."""
+    """(P, V) row of the sighting by each camera, -1 for none."""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """M pairs of sightings of one frame and two cameras that may be one person, and who else saw that person."""
+    """M pairs of sightings in one frame by two cameras that may be one person, with supporting
+    sightings.
+    """
 
     members: Index
     """(M, 2) the two sightings."""
     views: Index
     """(M, 2) their cameras."""
     error: Array
-    """(M,) median distance of their rays, as a part of the person's size in the picture."""
+    """(M,) median distance of their rays, as a share of the person's size in the picture."""
     frame: Index
     """(M,) frame of each."""
     third: Index
-    """(M, V) the sighting of every other camera that is nearest to the person's projection; -1 for none."""
+    """(M, V) sighting of every other camera nearest to the person's projection; -1 for none."""
     third_error: Array
-    """(M, V) its median distance, as a part of its size; inf for none."""
+    """(M, V) its median distance, as a share of its size; inf for none."""
 
     @classmethod
     def of(cls, sightings: Sightings, views: Views) -> "Pairs":
-        """All pairs of sightings that may be one person under the cameras `views`, the first camera's first."""
+        """All pairs of sightings that may be one person under the cameras `views`, in order of
+        cameras.
+        """
         first, second = same_frame(sightings.frame, sightings.frame)
         apart = sightings.view[first] < sightings.view[second]
         first, second = first[apart], second[apart]
@@ -159,13 +168,15 @@ class Pairs:
         )
 
     def groups(self, count: int, views: tuple[int, ...]) -> Groups:
-        """People as the cameras `views` alone see them: the best supported pairs first, each sighting used once.
+        """Associate people by the cameras `views` only: greedily by support, each sighting used
+        once.
 
-        `count` is S, of all sightings. In every round each frame takes its best pair with those that support it.
+        `count` is the number S of sightings. In every round each frame takes its best pair with the
+        supporting sightings.
         """
         allowed = np.zeros(self.third.shape[1], dtype=bool)
         allowed[list(views)] = True
-        free = np.ones(count + 1, dtype=bool)  # the last stands for no sighting
+        free = np.ones(count + 1, dtype=bool)  # the last is for no sighting
         free[count] = False
         V = len(allowed)
         live = np.flatnonzero(allowed[self.views].all(axis=1))
@@ -187,7 +198,9 @@ class Pairs:
         return Groups(np.concatenate(frames), np.concatenate(rows))
 
     def errors_of(self, groups: Groups, first: int, second: int) -> Array:
-        """(P,) by how much the rays of two cameras miss each other, of people grouped by these two alone."""
+        """(P,) distances between the rays of two cameras, for people associated by
+        these two only.
+        """
         of_pair = (self.views == (first, second)).all(axis=1)
         members = self.members[of_pair].tolist()
         error = {(a, b): miss for (a, b), miss in zip(members, self.error[of_pair].tolist(), strict=True)}
@@ -195,7 +208,7 @@ class Pairs:
 
 
 def rays_of(sightings: Sightings, views: Views) -> Array:
-    """(S, J, 3) unit vectors in the world from the camera to each joint; NaN where not seen."""
+    """(S, J, 3) unit directions in the world from the camera to each joint; NaN where not seen."""
     inverse = np.linalg.inv(views.K)[sightings.view]
     camera = np.einsum("sij,skj->ski", inverse[:, :, :2], sightings.xy) + inverse[:, None, :, 2]
     world = np.einsum("sji,skj->ski", views.cTw[sightings.view, :, :3], camera)
@@ -208,10 +221,11 @@ def centres_of(views: Views) -> Array:
 
 
 def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) -> tuple[Array, Array]:
-    """How far the rays of pairs miss each other (M,), as a part of people's sizes, and where they meet (M, J, 3).
+    """Median distances of the rays of pairs (M,), relative to people's sizes, and triangulated
+    midpoints (M, J, 3).
 
-    The middle of the shortest line between two rays. Infinite where the rays meet behind a camera, are almost
-    parallel, or have fewer than MIN_JOINTS joints in common.
+    Infinite if rays intersect behind a camera, are almost parallel, or have fewer than MIN_JOINTS
+    joints in common.
     """
     rays, centres = rays_of(sightings, views), centres_of(views)
     a, b = rays[first], rays[second]
@@ -234,7 +248,9 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
 
 
 def _others(sightings: Sightings, views: Views, members: Index, points: Array) -> tuple[Index, Array]:
-    """For pairs that place a person at `points` (M, J, 3), who else saw them: see `Pairs`."""
+    """Supporting sightings by other cameras for pairs with joints at `points` (M, J, 3): see
+    `Pairs`.
+    """
     frame = sightings.frame[members[:, 0]] if len(members) > 0 else np.zeros(0, np.intp)
     third = np.full((len(members), len(views)), -1, dtype=np.intp)
     third_error = np.full(third.shape, np.inf)
@@ -255,8 +271,9 @@ def distances(
 ) -> tuple[Index, Index, Array]:
     """Median distance of each person's projection to each sighting of one camera in the same frame.
 
-    `points` (P, J, 3) are people at `frame` (P,), `seen` what the `camera` saw, `lag` frames later. Returns
-    person (E,), sighting (E,) and error (E,), a part of the sighting's size.
+    `points` (P, J, 3) are people at `frame` (P,), `seen` the sightings of the `camera`, `lag`
+    frames later. Returns person (E,), sighting (E,) and error (E,), as a share of the sighting's
+    size.
     """
     person, sighting = same_frame(frame, seen.frame - lag)
     error = miss_px(points[person], seen.xy[sighting], camera)
@@ -273,14 +290,16 @@ def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
 
 
 def least_of_each(key: Index, value: Array) -> Index:
-    """The row with the least `value` (N,) of each `key` (N,), by rising keys; the first of equal ones."""
+    """Row with the smallest `value` (N,) for each `key` (N,), by ascending keys; ties keep their
+    order.
+    """
     order = np.lexsort((value, key))
     return order[np.unique(key[order], return_index=True)[1]]
 
 
 def miss_px(points: Array, xy: Array, camera: Pinhole) -> Array:
-    """(N, J) distance of projected `points` (N, J, 3) from the joints `xy` (N, J, 2), pixels; infinite behind the
-    camera, NaN where nothing was seen.
+    """(N, J) distance of projected `points` (N, J, 3) from the joints `xy` (N, J, 2), pixels;
+    infinite behind the camera, NaN for joints not seen.
     """
     at, depth = camera.project(points)
     miss = np.sqrt(np.square(at - xy).sum(axis=-1))
@@ -288,8 +307,8 @@ def miss_px(points: Array, xy: Array, camera: Pinhole) -> Array:
 
 
 def median_of(values: Array, least: int = 1) -> Array:
-    """(...) median of the last axis without NaN, the lower of two middles; infinite with fewer than `least`
-    values.
+    """(...) median over the last axis ignoring NaN, the lower of two middle values; infinite with
+    fewer than `least`.
     """
     ordered = np.sort(values, axis=-1)  # NaN last
     count = (~np.isnan(values)).sum(axis=-1)
@@ -298,7 +317,7 @@ def median_of(values: Array, least: int = 1) -> Array:
 
 
 def median_over(values: Array) -> Array:
-    """(...) median over the first axis, without NaN; 0 where there is nothing else."""
+    """(...) median over the first axis ignoring NaN; 0 if all are NaN."""
     ordered = np.sort(values, axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
     middle = [np.take_along_axis(ordered, np.maximum(count - k, 0)[None] // 2, axis=0)[0] for k in (0, 1)]
@@ -306,12 +325,14 @@ def median_over(values: Array) -> Array:
 
 
 _REACH, _FORGOTTEN = 1.4, 40
-"""A person is followed from frame to frame over so many times the spread of the joints (two thirds of a metre),
-and sought for so many frames."""
+"""Maximum distance that a person moves between frames, relative to the spread of the joints (two
+thirds of a metre), and the number of frames after which a lost person is forgotten."""
 
 
 def followed(frame: Index, points: Array) -> Index:
-    """(P,) who people (P, J, 3) at some frames are: each is the nearest of the frame before, if that is near."""
+    """(P,) identities of people (P, J, 3) over frames: each continues the nearest of the frame
+    before, if near.
+    """
     middle = _middle(points)
     spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
     reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
@@ -323,7 +344,7 @@ def followed(frame: Index, points: Array) -> Index:
         near = away[after, before] < reach
         who[here[after[near]]] = who[last[before[near]]]
         new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
-        if len(new) == len(lost) == 1:  # the only one who can have come back, after a cut for example
+        if len(new) == len(lost) == 1:  # the only possible pair, e.g. after a cut
             who[new], lost = who[lost], lost[:0]
         else:
             who[new] = count + np.arange(len(new))
@@ -334,6 +355,6 @@ def followed(frame: Index, points: Array) -> Index:
 
 
 def _middle(points: Array) -> Array:
-    """(N, n) mean of those `points` (N, J, n) that there are; 0 where there are none."""
+    """(N, n) mean over the points (N, J, n) that are not NaN; 0 if there are none."""
     there = ~np.isnan(points[..., :1])
     return np.asarray(np.where(there, points, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))

@@ -1,7 +1,8 @@
-"""Cameras that fit in one part of a recording and not in another: bumped, drifting, or lost from some frame on.
+"""Cameras that fit in one part of a recording only: bumped, drifting, or wrong from some frame on.
 
-A camera's turn is fitted in pieces of the recording. What these turns look like (one step, a line, nothing that
-fits) is tried on all frames, and weighed against one turn for the whole recording.
+A camera's rotation is fitted in pieces of the recording. Models of these rotations (one step, a
+linear drift) are fitted to all frames, and compared by likelihood with one rotation for the whole
+recording.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,20 +21,23 @@ from shapepose_fg.setup_check.matching import GATE, Pinhole, Sightings
 
 _PIECES = 12
 _LEAST_PEOPLE = 6
-"""Fewer people of the others say nothing of a piece."""
+"""Minimum number of the others' people for a piece to be used."""
 _RESTLESS = 0.1
-"""A camera is looked at closely if its score differs by so much between pieces: people lie 3 cm farther off."""
+"""Difference of a camera's score between pieces above which it is examined: 3 cm on people."""
 _THERE, _GOOD = 0.2, 0.45
-"""A piece says something from the first score on (in crowds sound cameras come to little more); below the second
-other turns than its neighbours' are tried."""
+"""Minimum score for a piece to be used (in crowds correct cameras have little more), and score
+below which rotations other than the neighbouring pieces' are tried."""
 _LEAST_DEG = 1.2
-"""A smaller step or way is not told from a detector that errs otherwise on a person who turns round."""
+"""Minimum step or drift, degrees; smaller ones may be detector errors that depend on people's
+orientation."""
 _SURE = 6.0
-"""By so much the logarithm of the likelihood must rise over that of the best turn that lasts."""
+"""Minimum gain in log-likelihood over the best constant rotation."""
 
 
 def warped(seen: Sightings, camera: Pinhole, turns: Array) -> Sightings:
-    """What `camera` would have seen without the `turns` (S, 3), rotation vectors about its own axes."""
+    """Sightings as `camera` would have them without the rotations `turns` (S, 3), vectors about its
+    own axes.
+    """
     back = camera.K @ exp_so3(-turns) @ np.linalg.inv(camera.K)
     h = np.einsum("sij,snj->sni", back[:, :, :2], seen.xy) + back[:, None, :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -42,13 +46,14 @@ def warped(seen: Sightings, camera: Pinhole, turns: Array) -> Sightings:
 
 
 Way = Callable[[Index], Array]
-"""From frames (S,) to rotation vectors (S, 3): how a camera is turned in each, about its own axes."""
+"""Function from frames (S,) to rotation vectors (S, 3) of a camera about its own axes."""
 
 
 def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[Finding, Look, int]]:
-    """What one camera did over time, if that explains what it saw better than a pose that lasts.
+    """Findings on motions of one camera over time that explain its sightings better than a constant
+    pose.
 
-    Each with the recording as if it had not, and how many parameters that took.
+    Each comes with the corrected look, and the number of parameters.
     """
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     both = np.intersect1d(others.frame, seen.frame)
@@ -83,12 +88,12 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
 
 
 def _as_if_still(look: Look, view: int, way: Way) -> Look:
-    """The recording as if the camera had not been turned."""
+    """The look corrected for the rotations of a camera."""
     return look.seeing(view, lambda seen: warped(seen, look.camera(view), way(seen.frame - look.lag[view])))
 
 
 def _during(others: Others, seen: Sightings, first: float, last: float) -> tuple[Others, Sightings]:
-    """What is of some frames only."""
+    """People and sightings in the frames from `first` to before `last`."""
     there, here = ((each.frame >= first) & (each.frame < last) for each in (others, seen))
     return others.rows(there), seen.rows(here)
 
@@ -96,8 +101,8 @@ def _during(others: Others, seen: Sightings, first: float, last: float) -> tuple
 def _turns(
     pieces: list[tuple[Others, Sightings]], camera: Pinhole, best: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """(n, 3) the turn that fits each piece best, and (n,) its score; from the `best` piece to both ends, each from
-    the turn of the piece before it.
+    """(n, 3) rotation that fits each piece best, and (n,) its score; from the `best` piece towards
+    both ends, each initialised by the piece before.
     """
     n = len(pieces)
     turns, scores = np.zeros((n, 3)), np.zeros(n)
@@ -113,17 +118,19 @@ def _turns(
 
 
 def _turned(camera: Pinhole, turn: Array) -> Pinhole:
-    """The camera turned by a rotation vector (3,) of its own axes."""
+    """The camera rotated by a rotation vector (3,) about its own axes."""
     return Pinhole(camera.K, exp_so3(turn) @ camera.cTw)
 
 
 def _turn_between(camera: Pinhole, other: Pinhole) -> Array:
-    """(3,) the rotation vector of what turns a camera to another."""
+    """(3,) rotation vector from one camera to another."""
     return log_so3(other.cTw[:, :3] @ camera.cTw[:, :3].T)
 
 
 def _bumped(others: Others, seen: Sightings, camera: Pinhole, turns: Array) -> tuple[Finding, Way, int]:
-    """One step from one turn to another, by the `turns` (n, 3) of pieces, and its number of parameters."""
+    """One step between two rotations, from the `turns` (n, 3) of pieces, and its number of
+    parameters.
+    """
     splits = [(turns[:j], turns[j:]) for j in range(1, len(turns))]
     split = min(splits, key=lambda parts: sum(np.abs(each - np.median(each, axis=0)).sum() for each in parts))
     before, after = (np.median(each, axis=0) for each in split)
@@ -144,14 +151,14 @@ def _bumped(others: Others, seen: Sightings, camera: Pinhole, turns: Array) -> t
 
 
 def _settled(others: Others, seen: Sightings, camera: Pinhole, turn: Array) -> Array:
-    """(3,) a turn, other than none, fitted to some frames."""
+    """(3,) a non-zero rotation, fitted to some frames."""
     if not turn.any() or min(len(others), len(seen)) == 0:
         return turn
     return _turn_between(camera, fit.refined(others, seen, _turned(camera, turn), TURN))
 
 
 def _step(others: Others, seen: Sightings, camera: Pinhole, before: Array, after: Array) -> int:
-    """The first frame that fits one turn better than the other, when those before it fit the other better."""
+    """The frame at which switching from one rotation to the other fits best."""
     frames = np.unique(others.frame)
     worth = np.zeros((2, len(frames)))
     for row, turn in enumerate((before, after)):
@@ -163,8 +170,8 @@ def _step(others: Others, seen: Sightings, camera: Pinhole, before: Array, after
 
 
 def _drifted(t: Array, turns: Array, first: int, last: int) -> tuple[Finding, Way, int]:
-    """A turn that grows with time, by the `turns` (n, 3) of pieces at frames `t` (n,), and its number of
-    parameters.
+    """A rotation linear in time, from the `turns` (n, 3) of pieces at frames `t` (n,), and its
+    number of parameters.
     """
     A = np.column_stack([np.ones(len(t)), t - first])
     weight = np.ones(len(t))
@@ -177,12 +184,14 @@ def _drifted(t: Array, turns: Array, first: int, last: int) -> tuple[Finding, Wa
 
 
 _PARTED, _LEAST_PART, _POOR = 0.3, 0.15, 0.5
-"""Two cameras, whose rays have only to meet, stop to agree where their score falls by so much, with this part of
-the people on either side, and to so little."""
+"""Criteria for two cameras, with rays that only need to intersect, to stop agreeing: the drop of
+the score, the share of people on either side, and the maximum score after it."""
 
 
 def parted(look: Look) -> tuple[int | None, int | None] | None:
-    """The frames in which two cameras do not agree, where they do in the others; of more, `stories` are told."""
+    """The frames in which two cameras disagree though they agree in the others; for more cameras
+    see `stories`.
+    """
     views, last = np.unique(look.sightings.view).tolist(), int(look.sightings.frame.max()) + 1
     if len(views) != 2:
         return None

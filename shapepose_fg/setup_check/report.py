@@ -1,6 +1,6 @@
-"""The check of a set-up as one value: what is wrong in words, and the figures; for run.json and the terminal.
+"""The report on a set-up as one value, in words and figures, for run.json and the terminal.
 
-`check_setup` needs cameras and detections; `result_check` adds what a reconstruction says of them.
+`check_setup` needs cameras and detections; `result_check` adds results of a reconstruction.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,68 +26,69 @@ from shapepose_fg.setup_check.matching import GATE, miss_px, size_of
 
 @dataclass(frozen=True)
 class CameraFigures:
-    """How one camera fits the others. Lengths are at the joints' depth."""
+    """Fit of one camera to the others. Lengths are at the joints' depth."""
 
     camera: str
-    """Its name."""
+    """Name of the camera."""
     people: int
-    """People that it saw in the frames that were looked at."""
+    """Number of people seen in the frames used."""
     matched: float
     """Share of them that another camera sees too."""
     median_px: float | None
-    """Median distance of a projected joint to its detection, all that were matched, pixels."""
+    """Median reprojection error of all matched joints, pixels."""
     high_px: float | None
-    """Nine of ten are nearer."""
+    """90 % quantile of the reprojection error, pixels."""
     median_mm: float | None
-    """Median distance as a length, millimetres."""
+    """Median reprojection error as a length, millimetres."""
     high_mm: float | None
-    """Nine of ten are nearer."""
+    """90 % quantile of the reprojection error as a length, millimetres."""
     left_out_px: float | None
-    """Median distance to where the other cameras alone put the joint, pixels."""
+    """Median distance from joints triangulated by the other cameras only, pixels."""
     left_out_mm: float | None
-    """Median distance to there as a length, millimetres."""
+    """Median of this distance as a length, millimetres."""
     left_out_matched: float
-    """Share of the people seen by the others that the camera could match and does match."""
+    """Share of the possible matches with people of the others that the camera has."""
     late_frames: int
-    """Frames by which it is late against the others; negative: early."""
+    """Delay against the others, frames; negative: early."""
 
 
 @dataclass(frozen=True)
 class PairFigures:
-    """How two cameras fit each other."""
+    """Fit of two cameras to each other."""
 
     first: str
     second: str
-    """Their names."""
+    """Names of the two cameras."""
     matched: float | None
-    """Share of the people that both could see who fit; None where they never see anybody at once."""
+    """Share of the possible common people that fit; None if they never see people at once."""
     miss_px: float | None
-    """Median distance by which the rays to one joint miss each other, pixels of the first camera's picture."""
+    """Median distance between the rays to a joint, pixels of the first camera's picture."""
 
 
 @dataclass(frozen=True)
 class SetupReport:
-    """What is wrong with a set-up, and how its cameras fit."""
+    """Findings on a set-up, and the fit of its cameras."""
 
     findings: tuple[Finding, ...]
-    """One after the other, gross mistakes first; none where nothing is wrong."""
+    """Findings, gross mistakes first; empty if nothing is wrong."""
     warnings: tuple[str, ...]
-    """The findings in words, a sentence each."""
+    """The findings as sentences."""
     cameras: tuple[CameraFigures, ...]
-    """By camera, as the set-up was given."""
+    """Figures of each camera, for the set-up as given."""
     pairs: tuple[PairFigures, ...]
-    """By pair of cameras."""
+    """Figures of each pair of cameras."""
     frames: int
-    """Frames that were looked at."""
+    """Number of frames used."""
     stature_m: float | None
-    """How tall the people come out, median; None without people."""
+    """Median stature of the people, metres; None without people."""
     trust: Trust = BELIEVED
-    """Which cameras a reconstruction is better without: for `reconstruct`."""
+    """Cameras that `reconstruct` should exclude or doubt."""
     notes: tuple[str, ...] = ()
-    """What is odd and need not be a mistake: people whose detections are biased in one view, or who are small."""
+    """Observations that are not necessarily mistakes: people with biased detections in one view, or
+    of small stature."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
-        """The warnings, and what a reconstruction makes of them."""
+        """The warnings, with their consequences for a reconstruction."""
         out = {view for view, _, _ in self.trust.left_out}
         words = [
             f"{said}. It is left out of these frames (--no-check keeps it)" if out & set(found.cameras) else said
@@ -102,7 +103,7 @@ class SetupReport:
         return words
 
     def as_dict(self) -> dict[str, Any]:
-        """What run.json holds under `setup`."""
+        """Content of `setup` in run.json."""
         names = [each.camera for each in self.cameras]
         return {
             "findings": [
@@ -122,10 +123,11 @@ class SetupReport:
 def check_setup(
     detections: DetectionSequence, rig: Rig, frames: range | None = None, more: tuple[Finding, ...] = ()
 ) -> SetupReport:
-    """Whether cameras and detections of a recording fit each other, and what it looks like where they do not.
+    """Check whether cameras and detections of a recording are consistent, and diagnose the mistake
+    if not.
 
-    Looks at frames spread over `frames` (all by default) and needs no reconstruction; takes about a second. `more`
-    was found by others.
+    Uses frames spread over `frames` (by default all) and needs no reconstruction; takes about a
+    second. `more` are findings from elsewhere.
     """
     diagnosis = diagnose(detections, rig, frames)
     findings, build = (*diagnosis.findings, *more), diagnosis.build
@@ -142,7 +144,7 @@ def check_setup(
 
 
 def _children(build: Build | None) -> list[str]:
-    """What a rig in which people are as tall as children may be instead."""
+    """A note for people as tall as children, on the scale of the rig."""
     if build is None or not build.are_children:
         return []
     lengths = f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they should be"
@@ -157,14 +159,14 @@ def _spells(spells: Sequence[Spell], names: Sequence[str]) -> list[dict[str, Any
 
 
 def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
-    """One entry for every camera."""
+    """Figures of every camera."""
     look = diagnosis.look
     groups, structure = look.structure(steps=5)
     px = structure.miss_px
     mm = 1e3 * px * structure.depth / look.views.focal_px
     seen = np.bincount(look.sightings.view, minlength=len(rig))
     remaining = [lag.frames if lag.is_offset else 0 for lag in diagnosis.lags] or [0] * len(rig)
-    late = diagnosis.corrected.lag + remaining  # what was found, and what remains
+    late = diagnosis.corrected.lag + remaining  # corrected and remaining offset
     found = []
     for view, name in enumerate(rig.names):
         others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
@@ -199,60 +201,63 @@ def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
 
 
 def quantile(values: Array, part: float) -> float | None:
-    """Return a quantile of the finite values; None where there are none."""
+    """Return a quantile of the finite values; None without any."""
     values = values[np.isfinite(values)]
     return float(np.quantile(values, part)) if len(values) > 0 else None
 
 
 def rounded(value: Any) -> Any:
-    """Floats with four digits, which are enough for run.json, in all objects within."""
+    """The value with all floats inside rounded to four digits, for run.json."""
     if isinstance(value, dict):
         return {key: rounded(each) for key, each in value.items()}
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 _ROWS = 300
-"""Rows that are enough to say how far a camera is from the others."""
+"""Number of rows sufficient for the distances of a camera from the others."""
 _MOST_BETA = 5.0
-"""A shape component so many standard deviations from the mean is no person's."""
+"""Absolute shape component above which a body is implausible, standard deviations."""
 _SHARE = 0.1
-"""Share of rows from which on shapes are named: fewer are single people that hardly any camera saw."""
+"""Share of rows above which implausible shapes are reported; fewer are people hardly seen by any
+camera."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
-"""Sprinters are as fast, for seconds; fewer than so many steps say nothing."""
+"""Speed of sprinters, m/s, and minimum number of steps for a speed."""
 _MOST, _FEW = 0.5, 50
-"""A camera of which less than this share of at least so many detections was used is named."""
+"""Share of used detections below which a camera is reported, and minimum number of detections."""
 _LOST, _LOST_SHARE = 0.5, 0.1
-"""Least number of people a frame, and least share of them, that are missing for a warning."""
+"""Minimum number of missing people per frame, and minimum share of them, for a warning."""
 _LOOKED_AT = 200
-"""Frames, spread over the recording, in which detections are counted for that."""
+"""Number of frames, spread over the recording, in which detections are counted for that."""
 _SHORT_S = 1.0
-"""In a recording shorter than this people whom two cameras see may lack evidence."""
+"""Duration, s, below which people seen by two cameras may lack evidence."""
 _REASONS = {
     Gate.TOO_FAR: "are too far from the joint",
     Gate.CONTRADICTS_BODY: "contradict the body",
     Gate.BEHIND_CAMERA: "are of joints behind the camera",
     Gate.NOT_PLACED: "are of joints without a position",
 }
-"""Why detections that were given to people were not used."""
+"""Reasons why assigned detections were not used."""
 _LEAST_USED = 0.1
-"""Least share of detections that people explain; on Shelf, false candidates included, it is most."""
+"""Minimum share of detections that people explain; on Shelf, with false candidates included, it is
+most."""
 _WORST = 2.0
-"""A camera whose joints are so many times as far from the others' as is usual is said, if nothing else is."""
+"""Ratio of a camera's distance from the others to the usual one above which it is reported, if
+nothing else is."""
 _FAR_MM = 60.0
 
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances of detections, in the picture and at the joint's depth."""
+    """Summary of reprojection distances, in the picture and at the joint's depth."""
 
     count: int
-    """How many."""
+    """Number of distances."""
     median_px: float | None
     high_px: float | None
-    """Median, and what nine of ten are below, pixels; None without any."""
+    """Median and 90 % quantile, pixels; None without any."""
     median_mm: float | None
     high_mm: float | None
-    """Both as lengths, millimetres."""
+    """Median and 90 % quantile as lengths, millimetres."""
 
     @classmethod
     def of(cls, px: Array, mm: Array) -> "Distances":
@@ -263,37 +268,38 @@ class Distances:
 
 @dataclass(frozen=True)
 class CameraUse:
-    """What became of one camera's detections."""
+    """Use of one camera's detections."""
 
     camera: str
-    """Its name."""
+    """Name of the camera."""
     offered: int
-    """Joint detections in the frames that were reconstructed."""
+    """Number of joint detections in the reconstructed frames."""
     used: int
-    """Those that a result was solved from."""
+    """Number of detections used in the solution."""
     given: Distances
-    """All that were given to people, before gates: from the solved joint."""
+    """Distances of all assigned detections from the solved joint, before gating."""
     after_gates: Distances
-    """Those that were used."""
+    """Distances of the used detections."""
     left_out: Distances
-    """All that were given to people: from where the other cameras alone put the joint."""
+    """Distances of all assigned detections from the joint triangulated by the other
+    cameras only."""
     unused: dict[str, int] = field(default_factory=dict)
-    """Detections that were not used, by why: left out with their camera, given to nobody, or a gate."""
+    """Number of unused detections by reason: excluded camera, unassigned, or a gate."""
 
 
 @dataclass(frozen=True)
 class ResultCheck:
-    """A set-up as a reconstruction shows it."""
+    """The check of a set-up with the results of a reconstruction."""
 
     report: SetupReport
-    """What cameras and detections say by themselves."""
+    """The check of cameras and detections only."""
     cameras: tuple[CameraUse, ...]
-    """What became of each camera's detections."""
+    """Use of each camera's detections."""
     warnings: tuple[str, ...]
-    """Everything that looks wrong, a sentence each."""
+    """All warnings as sentences."""
 
     def as_run(self) -> dict[str, Any]:
-        """What run.json holds: `setup` and `cameras`."""
+        """Content of `setup` and `cameras` in run.json."""
         return {
             "setup": {**self.report.as_dict(), "warnings": list(self.warnings)},
             "cameras": [rounded(asdict(each)) for each in self.cameras],
@@ -303,9 +309,9 @@ class ResultCheck:
 def result_check(
     report: SetupReport, people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
 ) -> ResultCheck:
-    """The check of a set-up with what the reconstruction adds to it.
+    """Add the results of a reconstruction to the check of a set-up.
 
-    `people` are the rows of all `frames`; detections of other frames are not counted.
+    `people` are the rows of all `frames`; detections of other frames are ignored.
     """
     uses = tuple(camera_use(people, detections, rig, frames))
     warnings = report.with_consequences(rig)
@@ -325,7 +331,7 @@ def result_check(
 def camera_use(
     people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
 ) -> list[CameraUse]:
-    """One entry for each camera; without observations in the result, an empty list."""
+    """Use of each camera's detections; empty if the result has no observations."""
     table = people.observations
     if table is None:
         return []
@@ -355,11 +361,11 @@ def camera_use(
 
 
 LEFT_OUT, NOBODY = "are left out with the camera", "are not assigned to any person"
-"""Why detections were not given to anybody."""
+"""Reasons why detections were not assigned."""
 
 
 def _reasons(gate: NDArray[np.uint8], offered: int, dark: int) -> dict[str, int]:
-    """Why those of a camera's detections were not used that were not, each reason that there is and its count."""
+    """Numbers of a camera's unused detections by reason, without zeros."""
     given = int((gate != Gate.NOT_SEEN).sum())
     counts = {LEFT_OUT: dark, NOBODY: max(offered - given - dark, 0)}
     counts |= {words: int((gate == each).sum()) for each, words in _REASONS.items()}
@@ -367,12 +373,14 @@ def _reasons(gate: NDArray[np.uint8], offered: int, dark: int) -> dict[str, int]
 
 
 def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
-    """(R, J, V) distances of detections from where two or more others put the joint, px and mm; R rows of all."""
+    """(R, J, V) distances of detections from joints triangulated by two or more others, px and mm;
+    R sampled rows.
+    """
     rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _ROWS)).astype(np.intp))
     xy, gate = table.xy[rows].astype(np.float64), table.gate[rows]
     confidence, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))
     px, mm, views = np.full(gate.shape, np.nan), np.full(gate.shape, np.nan), Views.of(rig)
-    for view in range(len(rig)):  # a handful of cameras
+    for view in range(len(rig)):  # few iterations
         rest = (gate == Gate.USED) & (np.arange(len(rig)) != view)
         kept = np.where(rest[..., None], xy, np.nan)
         structure = triangulate(kept, np.where(rest, confidence, 0.0), size, views, steps=3)
@@ -383,7 +391,7 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
 
 
 def _shapes(people: Reconstruction) -> Iterator[str]:
-    """Bodies of a shape that no person has."""
+    """Warning on implausible body shapes."""
     there = np.isfinite(people.betas).all(axis=1)
     largest = np.abs(people.betas[there]).max(axis=1, initial=0.0)
     far = largest > _MOST_BETA
@@ -395,7 +403,7 @@ def _shapes(people: Reconstruction) -> Iterator[str]:
 
 
 def _speeds(people: Reconstruction) -> Iterator[str]:
-    """People who move as nobody does, where rows have identities."""
+    """Warning on implausible speeds of people, if rows have identities."""
     if not people.run.get("configuration", {}).get("temporal", True):
         return
     hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
@@ -415,7 +423,7 @@ def _speeds(people: Reconstruction) -> Iterator[str]:
 
 
 def _too_many(people: Reconstruction) -> Iterator[str]:
-    """Frames with more detections than people could make."""
+    """Warning on frames with more detections than people could explain."""
     frames = sum(last - first for first, last in people.run.get("thinned_frames", {}).get("detections", []))
     if frames > 0:
         yield (
@@ -426,7 +434,7 @@ def _too_many(people: Reconstruction) -> Iterator[str]:
 
 
 def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
-    """Detections of which hardly any is a person's."""
+    """Warning if people explain hardly any detections."""
     offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
     if 0 < used < _LEAST_USED * offered:
         yield (
@@ -436,7 +444,7 @@ def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
 
 
 def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
-    """Cameras whose detections were mostly left out, and why."""
+    """Warnings on cameras with mostly unused detections, with reasons."""
     for use in uses:
         if use.offered < _FEW or use.used >= _MOST * use.offered:
             continue
@@ -450,7 +458,7 @@ def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
 
 
 def _unseen(people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]) -> list[str]:
-    """`unseen` of a result that has anybody."""
+    """`unseen` for a result with people."""
     if len(people) == 0 or len(frames) == 0:
         return []
     fps = people.run.get("time", {}).get("fps")
@@ -467,10 +475,11 @@ def unseen(
     per_frame: Whole,
     lasts_s: float | None,
 ) -> list[str]:
-    """A sentence where two cameras see more people than there are rows in a frame, `per_frame` (F,), and why.
+    """A warning if two cameras see more people than there are rows per frame, `per_frame` (F,),
+    with the reason.
 
-    A camera sees as many as it has detections of a core joint (median). `lasts_s` is how long the recording is,
-    None of frames by themselves.
+    A camera's number of people is the median number of detections per core joint. `lasts_s` is the
+    duration of the recording, None for isolated frames.
     """
     core = list(detections.skeleton.core)
     looked_at = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
@@ -492,7 +501,7 @@ def unseen(
 
 
 def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
-    """A camera that is much farther from the others than these are from each other."""
+    """Warning on a camera much farther from the others than these are from each other."""
     lengths = np.array([use.left_out.median_mm for use in uses], dtype=np.float64)  # None is NaN
     if np.isfinite(lengths).sum() < 3:
         return

@@ -1,7 +1,8 @@
-"""Small errors of cameras, and biases of single people: which explain the residuals, with probabilities.
+"""Small errors of cameras, and biases of single people: their probabilities as explanations of the
+residuals.
 
-All explanations are compared with each other and with none, by the likelihood of `biases`: whatever biases the
-detector has, and wherever the joints are.
+All explanations are compared with each other and with none, by the likelihood of `biases`,
+marginalised over detector biases and joint positions.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,27 +21,29 @@ from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, 
 from shapepose_fg.setup_check.matching import followed
 
 ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL, Kind.PRINCIPAL_POINT: CENTRE}
-"""What one camera alone may have wrong."""
+"""Small mistakes of a single camera, and their parameters."""
 _TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
-"""How large a small mistake of a camera usually is (one sigma): a turn, or a shift as large; a move, part
-of the people's distance; the logarithm of the focal length."""
+"""Standard deviations of a small mistake of a camera: a rotation, or an equivalent shift of the
+principal point, rad; a translation, as a share of the people's distance; the logarithm of the focal
+length."""
 _EVERY = np.deg2rad(0.5)
-"""How far principal points of several cameras usually are off, as a turn (one sigma)."""
+"""Standard deviation of the principal points of several cameras, as an angle, rad."""
 BIAS = 0.1
-"""An unusual bias on one person, part of the size (one sigma)."""
+"""Standard deviation of an unusual bias of one person, as a share of the size."""
 _WRONG = 0.5
-"""The probability beforehand that some camera has a small mistake; that some person has an unusual bias."""
+"""Prior probability that some camera has a small mistake, and that some person has an
+unusual bias."""
 _KNOCKED = 3
-"""Cameras are turned or moved so many times as often as anything else happens to them."""
+"""Prior frequency of rotated or translated cameras, relative to other mistakes."""
 _PARTS = 8
-"""Parts of a recording at whose ends a camera may be bumped."""
+"""Number of parts of a recording at whose borders a camera may be bumped."""
 _MOST_PEOPLE = 160
 _LEAST_OF_ONE = 6
-"""People of fewer frames are one stranger to the biases of single people."""
+"""Minimum number of frames of a person; people with fewer are pooled for the biases."""
 _TURN_DEG = 1.0
-"""A camera that is moved and turned by more is called turned."""
+"""Rotation, degrees, above which a translated and rotated camera is called rotated."""
 _NOTABLE_DEG = 0.25
-"""Smaller shifts of one of several cameras are not named."""
+"""Minimum shift of a principal point, degrees, that is reported for several cameras."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +51,13 @@ class Cause:
     """One explanation of the residuals."""
 
     finding: Finding | None
-    """What is wrong; None for nothing."""
+    """The mistake; None for no mistake."""
     log: float
-    """The logarithm of the likelihood times the probability beforehand."""
+    """Logarithm of likelihood times prior probability."""
     views: Views
-    """The cameras after it is put right."""
+    """The corrected cameras."""
     person: int = -1
-    """Whose bias it is."""
+    """Person with the bias; -1 for none."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +65,19 @@ class Problem:
     """The residuals of a recording, to be explained."""
 
     residuals: Residuals
-    """By people grouped under the cameras of a look."""
+    """Residuals of people associated under the cameras of a look."""
     frame: Index
     """(N,) frame of each person."""
     given: Views
-    """The cameras as they are without any explanation."""
+    """The cameras without any explanation."""
     biased: tuple[tuple[int, ...], ...] = ()
-    """People and views with an unusual bias, which explains nothing any more."""
+    """People and views with an unusual bias already accounted for."""
 
     @classmethod
     def of(cls, look: Look, given: Views | None = None) -> "Problem":
-        """Make the problem of people spread over the frames, against the look's own cameras or others."""
+        """Build the problem from people spread over the frames, relative to the look's own cameras
+        or to `given`.
+        """
         groups, structure = look.structure(steps=2)
         who = followed(groups.frame, structure.points)
         step = max(1, -(-len(groups) // _MOST_PEOPLE))
@@ -92,9 +97,11 @@ class Problem:
     def _likelihood(
         self, directions: Array, sigma: Array, views: Views | None = None, before: Array | None = None
     ) -> tuple[float, Array]:
-        """The likelihood's logarithm of changes along `directions` (C, n) with sigmas (n,), and the change (n,).
+        """Log-likelihood of changes along `directions` (C, n) with standard deviations (n,), and
+        the best change (n,).
 
-        With `views` of these cameras, which are already changed by `before` (n,).
+        With `views` it is linearised at these cameras, which already include the change `before`
+        (n,).
         """
         marginals = self._marginals if views is None or views is self.given else self.residuals.marginals(views)
         others = [self.residuals.of_person(*each) for each in self.biased]
@@ -109,26 +116,28 @@ class Problem:
             best = np.linalg.solve(known, g - done)
             likely = each.log + 0.5 * float((g - done) @ best - done @ done - np.linalg.slogdet(known)[1])
             found.append((likely, best[: len(sigma)] * sigma))
-        logs = np.nan_to_num(
-            [likely for likely, _ in found], nan=-np.inf
-        )  # people behind a camera that is far off
+        logs = np.nan_to_num([likely for likely, _ in found], nan=-np.inf)  # people behind a camera
         return float(np.logaddexp.reduce(logs)), found[int(np.argmax(logs))][1]
 
     @cached_property
     def causes(self) -> list[Cause]:
-        """What may be wrong, or nothing: likeliest first, each finding with its probability."""
+        """Possible explanations including no mistake, most probable first, with probabilities."""
         found = [self.as_they_are(None, self.given), *self.biases(), *self._of_several()]
         for view in range(len(self.given)):
             found += [*self.explained(view, dict.fromkeys(ONE, self.given)), *self._over_time(view)]
         return probable(found)
 
     def as_they_are(self, finding: Finding | None, views: Views) -> Cause:
-        """That cameras are as in `views`, which a finding puts right; None for nothing."""
+        """The explanation that cameras are as in `views`, which corrects a finding; None for no
+        mistake.
+        """
         likely, _ = self._likelihood(self.residuals.camera(0, []), np.zeros(0), views)
         return Cause(finding, likely if finding is None else likely + self._rare(finding.kind), views)
 
     def explained(self, view: int, starts: Mapping[Kind, Views]) -> list[Cause]:
-        """What one camera alone may have wrong; `starts` have it as it is after that mistake, or nearly."""
+        """Mistakes of a single camera; `starts` are the cameras with each mistake approximately
+        corrected.
+        """
         found = []
         for kind, views in starts.items():
             which, sigma = ONE[kind], self._usual(view)[ONE[kind]]
@@ -141,7 +150,7 @@ class Problem:
         return found
 
     def biases(self) -> Iterator[Cause]:
-        """Each person's bias in each view."""
+        """A bias of each person in each view."""
         people, views = int(self.residuals.person.max(initial=-1)) + 1, len(self.given)
         seen = np.zeros((people, views))
         np.add.at(seen, self.residuals.person, (self.residuals.weight > 0).any(axis=1))
@@ -152,7 +161,7 @@ class Problem:
             yield Cause(finding, likely + np.log(_WRONG / (people * views)), self.given, person)
 
     def _over_time(self, view: int) -> Iterator[Cause]:
-        """One camera's turn in the parts before or after a frame, and its turn that grows or ends."""
+        """Rotations of one camera in the parts before or after a frame, and linear drifts."""
         K, times = self.residuals.parts, np.unique(self.residuals.part, return_index=True)[1]
         if K < 3:
             return
@@ -170,7 +179,7 @@ class Problem:
             yield Cause(finding, likely + self._rare(kind) - np.log(count), self.given)
 
     def _of_several(self) -> list[Cause]:
-        """Principal points of all cameras that are off, each in its own way."""
+        """Independent errors of the principal points of all cameras."""
         V = len(self.given)
         directions = np.concatenate([self.residuals.camera(view, CENTRE) for view in range(V)], axis=1)
         sigma = np.repeat(_EVERY * self.given.focal_px, 2)
@@ -185,7 +194,7 @@ class Problem:
         return [Cause(finding, likely + self._rare(Kind.PRINCIPAL_POINT), self.given)]
 
     def relaxed(self) -> Views:
-        """The cameras with the small errors that they all probably have."""
+        """The cameras with the small errors that are likely in all of them."""
         V, which = len(self.given), [TURN[2], *CENTRE, *FOCAL]
         directions = np.concatenate([self.residuals.camera(view, which) for view in range(V)], axis=1)
         sigma = np.array([np.append(_EVERY, self._usual(view)[which[1:]] / 5) for view in range(V)])
@@ -194,7 +203,9 @@ class Problem:
         return changed(self.given, change)
 
     def off(self, usual: Array, reference: int | None = None) -> float:
-        """The probability that cameras, but `reference`, are off by about `usual` (Q,); 0.5 beforehand."""
+        """Probability that cameras, except `reference`, have errors of about `usual` (Q,); the
+        prior is 0.5.
+        """
         which = np.flatnonzero(usual).tolist()
         views = [view for view in range(len(self.given)) if view != reference]
         directions = [self.residuals.camera(view, which) for view in views]
@@ -202,20 +213,20 @@ class Problem:
         return float(1 / (1 + np.exp(min(self.as_they_are(None, self.given).log - likely, 700.0))))
 
     def _usual(self, view: int) -> Array:
-        """(Q,) how large small mistakes of a camera's parameters are."""
+        """(Q,) standard deviations of small mistakes of a camera's parameters."""
         seen = self.residuals.weight[:, :, view] > 0
         cTw = self.given.cTw[view, 2]
         depth = float(np.median(self.residuals.points[seen] @ cTw[:3] + cTw[3])) if seen.any() else 1.0
         return np.array([_TURN] * 3 + [_MOVE * depth] * 3 + [_TURN * self.given.focal_px[view]] * 2 + [_FOCAL])
 
     def _rare(self, kind: Kind) -> float:
-        """The logarithm of the probability of one kind of mistake of one camera, beforehand."""
+        """Log prior probability of one kind of mistake of one camera."""
         often = _KNOCKED if kind in (Kind.TURNED, Kind.MOVED) else 1
         return float(np.log(_WRONG * often / (len(self.given) * (len(ONE) + 2 * _KNOCKED))))
 
 
 def probable(causes: list[Cause]) -> list[Cause]:
-    """The causes, which exclude each other, likeliest first, each finding with its probability."""
+    """Mutually exclusive causes, most probable first, with the probability of each finding."""
     total = np.logaddexp.reduce([each.log for each in causes])
     told = list[Cause]()
     for each in sorted(causes, key=lambda each: -each.log):
@@ -225,7 +236,7 @@ def probable(causes: list[Cause]) -> list[Cause]:
 
 
 def _between(given: Views, views: Views, view: int) -> Array:
-    """(Q,) the parameters of a camera of `given` that make it that of `views` (`fit.changed`)."""
+    """(Q,) change of parameters from a camera in `given` to that in `views` (`fit.changed`)."""
     turn = log_so3(views.cTw[view, :, :3] @ given.cTw[view, :, :3].T)
     move = views.cTw[view, :, 3] - exp_so3(turn[None])[0] @ given.cTw[view, :, 3]
     centre = (views.K - given.K)[view, :2, 2]
@@ -239,7 +250,9 @@ def _moved(views: Views, view: int, which: list[int], change: Array) -> Views:
 
 
 def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
-    """A change of one camera alone, in what the calibration has over what fits."""
+    """The finding for a change of a single camera: the calibration's value relative to the fitted
+    one.
+    """
     if kind == Kind.FOCAL:
         return Finding(kind, (view,), float(given.K[view, 0, 0] / views.K[view, 0, 0]))
     if kind == Kind.PRINCIPAL_POINT:

@@ -1,1 +1,3 @@
-"""From joints to bodies: the energy, the fitters, and what a body says of a joint without its own target."""
+"""Body fitting from joints: energy, fitters, and predictions of joints without their
+own targets.
+"""

@@ -1,4 +1,4 @@
-"""Bodies over time: one shape per person, and poses that move as people do."""
+"""Body fitting over time: one shape per person, and a motion prior on the poses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,24 +21,24 @@ from shapepose_fg.body.fitting.fitter import (
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SEGMENT_ROWS = 320
-"""Longer chains are cut, so that memory does not grow with them."""
+"""Maximum number of rows in a segment; longer chains are cut to bound memory."""
 OVERLAP_ROWS = 16
-"""Rows that a cut-off segment has of its neighbours, on either side."""
+"""Number of rows by which a segment overlaps its neighbours, on either side."""
 _CHUNK = 64
-"""Rows whose covariances are computed at a time."""
+"""Number of rows per batch of covariances."""
 
 
 @dataclass(frozen=True)
 class SequenceFitter:
-    """Fits one shape per group and poses linked in time, from bodies that were found row by row."""
+    """Fits one shape per group and poses linked in time, starting from single-row fits."""
 
     energy: BodyEnergy
     """Energy of a row."""
     starts: Callable[[Evidence], tuple[Array, Array, Mask]]
-    """Bodies of rows (R) by themselves: parameters (R, P) around their centres, around which angles (R, A) they
-    are held, which are good."""
+    """Single-row fits of rows (R): parameters (R, P) relative to their centres, angles (R, A) at
+    which the pose prior is centred, and a mask of the successful ones."""
     law: Motion
-    """How they move from row to row."""
+    """Motion model between rows."""
     config: BodyConfig
 
     def fit(
@@ -66,7 +66,8 @@ class SequenceFitter:
         evidence = weigh(targets, self.config.model_sigma_m)
         fit = BodyFit.failed(evidence.status, joints)
         free, origin, rows, found = self._start(evidence, group, time_s)
-        # Whoever is in a segment that is fitted gets a body all the same, and `_fill` says so.
+        # Rows without a fit of their own get a body if their segment is solved; `_fill` then sets
+        # their status.
         fit.status[fit.ok & ~found] = FitStatus.NOT_CONVERGED
         known = Shapes.unknown(len(numbers)) if shapes is None else shapes
         usable = np.flatnonzero(evidence.status != FitStatus.INVALID_TARGETS)
@@ -83,10 +84,11 @@ class SequenceFitter:
         return SequenceFit(fit, numbers, known)
 
     def _start(self, evidence: Evidence, group: Index, time_s: Array) -> tuple[Array, Array, ChainRows, Mask]:
-        """Where B rows start: bodies row by row; who has none starts as the nearest of the group in time.
+        """Initial bodies of B rows from single-row fits; rows without one take that of the nearest
+        row of the group in time.
 
-        Returns parameters (B, P), around which origins (B, 3), one for all rows of a group, what is minimised, and
-        which rows have a body of their own.
+        Returns parameters (B, P), their origins (B, 3), the same for all rows of a group, the
+        problem to minimise, and a mask of rows with a fit of their own.
         """
         ok, B = np.flatnonzero(evidence.status == FitStatus.OK), len(group)
         free, angles = np.zeros((B, self.energy.num_free)), np.zeros((B, self.energy.num_angles))
@@ -112,7 +114,7 @@ class SequenceFitter:
     def _solved(
         self, rows: ChainRows, free: Array, segments: list[Segment], known: Shapes, fixed: bool
     ) -> tuple[Array, Shapes]:
-        """Parameters (B, P), and the shapes (G) given everything."""
+        """Solved parameters (B, P), and the posterior shapes (G)."""
         owner = np.array([segment.group for segment in segments])
         if fixed:
             return rows.solved(free, segments, known.mean[owner], known.information[owner], fixed=True)[0], known
@@ -120,7 +122,8 @@ class SequenceFitter:
         prior = known.information * share[:, None, None]
         held, firm = known.mean[owner], prior[owner]
         free, betas, said = rows.solved(free, segments, held, firm, fixed=False)
-        # Each segment's Gaussian without the prior: information S, and S times its mean. Overlaps count once.
+        # Each segment's Gaussian without the prior: information S, and S times its mean; overlaps
+        # count once.
         kept = np.array([segment.kept.mean() for segment in segments])[:, None, None]
         pull = kept * ((said + firm) @ betas[..., None] - firm @ held[..., None])
         total, right = prior.copy(), prior @ known.mean[..., None]
@@ -160,7 +163,9 @@ class SequenceFitter:
 
 
 def _rows_per_look(time_s: Array, segments: list[Segment], correlation_s: float, count: int) -> Array:
-    """(G,) how many rows of a group tell of its shape as one: those within the time that errors are correlated."""
+    """(G,) number of rows of each group per independent look at its shape, given the correlation
+    time of errors.
+    """
     rows, looks = np.zeros(count), np.zeros(count)
     for segment in segments:
         kept = time_s[segment.rows[segment.kept]]
@@ -170,7 +175,7 @@ def _rows_per_look(time_s: Array, segments: list[Segment], correlation_s: float,
 
 
 def _nearest(sorted_s: Array, asked_s: Array) -> Index:
-    """(M,) index of the nearest of some sorted times to each that is asked for."""
+    """(M,) index of the nearest of the sorted times to each of `asked_s` (M,)."""
     after = np.clip(np.searchsorted(sorted_s, asked_s), 0, len(sorted_s) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(sorted_s[before] - asked_s) <= np.abs(sorted_s[after] - asked_s), before, after)

@@ -1,4 +1,4 @@
-"""Chains of rows over time: the motion prior along them, and Levenberg-Marquardt for all poses and one shape."""
+"""Chains of rows over time: motion prior, and Levenberg-Marquardt for all poses and one shape."""
 
 from dataclasses import dataclass
 
@@ -12,31 +12,31 @@ from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_in
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 MAX_ITERATIONS = 8
-"""Steps of Levenberg-Marquardt, refused ones included."""
+"""Maximum number of Levenberg-Marquardt steps, rejected ones included."""
 TOLERANCE = 0.05
-"""A chain is done when a step lowers its energy by less than this a row, in squared standard deviations."""
+"""Convergence: decrease of the energy per row in a step, in squared standard deviations."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-4, 1e-8, 1e4
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Rows of one person that follow each other."""
+    """Consecutive rows of one person."""
 
     rows: Index
-    """(T,) in the order of time."""
+    """(T,) row indices, ordered by time."""
     kept: Mask
     """(T,) whether a row belongs to this segment; the others overlap with the one before or after."""
     group: int
-    """Whose."""
+    """Index of the person."""
 
 
 def cut_segments(
     rows: Index, group: Index, time_s: Array, *, gap_s: float, length: int, overlap: int
 ) -> list[Segment]:
-    """The `rows` (R,), of so many people `group` (B,) at the times `time_s` (B,), as segments.
+    """Cut the `rows` (R,), of people `group` (B,) at times `time_s` (B,), into segments.
 
-    A gap of more than `gap_s` ends a chain; one of more than `length` rows is cut, with so many rows `overlap` on
-    either side. ValueError where one person has two rows at one time.
+    A gap of more than `gap_s` ends a chain; one longer than `length` rows is cut, with `overlap`
+    further rows on either side. Raises ValueError if one person has two rows at one time.
     """
     order = rows[np.lexsort((time_s[rows], group[rows]))]
     same, step = np.diff(group[order]) == 0, np.diff(time_s[order])
@@ -54,27 +54,29 @@ def cut_segments(
 
 
 class Links:
-    """`MotionPrior` along a chain of T rows of N numbers, as a part of a least-squares problem.
+    """`MotionPrior` along a chain of T rows with N parameters, as a part of a least-squares
+    problem.
 
-    A model of motion of order n (`factors.Motion`) links n + 1 rows that follow each other: how the last
-    derivative of a state goes on, the derivatives being differences of rows. The root's rotation moves in tangents
-    of the world, exp(delta) R, in which its coupling is as diagonal as that of the other numbers, up to the turn
-    from frame to frame; its gradient is exact.
+    A motion model of order n (`factors.Motion`) links n + 1 consecutive rows: it predicts the last
+    derivative of the state, with derivatives as finite differences of rows. The root's rotation is
+    updated in tangents of the world, exp(delta) R, in which its coupling is as diagonal as that of
+    the other parameters, up to the rotation between frames; its gradient is exact.
     """
 
     diagonal: Array
-    """(T, N) diagonal of half the Hessian: a parameter is coupled with itself in other rows only."""
+    """(T, N) diagonal of half the Hessian; a parameter is only coupled with itself in
+    other rows."""
     beyond: Array
-    """(T, N, n) coupling of a row with the next, the one after, and so on."""
+    """(T, N, n) coupling of each row with the next n rows."""
 
     def __init__(self, law: Motion, acceleration: Array, velocity: Array, step_s: Array):
-        """Densities (N,) as in `MotionPrior`; `step_s` (T - 1,) seconds from row to row, infinite past the
-        end: T is n or more, and a single row is one with nothing after it.
+        """Spectral densities (N,) as in `MotionPrior`; `step_s` (T - 1,) time between rows,
+        seconds, infinite beyond the end: T is at least n, and a single row has nothing after it.
         """
         real = np.isfinite(step_s)
         self._rate = np.where(real, 1 / step_s, 0.0)[:, None]
         self._slow = np.where(real, step_s, 0.0)[:, None] / velocity
-        # What goes on: the derivative of this order in velocities v_k, v_k+1, ..., weighted.
+        # The predicted derivative as a weighted sum of velocities v_k, v_k+1, ...
         gaps, weights = step_s, [np.ones((len(step_s), 1))]
         for order in range(2, law.order + 1):
             gaps = (gaps[1:] + gaps[:-1]) / 2
@@ -88,7 +90,7 @@ class Links:
         self._weights, n = weights, law.order
         noise = law.noise(gaps[..., None], law.density(acceleration))[..., -1, -1]
         self._smooth = real[n - 1 :, None] / noise
-        # In velocities the prior is banded: slow v² + smooth (weights v)².
+        # In terms of velocities the prior is banded: slow v² + smooth (weights v)².
         self._bands = [self._slow.copy(), *(0 * self._slow[k:] for k in range(1, n))]
         for i in range(n - 1, -1, -1):
             for k in range(n - i):
@@ -98,8 +100,8 @@ class Links:
         self.beyond = np.stack(beyond, -1)
 
     def at(self, root: Array, others: Array) -> tuple[float, Array]:
-        """Energy in squared standard deviations, and half its gradient (T, N), at rotations of the root (T, 3, 3)
-        and everything else (T, N - 3).
+        """Energy in squared standard deviations, and half its gradient (T, N), at root rotations
+        (T, 3, 3) and the other parameters (T, N - 3).
         """
         turn = log_so3(root[1:] @ root[:-1].swapaxes(1, 2))
         v = self._rate * np.concatenate((turn, others[1:] - others[:-1]), -1)
@@ -120,7 +122,9 @@ class Links:
         return energy, np.concatenate((edge, after)) - np.concatenate((before, edge))
 
     def _couplings(self) -> list[Array]:
-        """H = V^T M V with V the differences of rows, M banded: diagonal, next, next but one, ... (T, N)."""
+        """H = V^T M V with difference operator V and banded M; returns the diagonals (T, N), main
+        diagonal first.
+        """
         edge, rate = np.zeros_like(self._slow[:1]), self._rate
         found = [np.concatenate((edge, 0 * self._slow)) for _ in range(len(self._bands) + 1)]
         for k, band in enumerate(self._bands):  # v_i with v_i+k
@@ -136,29 +140,32 @@ class Links:
 
 @dataclass(frozen=True)
 class ChainRows:
-    """R rows whose energies are minimised, with the motion prior between them; rows of a chain have one origin."""
+    """R rows with their energies, linked by the motion prior; all rows of a chain share
+    an origin.
+    """
 
     energy: BodyEnergy
     """Energy of a row."""
     kernel_scale: float
     """Width of the robust kernel, in standard deviations."""
     targets: EnergyTargets
-    """(R) where the joints should be."""
+    """(R) targets of the joints."""
     angles: Array
-    """(R, A) around where the pose prior holds them."""
+    """(R, A) angles at which the pose prior is centred."""
     time_s: Array
-    """(R,) when."""
+    """(R,) times, s."""
     law: Motion
-    """How they move from row to row."""
+    """Motion model between rows."""
 
     def solved(
         self, free: Array, segments: list[Segment], mean: Array, information: Array, *, fixed: bool
     ) -> tuple[Array, Array, Array]:
-        """Parameters (R, P) of the rows that the `segments` (S) keep, from `free` (R, P) on, and their shapes.
+        """Solved parameters (R, P) of the rows that the `segments` (S) keep, starting from `free`
+        (R, P), and their shapes.
 
-        `mean` (S, 10) and `information` (S, 10, 10) are the prior of each segment's betas; with `fixed` they stay
-        there. Of the shapes the betas (S, 10) come back, and what the rows alone say of them, (S, 10, 10): the
-        Schur complement.
+        `mean` (S, 10) and `information` (S, 10, 10) are the prior of each segment's betas; with
+        `fixed` the betas stay at the mean. The shapes are the betas (S, 10), and the information of
+        the rows about them without the prior, (S, 10, 10): the Schur complement.
         """
         found, betas, said = free.copy(), mean.copy(), np.zeros_like(information)
         for number, segment in enumerate(segments):
@@ -171,17 +178,19 @@ class ChainRows:
 
 @dataclass(frozen=True)
 class _State:
-    """The bodies of a chain."""
+    """State of a chain."""
 
     betas: Array
-    """(10,)."""
+    """(10,) shape."""
     root: Array
-    """(T, 3, 3) rotation."""
+    """(T, 3, 3) rotations of the root."""
     others: Array
-    """(T, N - 3) angles and place."""
+    """(T, N - 3) angles and position."""
 
     def moved(self, shape: Array, pose: Array) -> "_State":
-        """After a step of the betas (10,) and of the rest (T, N), the root's in tangents of the world."""
+        """The state after a step of the betas (10,) and the poses (T, N); the root's is in tangents
+        of the world.
+        """
         return _State(self.betas + shape, exp_so3(pose[:, :3]) @ self.root, self.others + pose[:, 3:])
 
     def free(self) -> Array:
@@ -192,10 +201,12 @@ class _State:
 
 @dataclass(frozen=True)
 class _Normal:
-    """The energy of a chain and its normal equations, but for the couplings of rows, which are `Links`'."""
+    """Energy of a chain and its normal equations, without the couplings of rows, which are in
+    `Links`.
+    """
 
     energy: float
-    """In squared standard deviations."""
+    """Energy in squared standard deviations."""
     system: Array
     """(T, M, P) normal equations of each row (`body/kernels/solving.py`)."""
     pull: Array
@@ -205,7 +216,7 @@ class _Normal:
 
 
 class _Chain:
-    """A chain that is solved."""
+    """Solver of one chain."""
 
     def __init__(self, rows: ChainRows, segment: Segment, mean: Array, firm: Array, fixed: bool):
         self._rows, self._mean, self._firm, self._fixed = rows, mean, firm, fixed
@@ -217,7 +228,9 @@ class _Chain:
         self._links = Links(rows.law, *MotionPrior.default().part(rows.energy.angles), step)
 
     def solved(self, start: Array) -> tuple[_State, Array]:
-        """The bodies from `start` (T, P) on, and the information about their betas in the rows (10, 10)."""
+        """The state solved from `start` (T, P), and the information of the rows about the betas
+        (10, 10).
+        """
         state = _State(self._mean if self._fixed else start[0, :10], exp_so3(start[:, 10:13]), start[:, 13:])
         here, damping, information = self._normal(state), _DAMPING_START, np.zeros((10, 10))
         for _ in range(MAX_ITERATIONS):
@@ -225,7 +238,7 @@ class _Chain:
             trial = state.moved(shape, pose)
             there = self._normal(trial)
             gain = here.energy - there.energy
-            better = gain > 0  # a step into NaN is not
+            better = gain > 0  # false for NaN
             damping = max(damping / 10 if better else damping * 10, _DAMPING_MIN)
             if better:
                 state, here = trial, there
@@ -234,7 +247,7 @@ class _Chain:
         return state, information
 
     def _normal(self, state: _State) -> _Normal:
-        """Energy and normal equations."""
+        """Energy and normal equations at a state."""
         T, scale = len(state.root), self._rows.kernel_scale
         linear = self._rows.energy.linearise(state.free(), self._targets, scale, self._held, nothing(T))
         ends = max(len(self._links.diagonal) - T, 0)

@@ -1,10 +1,11 @@
-"""Learned gradient descent: a body moves towards its targets, one step of the update network after the other.
+"""Learned gradient descent: the update network moves a body towards its targets, step by step.
 
     Theta <- Theta + N_w(dE_shape/dTheta, Theta, X)              (Eq. 5 of the paper; Song et al., ECCV 2020)
 
-in the person's own frame: pelvis near the origin, upright, facing +z (see `PersonFrame`). E_shape is the data term
-of `BodyEnergy`, its gradient analytic. Training (`simulation/training/differentiable.py`) sees the very same
-inputs, and has the network's layers and the bodies' points once more, differentiable.
+in the person's own frame: pelvis near the origin, upright, facing +z (see `PersonFrame`). E_shape
+is the data term of `BodyEnergy`, with an analytic gradient. Training
+(`simulation/training/differentiable.py`) uses the same inputs, with differentiable versions of the
+network's layers and the body's points.
 """
 
 import math
@@ -24,11 +25,13 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.compiled import kernel
 
 _TANGENT = np.append(np.arange(10 + 3 * NUM_ROTATIONS), np.arange(10 + 72, 10 + 75))
-"""Columns of the body's Jacobian that the network is told: all but the hands'."""
+"""Columns of the body's Jacobian that are inputs of the network: all but the hands'."""
 _SEEN_M, _TURN_RAD = 0.02, 0.3
-"""Sigma of a joint well seen, and of an angle that no joint tells: for the size of gradients only."""
+"""Standard deviations of a well observed joint, m, and of an unobserved angle, rad; they only scale
+gradients."""
 STEP = 0.1
-"""What the network's output of 1 means, in betas' tenths, entries of rotations, metres."""
+"""Scale of the network's output: an output of 1 is 0.1 in entries of rotations and metres, and 1 in
+betas."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,9 @@ class BodyState:
     betas: Array
     """(B, 10) shape."""
     local: Array
-    """(B, 24, 3, 3) rotations relative to the parent, the root's to the person's frame."""
+    """(B, 24, 3, 3) rotations relative to the parent; for the root, to the person's frame."""
     transl: Array
-    """(B, 3) metres."""
+    """(B, 3) translation, metres."""
 
 
 class LearnedDescent:
@@ -55,16 +58,17 @@ class LearnedDescent:
         others: SkinnedPoints | None = None,
         offsets: tuple[Array, Index] | None = None,
     ):
-        """`points` are the targets' (K), `slots` (K,) their places among `BODY_POINTS`.
+        """`points` are the targets' points (K), `slots` (K,) their indices in `BODY_POINTS`.
 
-        `others`: the rest of the body's points (50 - K), in order, to be given where there are any.
-        `offsets`: what a detector's keypoint offsets add to the points (K, 3), in the frames of which bones (K,).
+        `others`: the remaining points of the body (50 - K), in order; required if there are any.
+        `offsets`: the detector's keypoint offsets (K, 3), in the frames of the bones (K,).
         """
         self.network, self._see = network, Sight(points, slots, kernel_scale, others, offsets)
 
     def unroll(self, state: BodyState, xyz: Array, information: Array) -> Iterator[BodyState]:
-        """The states after each update, given targets (B, K, 3) in the person's own frame, metres, finite, and
-        their information (B, K, 3, 3), 1/m², the model's error included; zero for a joint never seen.
+        """Yield the state after each update, given targets (B, K, 3) in the person's own frame,
+        metres, finite, and their information (B, K, 3, 3), 1/m², including the model's error; zero
+        for an unseen joint.
         """
         for step in range(self.network.config.steps):
             inputs = self._see(state, xyz, information, self.network.gradient_scale)
@@ -74,7 +78,7 @@ class LearnedDescent:
 
 
 class Sight:
-    """What the network sees of bodies and their targets; parameters as in `LearnedDescent`."""
+    """Computes the network's inputs from bodies and targets; parameters as in `LearnedDescent`."""
 
     def __init__(
         self,
@@ -92,12 +96,14 @@ class Sight:
         )
         own = Own(np.full(len(BODY_POINTS), -1), np.zeros((50, 3)), np.zeros(50, dtype=np.intp))
         own.target[list(slots)] = np.arange(len(slots))
-        if offsets is not None:  # the network knows the body's own points
+        if offsets is not None:  # the network uses the body's own points
             own.offset[list(slots)], own.bone[list(slots)] = offsets
         self._own, self._limbs, self._kernel_scale = own, every.limbs(), kernel_scale
 
     def __call__(self, state: BodyState, target: Array, information: Array, scale: Any) -> NDArray[np.float32]:
-        """(B, `UpdateNetwork.num_inputs`); gradients are multiplied by `scale` (79,)."""
+        """(B, `UpdateNetwork.num_inputs`) network inputs; gradients are multiplied by `scale`
+        (79,).
+        """
         given = (state.betas, state.local, state.transl, target, information)
         betas, local, transl, xyz, known = (np.require(each, float, ["C", "W"]) for each in given)
         inputs = np.empty((len(state.betas), UpdateNetwork.num_inputs), dtype=np.float32)
@@ -110,9 +116,10 @@ class Sight:
 
 @kernel("s2 f0 f2 f4 f2")
 def moved(change, size, betas, local, transl):
-    """Move B bodies, in place, by `size` times a `change` (B, 145): betas in tens, the first two columns of 22
-    rotations, made orthogonal again (Gram-Schmidt; parallel ones: NaN), and the place. Rotations as six numbers:
-    Zhou et al., "On the Continuity of Rotation Representations in Neural Networks", CVPR 2019.
+    """Update B bodies in place by `size` times a `change` (B, 145): betas scaled by 10, the first
+    two columns of 22 rotations, orthogonalised again (Gram-Schmidt; NaN if parallel), and the
+    translation. For rotations as six numbers see Zhou et al., "On the Continuity of Rotation
+    Representations in Neural Networks", CVPR 2019.
     """
     for b in range(len(change)):
         for n in range(10):
@@ -134,7 +141,9 @@ def moved(change, size, betas, local, transl):
 
 
 def gradient_scale(points: SkinnedPoints, slots: tuple[int, ...]) -> Array:
-    """(P,) what turns a gradient into about a step: the inverse of the Hessian's diagonal in T-pose."""
+    """(P,) factors from gradient to approximate step: the inverse diagonal of the Hessian in
+    T-pose.
+    """
     eye = np.tile(np.eye(3), (1, 24, 1, 1))
     _, jacobian = points.positions_with_jacobian(eye, np.zeros((1, 10)), np.zeros((1, 3)))
     slope = np.square(jacobian[0, list(slots)]).sum((0, 1))[_TANGENT] / _SEEN_M**2

@@ -1,9 +1,10 @@
-"""The energy of a body given joint targets: what `body/kernels/bodies.py` linearises and minimises, over rows.
+"""Energy of a body given joint targets; `body/kernels/bodies.py` linearises it row by row.
 
     E(Theta) = sum_i rho((x_i(Theta) - z_i)ᵀ M_i (x_i(Theta) - z_i)) + |betas|² - 2 log p(theta) + constant
 
-with M_i the information of target z_i, rho a robust kernel, p the pose prior, a Gaussian: SMPLify
-(Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of the Hessian below is a covariance.
+with M_i the information of target z_i, rho a robust kernel, and p the Gaussian pose prior: SMPLify
+(Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of half its Hessian is
+a covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,14 +24,15 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.rows import Rows as FitRows
 
 SETTLED = 1e6
-"""Precision of a beta that other rows of the same person have settled."""
+"""Precision of a beta that is fixed by other rows of the same person."""
 VISIBLE_M_PER_RAD = 1e-3
-"""A joint whose rotation moves no keypoint faster than this is invisible: a radian would move 1 mm."""
+"""Speed of the fastest keypoint per rotation of a joint, m/rad, below which the joint is
+unobservable."""
 
 
 @dataclass(frozen=True)
 class EnergyTargets(FitRows):
-    """Targets as the energy wants them."""
+    """Joint targets in the form that the energy takes."""
 
     xyz: Array
     """(B, K, 3) metres, finite."""
@@ -40,34 +42,38 @@ class EnergyTargets(FitRows):
 
 @dataclass(frozen=True)
 class Held(FitRows):
-    """Around what shape and pose are held: angles as tightly as the pose prior holds them."""
+    """Centres of the priors on shape and angles, and the precision of the shape."""
 
     betas: Array
-    """(B, 10) shape."""
+    """(B, 10) centre of the shape prior."""
     stiffness: Array
     """(B,) precision of each beta."""
     angles: Array
-    """(B, A) free angles."""
+    """(B, A) centre of the pose prior in the free angles, rad."""
 
     def at_shape(self, betas: Array, settled: Mask) -> "Held":
-        """Return these priors with shapes all but fixed at `betas` (B, 10) in `settled` rows (B,)."""
+        """Return these priors with shapes practically fixed at `betas` (B, 10) in `settled` rows
+        (B,).
+        """
         stiffness = np.where(settled, SETTLED, self.stiffness)
         return Held(np.where(settled[:, None], betas, self.betas), stiffness, self.angles)
 
 
 def robust_cost(squared: Array, scale: float) -> Array:
-    """Geman-McClure: c² s / (c² + s), which grows to c² and no further."""
+    """Geman-McClure cost c² s / (c² + s), bounded by c²."""
     return np.asarray(scale**2 * squared / (scale**2 + squared))
 
 
 def robust_weight(squared: Array, scale: float) -> Array:
-    """Derivative of `robust_cost`: the weight of a joint in iterated least squares, 1 at its target."""
+    """Derivative of `robust_cost`: the weight of a joint in iteratively reweighted least squares, 1
+    at its target.
+    """
     return np.asarray((scale**2 / (scale**2 + squared)) ** 2)
 
 
 @dataclass(frozen=True)
 class Evaluated(FitRows):
-    """Bodies, and the energy around them: its slope where they are, its factor where it was linearised last."""
+    """Bodies with their energy and gradient, and the factored Hessian of the last linearisation."""
 
     free: Array
     """(B, P) free parameters."""
@@ -80,14 +86,17 @@ class Evaluated(FitRows):
     gradient: Array
     """(B, P) half the gradient."""
     system: Array
-    """(B, P + 1 + 3 N + 10, P) as `body/kernels/solving.py` has it, Hessian and gradient reduced; N keypoints."""
+    """(B, P + 1 + 3 N + 10, P) systems as in `body/kernels/solving.py`, Hessian and gradient
+    reduced; N keypoints."""
     step: Array
     """(B, P) the Newton step."""
     left: Array
-    """(B,) by how much that step would lower the energy."""
+    """(B,) predicted decrease of the energy by that step."""
 
     def move(self, where: Mask, free: Array, slope: Linear) -> None:
-        """Put rows `where` (B,) at `free` (B, P) with the slope there; the factor stays as it was."""
+        """Move the rows `where` (B,) to `free` (B, P) with the gradient there; the factored Hessian
+        is kept.
+        """
         self.free[where] = free[where]
         for name in ("energy", "xyz", "squared", "gradient"):
             getattr(self, name)[where] = getattr(slope, name)[where]
@@ -95,9 +104,10 @@ class Evaluated(FitRows):
         solved(self.system, np.full(len(self), -1.0), self.step, self.left)
 
     def covariances(self) -> tuple[Array, Array]:
-        """Return the covariances of the systems' keypoints (B, N, 3, 3), m², and of the betas (B, 10, 10).
+        """Return the covariances of the systems' keypoints (B, N, 3, 3), m², and of the betas (B,
+        10, 10).
 
-        Laplace approximation. The rest of the systems is reduced in place.
+        Laplace approximation. Reduces the rest of the systems in place.
         """
         B, M, P = self.system.shape
         covariance, shape = np.zeros((B, (M - P - 11) // 3, 3, 3)), np.zeros((B, 10, 10))
@@ -106,18 +116,19 @@ class Evaluated(FitRows):
 
 
 class BodyEnergy:
-    """Evaluates the energy over the *free* parameters of a row, a vector (P,).
+    """Evaluates the energy over the *free* parameters (P,) of a row: betas, root orientation,
+    angles, translation.
 
-    It holds betas, root orientation, angles, translation. The angles are the axis-angles of joints that some
-    keypoint can see. The others (hands) have no evidence: the prior's marginal over the visible angles accounts
-    for them exactly, and `complete` fills them in with what it expects of them.
+    The angles are the axis-angles of joints that move some keypoint. There is no evidence on the
+    others (hands): the prior's marginal over the free angles accounts for them exactly, and
+    `complete` sets them to their conditional mean.
     """
 
     def __init__(self, model: BodyModel, prior: PosePrior):
         self.model = model
         visible = visible_joints(model, prior)
         self.angles = (visible[:, None] * 3 + np.arange(3)).ravel()
-        """(A,) places of the visible angles among the 69."""
+        """(A,) indices of the free angles among the 69."""
         hidden = np.setdiff1d(np.arange(NUM_ANGLES), self.angles)
         self.num_angles = len(self.angles)
         self.num_free = 10 + 3 + self.num_angles + 3
@@ -134,37 +145,40 @@ class BodyEnergy:
         self._limbs = model.keypoint_points.limbs(column)
 
     def complete(self, free: Array) -> BodyParameters:
-        """The body (B rows) of free parameters (B, P); invisible joints are where the prior expects them."""
+        """The bodies (B rows) for free parameters (B, P); unobservable joints are at their
+        conditional mean.
+        """
         angles, pose = free[:, 13:-3], np.zeros((len(free), NUM_ANGLES))
         pose[:, self.angles] = angles
         pose[:, self._hidden] = angles @ self.priors.gain.T + self.priors.at_zero
         return BodyParameters(free[:, :10], free[:, 10:13], pose.reshape(-1, 23, 3), free[:, -3:])
 
     def parameters(self, fit: BodyFit, origin: Array) -> Array:
-        """Free parameters (B, P) of fitted bodies around their origins (B, 3)."""
+        """Free parameters (B, P) of fitted bodies relative to their origins (B, 3)."""
         angles = fit.body_pose.reshape(len(fit), -1)[:, self.angles]
         return np.concatenate((fit.betas, fit.global_orient, angles, fit.transl - origin), axis=1)
 
     def retract(self, free: Array, step: Array) -> Array:
-        """Move by a step (B, P): the orientation by R exp(step), all else by addition.
+        """Apply a step (B, P): the orientation by R exp(step), all else by addition.
 
-        Angles are added to as vectors, for in them the pose prior's components are exactly quadratic.
+        Angles are added as vectors, because the pose prior is exactly quadratic in them.
         """
         moved = free + step
         moved[:, 10:13] = log_so3(exp_so3(free[:, 10:13]) @ exp_so3(step[:, 10:13]))
         return moved
 
     def held_by_priors(self, count: int) -> Held:
-        """`count` rows, held by nothing else than the priors."""
+        """`count` rows constrained only by the priors."""
         return Held(np.zeros((count, 10)), np.ones(count), np.tile(self.priors.mean, (count, 1)))
 
     def linearise(
         self, free: Array, targets: EnergyTargets, scale: Array | float, held: Held, asked: Index | None = None,
         *, slope_only: bool = False,
     ) -> Linear:  # fmt: skip
-        """The energy at free parameters (B, P), the robust kernel having this scale, or one for each row (B,).
+        """Linearise the energy at free parameters (B, P), with a scale of the robust kernel for all
+        rows or each row (B,).
 
-        Systems hold the Jacobian of the keypoints that are `asked` (B, N) for; None: of all.
+        Systems include the Jacobian of the keypoints `asked` (B, N); None: of all.
         """
         (B, P), K = free.shape, len(self.model.keypoint_names)
         asked = np.broadcast_to(np.arange(K), (B, K)) if asked is None else asked
@@ -178,7 +192,7 @@ class BodyEnergy:
     def evaluate(
         self, free: Array, targets: EnergyTargets, scale: float, held: Held, asked: Index | None = None
     ) -> Evaluated:
-        """Bodies at free parameters (B, P), and the energy around them; `asked` as in `linearise`."""
+        """Bodies at free parameters (B, P) with energy and step; `asked` as in `linearise`."""
         linear = self.linearise(free, targets, scale, held, asked)
         step, left = np.empty(free.shape), np.empty(len(free))
         solved(linear.system, np.zeros(len(free)), step, left)
@@ -186,28 +200,30 @@ class BodyEnergy:
 
 
 def nothing(count: int) -> Index:
-    """No keypoints of `count` rows."""
+    """An empty selection of keypoints for `count` rows."""
     return np.zeros((count, 0), dtype=np.intp)
 
 
 def _contiguous(parts: Sequence[Any]) -> Iterator[Any]:
-    """As kernels want them."""
+    """Copies of arrays, C-contiguous, as kernels require."""
     return (np.array(part, order="C") for part in parts)
 
 
 def _plain(array: Array) -> Array:
-    """As kernels want it: C-contiguous, float64, writable."""
+    """The array, C-contiguous, float64 and writable, as kernels require."""
     array = np.ascontiguousarray(array, dtype=np.float64)
     return array if array.flags.writeable else array.copy()
 
 
 def _rows(targets: EnergyTargets, held: Held) -> Rows:
-    """For kernels."""
+    """Targets and priors in the form that kernels take."""
     return Rows(*map(_plain, (targets.xyz, targets.information, held.betas, held.stiffness, held.angles)))
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> Index:
-    """Which of the 23 joints below the root move some keypoint, by the model's own Jacobian (indices)."""
+    """Indices of the joints below the root (of 23) whose rotation moves some keypoint, from the
+    Jacobian.
+    """
     poses, still = prior.sample(np.random.default_rng(0), 8), np.zeros((8, 3))
     _, jacobian = model.keypoints_with_jacobian(BodyParameters(np.zeros((8, 10)), still, poses, still))
     speed = np.abs(jacobian[..., 13:-3]).reshape(*jacobian.shape[:3], 23, 3).max(axis=(0, 1, 2, 4))

@@ -1,4 +1,4 @@
-"""Which joint targets can be believed, and how much: what every fitter does before it fits."""
+"""Validation and weighting of joint targets before any fit."""
 
 import math
 from dataclasses import dataclass
@@ -12,40 +12,44 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.rows import Rows
 
 _ROUNDING = 1e-4
-"""Asymmetry or negativity of information, relative, that passes for rounding: inverses of rays lose much."""
+"""Relative tolerance for asymmetry and negative eigenvalues of information; inverses for rays lose
+precision."""
 LEAST_JOINTS = 4
-"""Joints with full information that a fit needs: three place a body in space, one more says whether they agree."""
+"""Minimum number of joints with full information: three determine a pose, one more
+allows a check."""
 _SEEN_SIGMA_M = 0.3
-"""A joint's information is full when its target's sigma is under this along every axis, metres."""
+"""Standard deviation, m, below which, along every axis, a joint's information is full."""
 MIN_SPREAD_M = 0.03
-"""Joints with full information must lie this far off a common line (root mean square), metres: the body could spin
-about it."""
+"""Minimum root mean square distance of the joints with full information from a common line, m; else
+the rotation about it is undetermined."""
 
 
 @dataclass(frozen=True)
 class Evidence(Rows):
-    """Targets, judged: which rows can be fitted, and their information with the model's error in it."""
+    """Validated targets: status of each row, and information including the model's error."""
 
     status: NDArray[np.str_]
-    """(B,) OK or why not."""
+    """(B,) OK, or the reason why the row cannot be fitted."""
     xyz: Array
     """(B, K, 3) targets, zero where there is no information, metres."""
     information: Array
-    """(B, K, 3, 3) inverse of (information^-1 + sigma² I), which holds for a direction in which nothing was
-    measured, too, 1/m²."""
+    """(B, K, 3, 3) inverse of (information^-1 + sigma² I), 1/m²; also valid for singular
+    information."""
     variance_m2: Array
-    """(B, K) mean variance over the axes of joints with full information, else infinite."""
+    """(B, K) mean variance over the axes, m², of joints with full information; else infinite."""
     centre: Array
     """(B, 3) mean of the joints with full information, metres."""
 
     @property
     def total_information(self) -> Array:
-        """(B,) information about all joints of a row together, mean over the axes, 1/m²."""
+        """(B,) total information of all joints of a row, mean over the axes, 1/m²."""
         return np.asarray(np.trace(self.information, axis1=2, axis2=3).sum(axis=1) / 3)
 
 
 def weigh(targets: JointTargets, model_sigma_m: float) -> Evidence:
-    """Judge the rows, and add the model's error, a sigma in metres, to every target."""
+    """Validate the rows, and add the model's error, a standard deviation in metres, to every
+    target.
+    """
     xyz, information, valid = _refuse_nonsense(targets)
     weighed, variance, full = (
         np.empty_like(information),
@@ -69,8 +73,9 @@ def _positive(a, b, c, d, e, f):
 
 @kernel("f4 f0 f4 f2 b2 b1")
 def _weighed(information, v, found, variance, full, valid):
-    """Fill in, for B rows of targets with `information` L (B, K, 3, 3): (L^-1 + v I)^-1, `found`, the mean
-    `variance` (B, K) over the axes where a target is `full`, else infinite; and which rows are not `valid` (B,).
+    """For B rows of targets with `information` L (B, K, 3, 3), fill in `found` = (L^-1 + v I)^-1;
+    the mean `variance` (B, K) over the axes of targets that are `full`, else infinite; and which
+    rows are not `valid` (B,).
     """
     least = 1 / _SEEN_SIGMA_M**2
     for n in range(len(information)):
@@ -106,21 +111,23 @@ def _weighed(information, v, found, variance, full, valid):
 
 
 def determine_pose(xyz: Array, used: Mask) -> Mask:
-    """(...) whether the joints `used` (..., K) of `xyz` (..., K, 3) are enough, and do not lie on a line."""
+    """(...) whether the joints `used` (..., K) of `xyz` (..., K, 3) determine a pose: enough, and
+    not on a line.
+    """
     count = used.sum(axis=-1)
     points = np.where(used[..., None], xyz, 0.0)
     centre = points.sum(axis=-2) / np.maximum(count, 1)[..., None]
     points = np.where(used[..., None], points - centre[..., None, :], 0.0)
     scatter = points.swapaxes(-1, -2) @ points / np.maximum(count, 1)[..., None, None]
-    # How far they lie off their best line, squared, is what the largest eigenvalue leaves of the trace.
+    # The mean squared distance from the best line is the trace less the largest eigenvalue.
     off = np.maximum(np.linalg.eigvalsh(scatter)[..., :2].sum(axis=-1), 0.0)
     return (count >= LEAST_JOINTS) & (off >= MIN_SPREAD_M**2)
 
 
 def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, Mask]:
-    """Targets and information with rows that are not finite set to zero, and which rows (B,) were finite.
+    """Targets and information with non-finite rows set to zero, and a mask (B,) of the finite rows.
 
-    The place of a joint without information may be anything, NaN too: it is not used.
+    The position of a joint without information is ignored, and may be NaN.
     """
     known = np.any(targets.information != 0, axis=(2, 3))  # NaN differs from 0
     finite = np.isfinite(targets.information).all(axis=(1, 2, 3))

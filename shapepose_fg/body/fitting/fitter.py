@@ -1,4 +1,4 @@
-"""From 3D joints to bodies: what a fitter is given, its settings, what it gives back, what may replace it."""
+"""Interface of body fitters: targets, settings, results, and the base class."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -27,37 +27,40 @@ _ONE_TABLE = (
 
 @dataclass(frozen=True)
 class BodyConfig(Settings):
-    """How bodies are fitted."""
+    """Settings of body fitting."""
 
     method: str = "auto"
-    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned where there are weights
-    for the body at hand, plain on any other body."""
+    """"learned": learned gradient descent; "plain": Levenberg-Marquardt; "auto": learned if there
+    are weights for the given body, else plain."""
     weights: str = ""
-    """File of the network's weights; empty: those that come with the package, or that `shapepose-fg train-fitter`
-    made for another body."""
+    """File with the network's weights; empty: those of the package, or those that `shapepose-fg
+    train-fitter` made for another body."""
     model_sigma_m: Metres = 0.02
-    """How far the detector's joints lie from the body's, metres: added to every target's covariance."""
+    """Standard deviation between the detector's and the body's joints, metres; added to every
+    target's covariance."""
     kernel_scale: Factor = 6.0
-    """Mahalanobis distance at which the Geman-McClure kernel has cut a joint's weight to a quarter."""
+    """Mahalanobis distance at which the Geman-McClure kernel reduces a joint's weight
+    to a quarter."""
     polish_steps: RepeatsOrNone = 1
-    """Gauss-Newton steps after the network's, held by the pose prior around where the network arrived. On
-    validation subjects the first takes clean joints from 5.2 to 2.6 mm; a second changes nothing."""
+    """Gauss-Newton steps after the network's, with the pose prior centred at the network's result.
+    On validation subjects the first reduces the error on clean joints from 5.2 to 2.6 mm; a second
+    changes nothing."""
     unfinished: Factor = 30.0
-    """Rows that the network leaves so that another step would lower their energy by more are fitted by the plain
-    optimiser: some in a hundred whose joints contradict each other, such as those of two people."""
+    """Maximum decrease of the energy that a further step predicts; rows above it are fitted by the
+    plain optimiser: a few in a hundred with contradictory joints, e.g. of two people."""
     gap_s: Seconds = 1.0
-    """Bodies over time: rows of a person that are farther apart are not linked."""
+    """Bodies over time: rows of a person with a larger gap, s, are not linked."""
     correlation_s: Annotated[float, Interval(gt=0, le=3600)] = 1.5
-    """Bodies over time: how long errors of targets stay correlated, seconds; rows within that time tell of the
-    shape as one. On real detections of a static camera the correlation is 0.83 after 0.04 s, 0.63 after 0.2 s and
-    0.40 after 1 s."""
+    """Bodies over time: correlation time of errors of targets, seconds; rows within it count as one
+    observation of the shape. On real detections of a static camera the correlation is 0.83 after
+    0.04 s, 0.63 after 0.2 s and 0.40 after 1 s."""
 
     replaced: ClassVar[dict[str, str]] = {"learned": _ONE_TABLE, "plain": _ONE_TABLE}
-    """Settings of before, and what took their place."""
+    """Obsolete settings, and what replaces them."""
 
     @classmethod
     def paper(cls) -> "BodyConfig":
-        """As written in Eq. 6: the network's steps, and nothing after them."""
+        """The settings of Eq. 6: the network's steps only."""
         return cls(polish_steps=0, unfinished=1e6)
 
     def __post_init__(self) -> None:
@@ -67,31 +70,31 @@ class BodyConfig(Settings):
 
 
 class FitStatus(StrEnum):
-    """How the fit of one row ended."""
+    """Outcome of the fit of a row."""
 
     OK = "ok"
     INVALID_TARGETS = "invalid_targets"
-    """NaN or infinity in a target that has information, or information that is not positive semi-definite."""
+    """A target with information is not finite, or information is not positive semi-definite."""
     TOO_FEW_JOINTS = "too_few_joints"
-    """Too few joints with full information, or all of them on one line: the body could be turned freely."""
+    """Too few joints with full information, or all on one line: the rotation about it is
+    undetermined."""
     NOT_CONVERGED = "not_converged"
-    """The energy was still falling when the iterations ran out, or it left the finite numbers."""
+    """The energy was still decreasing at the last iteration, or became non-finite."""
 
 
 STATUS_TYPE = np.dtype(f"U{max(map(len, FitStatus))}")
-"""Type of arrays that hold any `FitStatus`; NumPy would cut longer texts off in a type inferred from one."""
+"""NumPy type for any `FitStatus`; a type inferred from one text would truncate longer ones."""
 
 
 @dataclass(frozen=True)
 class JointTargets(Rows):
-    """Where the joints of B people (rows: people, frames or both) should be, and how surely."""
+    """Target positions with information for the joints of B rows (people, frames or both)."""
 
     xyz: Array
     """(B, J, 3) target of each joint in the world, metres; ignored where the information is zero."""
     information: Array
     """(B, J, 3, 3) inverse covariance of each target, 1/m², symmetric and positive *semi*-definite.
-
-    Zero for a joint never seen, rank 2 for one that a single view saw (a ray), full otherwise."""
+    Zero for an unseen joint, rank 2 for one seen by a single view (a ray), full otherwise."""
 
     def __post_init__(self) -> None:
         xyz = np.asarray(self.xyz, dtype=np.float64)
@@ -105,7 +108,9 @@ class JointTargets(Rows):
 
     @classmethod
     def solved(cls, joints: Array, covariance: Array) -> "JointTargets":
-        """Targets at `joints` (B, J, 3), metres, known to `covariance` (B, J, 3, 3); none where either is NaN."""
+        """Targets at `joints` (B, J, 3), metres, with covariance (B, J, 3, 3); none where either is
+        NaN.
+        """
         known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
         information = np.zeros(covariance.shape)
         information[known] = np.linalg.inv(covariance[known])
@@ -117,22 +122,25 @@ class JointTargets(Rows):
         return np.asarray(self.information.any(axis=(2, 3)))
 
     def where(self, chosen: Mask, times: float = 1.0) -> "JointTargets":
-        """The targets of the `chosen` (B, J) joints, their information `times` this number; none for others."""
+        """The targets of the `chosen` (B, J) joints, with information multiplied by `times`; none
+        for others.
+        """
         chosen = chosen & self.known
         information = np.where(chosen[..., None, None], self.information * times, 0.0)
         return JointTargets(np.where(chosen[..., None], self.xyz, 0.0), information)
 
     def larger(self, size: Array) -> "JointTargets":
-        """Return the targets with people and world scaled by `size` (B,)."""
+        """Return the targets with all lengths scaled by `size` (B,)."""
         size = size[:, None, None]
         return JointTargets(self.xyz * size, self.information / size[..., None] ** 2)
 
 
 @dataclass(frozen=True)
 class BodyFit(Rows):
-    """The bodies of B rows.
+    """Bodies fitted to B rows.
 
-    A row whose status is not OK has NaN joints and covariances and zero parameters: parameters are never NaN.
+    A row with a status other than OK has NaN joints and covariances and zero parameters: parameters
+    are never NaN.
     """
 
     betas: Array
@@ -148,9 +156,10 @@ class BodyFit(Rows):
     covariance: Array
     """(B, J, 3, 3) covariance of `joints` given all targets, m² (Laplace)."""
     prior_xyz: Array
-    """(B, J, 3) where the body puts each joint *without* that joint's own target, metres."""
+    """(B, J, 3) prediction of each joint by the body *without* that joint's own target, metres."""
     prior_covariance: Array
-    """(B, J, 3, 3) its covariance as a prediction of the detector's joint: model error included, m²."""
+    """(B, J, 3, 3) covariance of this prediction of the detector's joint, including the model's
+    error, m²."""
     residual_m: Array
     """(B,) weighted root mean square distance of the joints to their targets, metres; NaN where not OK."""
     status: NDArray[np.str_]
@@ -158,7 +167,7 @@ class BodyFit(Rows):
 
     @property
     def ok(self) -> Mask:
-        """(B,) which rows hold a body."""
+        """(B,) mask of the rows with a body."""
         return self.status == FitStatus.OK
 
     @classmethod
@@ -170,7 +179,9 @@ class BodyFit(Rows):
         return cls(*columns, status=np.asarray(status).astype(STATUS_TYPE))
 
     def put_bodies(self, index: Index, body: "BodyParameters", origin: Array) -> None:
-        """Write bodies (R) that were found around `origin` (R, 3), metres, over the rows `index` (R,)."""
+        """Write bodies (R), fitted relative to `origin` (R, 3), metres, to the rows
+        `index` (R,).
+        """
         for name in ("betas", "global_orient", "body_pose"):
             getattr(self, name)[index] = getattr(body, name)
         self.transl[index] = body.transl + origin
@@ -178,12 +189,12 @@ class BodyFit(Rows):
 
 @dataclass(frozen=True)
 class Shapes:
-    """What is known of the shapes of G people: a Gaussian over the betas of each."""
+    """Gaussian posteriors of the shapes (betas) of G people."""
 
     mean: Array
     """(G, 10) in standard deviations over adults."""
     information: Array
-    """(G, 10, 10) inverse covariances. Those of an unknown person are the identity around 0."""
+    """(G, 10, 10) inverse covariances; the prior of an unknown person is the identity, around 0."""
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 2 or self.mean.shape[1] != 10 or self.information.shape != (*self.mean.shape, 10):
@@ -192,36 +203,40 @@ class Shapes:
 
     @classmethod
     def unknown(cls, count: int) -> "Shapes":
-        """Shapes of `count` people who were never seen: adults."""
+        """Prior shapes of `count` unknown people: adults."""
         return cls(np.zeros((count, 10)), np.tile(np.eye(10), (count, 1, 1)))
 
 
 @dataclass(frozen=True)
 class SequenceFit:
-    """Bodies of B rows, and what is known of their shapes."""
+    """Bodies of B rows, and posteriors of their shapes."""
 
     fit: BodyFit
-    """The bodies. `covariance` is what a row's own targets say at the shape of its group: correlated errors are
-    not averaged out. `prior_xyz` and `prior_covariance` are NaN: they are `fit`'s."""
+    """The bodies. `covariance` is from a row's own targets, given the shape of its group:
+    correlated errors are not averaged out. `prior_xyz` and `prior_covariance` are NaN; only `fit`
+    computes them."""
     groups: Index
     """(G,) the groups, in order."""
     shapes: Shapes
-    """(G) their shapes given everything, what was known before included: the prior of their next recording."""
+    """(G) posterior shapes, including the prior given; they can be the prior for a next
+    recording."""
 
 
 class BodyFitter(ABC):
-    """Anything that turns joints into bodies. Your own inherits from this and has `fit`, the rest is optional."""
+    """Base class of body fitters. Your own must define `fit`; the rest is optional."""
 
     model: "BodyModel | None" = None
-    """The body that it fits. A fitter that has one has `with_keypoint_offsets` and `fit_sequence`, too; without,
-    the detector's offsets are not learnt, and there is no one body for each person over time."""
+    """The body model. A fitter with one must define `with_keypoint_offsets` and `fit_sequence`,
+    too; without one, the detector's offsets are not estimated, and people have no common shape over
+    time."""
 
     @abstractmethod
     def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
         """Fit a body to every row of `targets`.
 
-        `initial` has one row per target; its OK rows are where the fit may start. `groups` (B,) are whole numbers:
-        rows with the same number are one person and get one shape. Otherwise rows do not influence each other.
+        `initial` has one row per target; the fit may start at its OK rows. `groups` (B,) are
+        integers: rows with the same number are one person and get one shape. Otherwise rows are
+        independent.
         """
 
     def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
@@ -241,23 +256,24 @@ class BodyFitter(ABC):
         *,
         fixed_shapes: bool = False,
     ) -> SequenceFit:
-        """One shape per group and poses that move as people do, over time.
+        """Fit one shape per group, and poses over time with a motion prior.
 
         Parameters
         ----------
-        targets: of B rows: where a person's joints are, and how surely, in one frame each.
-        groups: (B,) whole numbers: who.
-        time_s: (B,) when, seconds. Rows of a group more than `gap_s` apart are not linked.
-        shapes: what is known of the shape of each group, in the order of `np.unique(groups)`; None: nothing.
+        targets: joint targets of B rows, each a person in a frame.
+        groups: (B,) integers that identify people.
+        time_s: (B,) times, seconds. Rows of a group more than `gap_s` apart are not linked.
+        shapes: prior shapes of the groups, in the order of `np.unique(groups)`; None: adults.
         fixed_shapes: keep the means of `shapes`.
 
-        Rows with too few joints follow those before and after; ValueError where a group has two rows at one time.
+        Rows with too few joints are interpolated by the motion prior. Raises ValueError if a group
+        has two rows at one time.
         """
         raise NotImplementedError(f"{type(self).__name__} has a model and no fit_sequence")
 
 
 def check_fitter(fitter: object) -> None:
-    """TypeError where `fitter` is no `BodyFitter`."""
+    """Raise TypeError unless `fitter` is a `BodyFitter`."""
     if not isinstance(fitter, BodyFitter):
         raise TypeError(
             f"{type(fitter).__name__} must inherit from shapepose_fg.body.fitting.fitter.BodyFitter, which makes"
@@ -266,7 +282,7 @@ def check_fitter(fitter: object) -> None:
 
 
 def check_groups(groups: Index, rows: int) -> Index:
-    """`groups` if it is one whole number a row; ValueError otherwise."""
+    """`groups` as an array; raises ValueError unless it has one integer per row."""
     groups = np.asarray(groups)
     if groups.shape != (rows,) or groups.dtype.kind not in "iu":
         raise ValueError(f"groups must be {rows} whole numbers, one a row, got {groups.dtype} {groups.shape}")

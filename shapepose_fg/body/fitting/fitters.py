@@ -1,4 +1,6 @@
-"""The body fitter: judge targets, plan passes, fit them, share shapes, fit again; with the network on or off."""
+"""The body fitter: validates targets, runs all passes, pools shapes, and fits again; with or
+without the network.
+"""
 
 from dataclasses import replace
 from functools import cached_property
@@ -31,28 +33,32 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 _CHUNK = 64
-"""Rows that are fitted at a time: their Hessians stay in the cache, and memory does not grow with the batch."""
+"""Number of rows per batch of fits; their Hessians fit into the cache, and memory is bounded."""
 _ARRIVE = 128
-"""Rows that the network sees at a time."""
+"""Number of rows per batch of the network."""
 _VOTERS = 24
-"""Rows of a group that agree upon its shape. In a window of some seconds errors are correlated: more tell no
-more."""
+"""Maximum number of rows that determine a group's shape; errors within seconds are correlated, so
+more add no information."""
 _CONVERGED = 9.0
-"""Without a network, rows whose energy a Newton step would still lower by more (3 sigma of the posterior) are
-NOT_CONVERGED; with one, `BodyConfig.unfinished` says so after the plain optimiser has tried."""
+"""Without a network: maximum decrease of the energy that a Newton step predicts for a converged row
+(3 sigma of the posterior). With a network, `BodyConfig.unfinished` is used after the plain
+optimiser."""
 _ROUNDS = 2
-"""How often somebody is fitted at an adult's size: the first sizes are those that the prior of adults leaves."""
+"""Number of fits at an adult's size; the first estimate of the size is biased by the prior of
+adults."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
-"""Multiplies the variance of joints without their own target. Elbows bend farther from their mean than a Gaussian
-says: without it, 85 % of the wrists of the validation subjects (training.motions) lay in their 90 % ellipsoids."""
+"""Factors on the variance of joints without their own target. Elbows bend farther from their mean
+than a Gaussian predicts: without them, 85 % of the wrists of the validation subjects
+(training.motions) lie in their 90 % ellipsoids."""
 
 
 def make_fitter(
     config: BodyConfig | None = None, model: BodyModel | None = None, law: Motion = CONSTANT_VELOCITY
 ) -> "SmplFitter":
-    """The fitter that `config` asks for, on `model` or the shipped body; over time bodies move by this `law`.
+    """The fitter for `config`, on `model` or the body of the package; `law` is the motion model
+    over time.
 
-    InputError where the network is asked for and its weights are missing, or for another body.
+    Raises InputError if the network is requested and its weights are missing or for another body.
     """
     config = BodyConfig() if config is None else config
     model = BodyModel.default() if model is None else model
@@ -65,11 +71,12 @@ def make_fitter(
 
 
 class SmplFitter(BodyFitter):
-    """Fits a body to 3D joints by learned gradient descent, or without `weights` by Levenberg-Marquardt.
+    """Fits a body to 3D joints by learned gradient descent, or without `weights` by
+    Levenberg-Marquardt.
 
-    Rows are independent, but for the shape of rows in one group; one that the network and a short polish do not
-    settle is fitted by Levenberg-Marquardt instead, with a shape of its own. Everything but the network's layers
-    is computed in double precision.
+    Rows are independent except for the common shape of a group. Rows that do not converge with the
+    network and a short polish are fitted by Levenberg-Marquardt, with a shape of their own. All but
+    the network's layers is computed in double precision.
     """
 
     model: BodyModel
@@ -86,7 +93,7 @@ class SmplFitter(BodyFitter):
         self.prior = PosePrior.default() if pose_prior is None else pose_prior
         self.config = config = BodyConfig() if config is None else config
         self.law = law
-        """How bodies of a person move from row to row."""
+        """Motion model of bodies over time."""
         self.weights = weights
         """Weights of the network; None: no network is used."""
         self.energy = BodyEnergy(self.model, self.prior)
@@ -102,7 +109,7 @@ class SmplFitter(BodyFitter):
 
     @cached_property
     def sets(self) -> Index:
-        """(J,) which joints are left out together."""
+        """(J,) number of the leave-one-out set of each joint."""
         return left_out_sets(self.energy, self.prior)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "SmplFitter":
@@ -111,10 +118,11 @@ class SmplFitter(BodyFitter):
         return SmplFitter(model, self.prior, self.config, self.weights, self.law)
 
     def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
-        """Fit a body to every row of `targets`; see `BodyFit` for what comes back.
+        """Fit a body to every row of `targets`; see `BodyFit` for the result.
 
-        OK rows of `initial` are warm starts of Levenberg-Marquardt: no closed form, no annealing; passes that
-        leave targets out start cold. The network needs none: two fits to the same targets are the same fit.
+        OK rows of `initial` are warm starts of Levenberg-Marquardt, without closed form and
+        annealing; leave-one-out passes start cold. The network ignores them: its result depends on
+        the targets only.
         """
         return self._fit(targets, initial, groups, leave_out=True)
 
@@ -133,7 +141,9 @@ class SmplFitter(BodyFitter):
         *,
         fixed_shapes: bool = False,
     ) -> SequenceFit:
-        """See `BodyFitter`; who is far from the size of adults is fitted at that size first (`sizes`)."""
+        """See `BodyFitter`; people far from adults' size are fitted at that size first
+        (`sizes`).
+        """
         sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
         found = sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
         sizes = Sizes.of(self.model)
@@ -154,7 +164,7 @@ class SmplFitter(BodyFitter):
     def _fit(
         self, targets: JointTargets, initial: BodyFit | None, groups: Index | None, *, leave_out: bool
     ) -> BodyFit:
-        """A body for every row."""
+        """Fit a body to every row, with or without the leave-one-out passes."""
         count = len(self.model.keypoint_names)
         if targets.xyz.shape[1] != count:
             raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
@@ -174,7 +184,7 @@ class SmplFitter(BodyFitter):
         return fit
 
     def _posterior(self, passes: Passes, start: Array | None) -> list[JointPosterior]:
-        """What all passes (M) say: in order, part by part."""
+        """Posteriors of all passes (M), in order, in parts."""
         free, held = self._arrive(passes, start)
         fitted = self.optimiser.evaluated
         if shared(passes.pool, passes.votes).any():
@@ -185,8 +195,9 @@ class SmplFitter(BodyFitter):
             asked = passes.asked(index)
             body = fitted(free[index], passes.given(index)[0], held.rows(index), asked)
             part = JointPosterior.of(body)
-            # Each pass by itself: what a target does to another pass must not decide which optimiser this one has.
-            unsettled = np.flatnonzero(~(part.left < self._unfinished))  # NaN is unsettled
+            # Each pass separately: the choice of optimiser must not depend on the targets of
+            # another pass.
+            unsettled = np.flatnonzero(~(part.left < self._unfinished))  # true for NaN
             if self._fallback is not None and len(unsettled) > 0:
                 (targets, variance), asked = passes.given(index[unsettled]), asked[unsettled]
                 arrived, by_priors = self._fallback.arrive(targets, variance)
@@ -196,8 +207,9 @@ class SmplFitter(BodyFitter):
         return parts
 
     def _arrive(self, passes: Passes, start: Array | None) -> tuple[Array, Held]:
-        """Where passes (M) start, (M, P) around the centres of their rows, and what holds them. Only those with
-        all targets may begin at `start` (R, P): an earlier body has seen what the others leave out.
+        """Initial parameters of passes (M, P), relative to the centres of their rows, and their
+        priors. Only passes with all targets may begin at `start` (R, P): an earlier body has used
+        the targets that others leave out.
         """
         found = []
         for index in passes.chunks(_ARRIVE):
@@ -207,9 +219,9 @@ class SmplFitter(BodyFitter):
         return np.concatenate([free for free, _ in found]), Held(*map(np.concatenate, held))
 
     def _one_shape(self, passes: Passes, free: Array, held: Held) -> tuple[Array, Held]:
-        """Return starts and priors of passes (M) with one shape for each pool of rows.
+        """Return initial parameters and priors of passes (M) with one shape per pool.
 
-        The passes that vote are fitted by themselves first.
+        The passes that contribute are first fitted independently.
         """
         free, precision, settled = free.copy(), np.zeros((len(free), 10, 10)), np.zeros(len(free), dtype=bool)
         for index in _parts(np.flatnonzero(passes.votes), _CHUNK):
@@ -222,9 +234,9 @@ class SmplFitter(BodyFitter):
         return np.concatenate((betas, free[:, 10:]), 1), held.at_shape(betas, agreed)
 
     def _fill(self, fit: BodyFit, rows: Index, passes: Passes, parts: list[JointPosterior]) -> None:
-        """Fill `fit`'s `rows` (R,) with what the passes found.
+        """Fill `fit`'s `rows` (R,) with the results of the passes.
 
-        Rows whose energy a Newton step would still lower, or that are not finite, become NOT_CONVERGED.
+        Rows that have not converged, or are not finite, become NOT_CONVERGED.
         """
         wider, evidence, chunks = self._spread[:, None, None], passes.evidence, passes.chunks(_CHUNK)
         whole = [part for part, index in zip(parts, chunks, strict=True) if index[0] < len(rows)]
@@ -233,11 +245,11 @@ class SmplFitter(BodyFitter):
         prior_xyz, prior_covariance = found.xyz.copy(), found.covariance.copy()
         for part, index in zip(parts[len(whole) :], chunks[len(whole) :], strict=True):
             asked = passes.asked(index)
-            left_out = np.take_along_axis(passes.without[index], asked, axis=1)  # others fill up a smaller set
+            left_out = np.take_along_axis(passes.without[index], asked, axis=1)  # smaller sets are padded
             into = np.broadcast_to(passes.row[index, None], asked.shape)[left_out], asked[left_out]
             prior_xyz[into] = np.take_along_axis(part.xyz, asked[..., None], axis=1)[left_out]
             prior_covariance[into] = part.covariance[left_out]
-        done = found.left < self._unfinished  # NaN is not
+        done = found.left < self._unfinished  # false for NaN
         done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
         fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
         rows, origin = rows[done], evidence.centre[done]
@@ -249,10 +261,10 @@ class SmplFitter(BodyFitter):
         fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)[done]
 
     def _starts(self, evidence: Evidence) -> tuple[Array, Array, Mask]:
-        """Bodies of rows (R) with all their targets, nothing left out, each with a shape of its own.
+        """Fit rows (R) with all their targets and a shape of their own.
 
-        Returns their parameters (R, P) around `evidence.centre`, around which angles (R, A) they are held, and
-        which (R,) are finished.
+        Returns parameters (R, P) relative to `evidence.centre`, the centres of the pose prior (R,
+        A), and a mask (R,) of converged rows.
         """
         passes = Passes.whole(evidence, np.arange(len(evidence.xyz)))
         free, held = self._arrive(passes, None)
@@ -270,19 +282,21 @@ class SmplFitter(BodyFitter):
         return free, held.angles, done
 
     def _start(self, initial: BodyFit, centre: Array) -> Array:
-        """Free parameters (R, P) of bodies around their origins (R, 3); NaN where there is none."""
+        """Free parameters (R, P) of bodies relative to the origins (R, 3); NaN where there is no
+        body.
+        """
         start = self.energy.parameters(initial, centre)
         start[~initial.ok] = np.nan
         return start
 
 
 def _parts(rows: Index, size: int) -> list[Index]:
-    """Rows in parts of at most `size`."""
+    """Row indices in parts of at most `size`."""
     return [rows[at : at + size] for at in range(0, len(rows), size)]
 
 
 def evenly(groups: Index, count: int) -> Mask:
-    """(R,) at most `count` rows of each group (R,), evenly spread over its rows."""
+    """(R,) mask of at most `count` rows of each group (R,), evenly spread."""
     order = np.argsort(groups, kind="stable")
     _, first, size = np.unique(groups[order], return_index=True, return_counts=True)
     rank = np.arange(len(order)) - np.repeat(first, size)

@@ -1,4 +1,4 @@
-"""Leave-one-out: which targets are taken out together, and the passes of a fit that never see them."""
+"""Leave-one-out predictions: sets of targets to leave out, and the passes of a fit without them."""
 
 from dataclasses import dataclass
 
@@ -11,44 +11,47 @@ from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SETS = 6
-"""Number of sets. More sets cost more passes and leave fewer joints out at a time."""
+"""Number of sets. More sets cost more passes, but leave fewer joints out at once."""
 _POSES = 8
-"""Poses of the prior at which the coupling of joints is linearised."""
+"""Number of poses, sampled from the prior, at which the coupling of joints is linearised."""
 _ROOT_INFORMATION = 1e-2
-"""Prior information about the root's rotation, 1/rad², and place, 1/m², in that linearisation: negligible."""
+"""Prior information on the root's rotation, 1/rad², and position, 1/m², for that linearisation:
+negligible."""
 
 
 @dataclass(frozen=True)
 class Passes:
-    """M fits to the targets of R rows: first each row with all its targets, then with some of them left out.
+    """M fits to the targets of R rows: first each row with all its targets, then with some of them
+    left out.
 
-    A joint's prior is taken from a pass that saw none of its targets: the gain on its own noise is 0 by
-    construction, not to first order.
+    The prediction of a joint is from a pass without its target, so that it does not depend on the
+    target's noise, exactly and not only to first order.
     """
 
     evidence: Evidence
     """(R) the targets."""
     row: Index
-    """(M,) whose targets; the first R are 0 to R - 1."""
+    """(M,) row of each pass; the first R are 0 to R - 1."""
     without: Mask
     """(M, J) targets that are left out."""
     pool: Index
-    """(M,) passes with the same number get one shape: rows of one group, with the same targets left out of all."""
+    """(M,) pool of each pass: passes of one group with the same targets left out get one shape."""
     votes: Mask
-    """(M,) whether a pass has a part in its pool's shape."""
+    """(M,) whether a pass contributes to its pool's shape."""
 
     @classmethod
     def whole(cls, evidence: Evidence, groups: Index) -> "Passes":
-        """One pass with all targets for each row of `groups` (R,), and nothing left out."""
+        """One pass per row of `groups` (R,), with all targets."""
         R, J = evidence.xyz.shape[:2]
         return cls(evidence, np.arange(R), np.zeros((R, J), dtype=bool), groups, np.ones(R, dtype=bool))
 
     @classmethod
     def of(cls, evidence: Evidence, sets: Index, groups: Index) -> "Passes":
-        """One pass with all targets for each row (R), one more for every set of joints (J,) to leave out.
+        """One pass per row (R) with all targets, and one for every set of joints (J,) to leave out.
 
-        A set without a target in any row of a group (R,) needs no pass. Where what is left would not determine the
-        pose, the joints of the set are left out one by one; these passes take the shape of their group's others.
+        A set without targets in any row of a group (R,) needs no pass. If the remaining joints do
+        not determine the pose, those of the set are left out one by one; these passes take the
+        shape of their group's others.
         """
         seen, full = evidence.information.any(axis=(2, 3)), np.isfinite(evidence.variance_m2)
         R, J, S = *seen.shape, sets.max() + 1
@@ -67,21 +70,25 @@ class Passes:
         return cls(evidence, row, without, group[row] * (S + 1) + of_set + 1, votes)
 
     def chunks(self, size: int) -> list[Index]:
-        """Passes with all targets, then those without some, in parts of at most `size`."""
+        """Pass indices in parts of at most `size`: first those with all targets, then
+        the others.
+        """
         R, M = len(self.evidence.xyz), len(self.row)
         ends = [(0, R), (R, M)]
         return [np.arange(at, min(at + size, end)) for start, end in ends for at in range(start, end, size)]
 
     def asked(self, index: Index) -> Index:
-        """(B, N) joints that some passes are for: all, or those left out, of some sets others too."""
+        """(B, N) joints that some passes must predict: all, or those left out, padded with others
+        to equal number.
+        """
         without = self.without[index]
         if not without.any():
             return np.broadcast_to(np.arange(without.shape[1]), without.shape)
         return np.argsort(~without, axis=1, kind="stable")[:, : self.without.sum(axis=1).max()]
 
     def given(self, index: Index) -> tuple[EnergyTargets, Array]:
-        """The targets of some passes around their rows' centres, and the variance of each (B, J): infinite where a
-        target is left out.
+        """Targets of some passes, relative to the centres of their rows, and the variance of each
+        (B, J); infinite for targets left out.
         """
         evidence, row, without = self.evidence, self.row[index], self.without[index]
         xyz = evidence.xyz[row] - evidence.centre[row, None]
@@ -90,10 +97,12 @@ class Passes:
 
 
 def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> Index:
-    """Which of `SETS` sets each joint (J,) is left out with: joints that tell little of each other.
+    """Set (of `SETS`) with which each joint (J,) is left out, such that joints of a set carry
+    little information about each other.
 
-    The cost of a pair is how much less certain each of the two is when the other is missing too (`_coupling`); the
-    sum over all pairs in one set is made small by placing joint by joint, then moving and exchanging them.
+    The cost of a pair is the increase of each one's uncertainty if the other is missing too
+    (`_coupling`). The sum over all pairs within sets is reduced by greedy assignment, then by
+    moving and exchanging joints.
     """
     cost = _coupling(energy, prior)
     sets = np.full(len(cost), -1)
@@ -116,10 +125,11 @@ def left_out_sets(energy: BodyEnergy, prior: PosePrior) -> Index:
 
 
 def _coupling(energy: BodyEnergy, prior: PosePrior) -> Array:
-    """(J, J) how much a pair of joints costs that are left out together, nats.
+    """(J, J) cost of leaving a pair of joints out together, nats.
 
-    With P the covariance of all joints under the priors and K = (P + model_sigma² I)^-1, the joints A are
-    predicted from all others with the covariance K_AA^-1. Leaving b out with a widens a's part of it.
+    With P the covariance of all joints under the priors and K = (P + model_sigma² I)^-1, the joints
+    A are predicted from all others with covariance K_AA^-1. Leaving b out as well increases a's
+    part of it.
     """
     free = np.zeros((_POSES, energy.num_free))
     poses = prior.sample(np.random.default_rng(0), _POSES).reshape(_POSES, -1)

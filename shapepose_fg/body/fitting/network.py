@@ -1,4 +1,4 @@
-"""The update network of learned gradient descent: its size, its weights, its layers."""
+"""The update network of learned gradient descent."""
 
 import math
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.compiled import kernel
 
 NUM_ROTATIONS = 22
-"""Root and the 21 joints of SMPL that are not hands: what the network turns."""
+"""Root and the 21 joints of SMPL that are not hands: the rotations that the network updates."""
 NUM_PARAMETERS = 10 + 6 * NUM_ROTATIONS + 3
-"""betas, rotations as 6D, translation."""
+"""Number of parameters: betas, 6D rotations, translation."""
 NUM_TANGENT = 10 + 3 * NUM_ROTATIONS + 3
-"""betas, tangents of the rotations, translation."""
+"""Number of tangent parameters: betas, tangents of the rotations, translation."""
 _NUM_POINTS = len(BODY_POINTS)
 _NONE, _LITTLE, _ROOT_HALF, _HALF, _ONE, _FAR = map(np.float32, (0.0, 1e-5, 0.5**0.5, 0.5, 1.0, 3.9))
 
@@ -28,27 +28,30 @@ class NetworkConfig(Settings):
     """The size of an `UpdateNetwork`."""
 
     width: Annotated[int, Interval(ge=1, le=8192)] = 384
-    """Units of every layer."""
+    """Number of units of every layer."""
     blocks: Annotated[int, Interval(ge=1, le=64)] = 2
-    """Residual blocks."""
+    """Number of residual blocks."""
     steps: Annotated[int, Interval(ge=1, le=14)] = 3
-    """Updates that it is made for; each knows its number."""
+    """Number of updates; the step number is an input."""
     dropout: Annotated[float, Interval(ge=0, le=0.99)] = 0.1
-    """Share of the units that are left out in training."""
+    """Dropout rate in training."""
     half_precision: bool = True
     """Trains with bfloat16 products, twice as fast on processors that have them; fits are always in float32."""
 
 
 class UpdateNetwork:
-    """From gradient, parameters and targets to the next step of the parameters.
+    """Predicts the next step of the parameters from gradient, parameters and targets.
 
-    A multilayer perceptron with residual blocks: layer normalisation, a layer, GELU, a layer.
+    A multilayer perceptron with residual blocks: layer normalisation, linear layer, GELU, linear
+    layer.
     """
 
     num_inputs = 7 * _NUM_POINTS + NUM_PARAMETERS + NUM_TANGENT
 
     def __init__(self, config: NetworkConfig, weights: Mapping[str, NDArray[np.floating]]):
-        """`weights` by their names in training; ValueError where one is missing, too many or of another size."""
+        """`weights` by their names in training; raises ValueError if one is missing, unknown or of
+        wrong shape.
+        """
         self.config = config
         shapes = layer_shapes(config)
         found = {name: value.shape for name, value in weights.items()}
@@ -56,16 +59,18 @@ class UpdateNetwork:
             wrong = sorted(name for name in found.keys() | shapes if found.get(name) != shapes.get(name))
             raise ValueError(f"the network's {wrong[0]} is {found.get(wrong[0])}, not {shapes.get(wrong[0])}")
         self.weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()}
-        """(float32) by name."""
+        """Weights by name, float32."""
         self._enter = np.ascontiguousarray(self.weights["enter.weight"][:, : self.num_inputs])
 
     @property
     def gradient_scale(self) -> NDArray[np.float32]:
-        """(79,) by which gradients are multiplied."""
+        """(79,) factors on the gradients."""
         return self.weights["gradient_scale"]
 
     def __call__(self, inputs: NDArray[np.float32], step: int) -> NDArray[np.float32]:
-        """(B, `NUM_PARAMETERS`) the change of the parameters in update number `step`; inputs (B, `num_inputs`)."""
+        """(B, `NUM_PARAMETERS`) change of the parameters in update `step`; inputs (B,
+        `num_inputs`).
+        """
         W = self.weights
         enter = W["enter.weight"]
         hidden = _applied(inputs, self._enter, W["enter.bias"] + enter[:, self.num_inputs + step])
@@ -80,7 +85,7 @@ class UpdateNetwork:
 
 
 def _layers(block: int) -> list[str]:
-    """Names of a block's normalisation and its two layers."""
+    """Names of a block's normalisation and its two linear layers."""
     return [f"blocks.{block}.layers.{place}" for place in (0, 1, 4)]
 
 
@@ -98,7 +103,7 @@ def layer_shapes(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
 def _applied(
     x: NDArray[np.float32], weight: NDArray[np.float32], bias: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(B, m) a layer; the same numbers however many threads a library for matrices would take."""
+    """(B, m) output of a linear layer; independent of the number of threads."""
     y = np.empty((len(x), len(weight)), dtype=np.float32)
     _layer(x, weight, bias, y)
     return y
@@ -106,7 +111,7 @@ def _applied(
 
 @kernel("s2 s2 s1 s2")
 def _layer(x, weight, bias, y):
-    """Fill y with x weightᵀ + bias, in blocks that stay in the fastest memory."""
+    """Fill y with x weightᵀ + bias, in cache-sized blocks."""
     (B, count), outputs = x.shape, len(weight)
     for start in range(0, outputs, 16):
         for i in range(0, B, 4):
@@ -154,7 +159,9 @@ _BELOW = tuple(np.float32(value) for value in (
 
 @kernel("s1")
 def _gelu(x):
-    """Replace each x by x (1 + erf(x / sqrt(2))) / 2, erf by a quotient of polynomials that is right to 2e-7."""
+    """Replace each x by x (1 + erf(x / sqrt(2))) / 2, with a rational approximation of
+    erf to 2e-7.
+    """
     for i in range(len(x)):
         v = min(max(x[i] * _ROOT_HALF, -_FAR), _FAR)
         s = v * v

@@ -1,6 +1,7 @@
-"""How one body is fitted to one row of targets: by a network's steps and a polish, or by Levenberg-Marquardt.
+"""Optimisers of single rows: network steps with a polish, or Levenberg-Marquardt.
 
-Both have `arrive`, from which `evaluated` is short, and `again`, held by something else; rows are independent.
+Both have `arrive`, which computes a solution, `evaluated`, which completes it cheaply, and `again`,
+which continues under other priors. Rows are independent.
 """
 
 import numpy as np
@@ -25,28 +26,31 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 STALE = 0.3
-"""Change of a joint's robust weight, in a step, from which on a row is linearised anew after it."""
+"""Change of a joint's robust weight in a step above which the row is linearised again."""
 WELL_SEEN_M = 0.05
-"""Sigma of a joint, metres, from which on the network is not shown it."""
+"""Standard deviation of a joint, metres, above which it is not an input of the network."""
 ANNEAL_STEPS = 2
-"""From a cold start the kernel begins 2^ANNEAL_STEPS times as wide, and is halved every iteration."""
+"""Cold starts begin with a kernel 2^ANNEAL_STEPS times as wide, halved in every iteration."""
 MAX_ITERATIONS = 40
-"""Levenberg-Marquardt steps, refused ones included."""
+"""Maximum number of Levenberg-Marquardt steps, rejected ones included."""
 TOLERANCE = 1e-2
-"""A row is done when a step lowers its energy (in squared standard deviations) by less."""
+"""Convergence: decrease of a row's energy in a step, in squared standard deviations."""
 _NOBODY = 50.0
-"""A beta that the network gave to a row on which it went wild: the plain optimiser fits that."""
+"""Size of a beta above which the network has diverged; such rows are fitted by the
+plain optimiser."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
 
 
 class NetworkDescent:
-    """Learned gradient descent (Eq. 5 of the paper) from a closed form, then a short polish; needs no start."""
+    """Learned gradient descent (Eq. 5 of the paper) from a closed form, then a short polish;
+    ignores initial bodies.
+    """
 
     def __init__(self, energy: BodyEnergy, weights: FitterWeights, kernel_scale: float, polish_steps: int):
         model = energy.model
         self._energy, self._frame, self._polish_steps = energy, weights.frame, polish_steps
         self._scale, self._slots = kernel_scale, slots(model.keypoint_names)
-        # The body's own points where there are no targets; offsets are the detector's.
+        # Points without targets are the body's own; offsets apply to the detector's points only.
         rest = [place for place in range(len(BODY_POINTS)) if place not in self._slots]
         moved = model.keypoint_offsets.xyz_m.any()
         body = model.with_keypoint_offsets(KeypointOffsets.identity()) if moved else model
@@ -56,25 +60,28 @@ class NetworkDescent:
         )  # fmt: skip
 
     def arrive(self, targets: EnergyTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
-        """Parameters (B, P) where the network arrives from the closed form on, and that bodies are held there.
+        """Parameters (B, P) after the network's steps from the closed form, and priors centred
+        there.
 
-        `variance` (B, J) is that of each target, infinite where it is not known in all directions, m².
+        `variance` (B, J) of each target, m², is infinite unless it is known in all directions.
         """
         frame, count = self._frame, len(targets.xyz)
         rotation, origin = frame.place(targets.xyz, variance, self._slots)
         inside = (targets.xyz - origin[:, None]) @ rotation
-        # What is hardly seen is left to the polish: the pull of a guess that had seen it would count it twice.
+        # Weakly observed joints are left to the polish: a prior centre that used them would count
+        # them twice.
         well_seen = variance < WELL_SEEN_M**2
         well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
         information = rotation[:, None].swapaxes(-1, -2) @ targets.information @ rotation[:, None]
         local = np.broadcast_to(frame.local, (count, 24, 3, 3))
         state = BodyState(np.zeros((count, 10)), local, np.broadcast_to(frame.transl, (count, 3)))
-        with np.errstate(all="ignore"):  # who goes wild ends in NaN, and is fitted by the other
+        with np.errstate(all="ignore"):  # divergence gives NaN
             *_, arrived = self._descent.unroll(state, inside, information * well_seen[..., None, None])
-        # From the person's frame to that of the targets.
+        # Transform from the person's frame to that of the targets.
         orient = log_so3(rotation @ arrived.local[:, 0])
         angles = log_so3(arrived.local[:, 1:]).reshape(count, -1)[:, self._energy.angles]
-        # The root turns about the pelvis: R (v - p) + p + transl, with p where betas put it in the T-pose.
+        # The root rotates about the pelvis: R (v - p) + p + transl, with p from the betas in
+        # T-pose.
         pelvis = self._energy.model.rest_pelvis(arrived.betas)
         transl = (rotation @ (pelvis + arrived.transl)[..., None])[..., 0] + origin - pelvis
         free = np.concatenate((arrived.betas, orient, angles, transl), 1)
@@ -82,14 +89,18 @@ class NetworkDescent:
         return free, Held(arrived.betas, np.ones(count), angles)
 
     def evaluated(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
-        """The bodies of `arrive` (B, P), polished, and the energy around them for the keypoints `asked` or all."""
+        """The polished bodies of `arrive` (B, P), with the energy and the keypoints `asked`
+        (default: all).
+        """
         return self.again(free, targets, held, asked)
 
     def again(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
-        """Gauss-Newton steps from `free` (B, P); one that does not lower a row's energy is not taken.
+        """Gauss-Newton steps from `free` (B, P); a step that does not lower a row's energy is
+        rejected.
 
-        The energy is linearised before each step. After the last, only rows are in which the weight of some joint
-        changed: covariances hardly change otherwise, and a linearisation is a third of the whole cost.
+        The energy is linearised before each step. After the last, it is linearised only for rows in
+        which the weight of some joint changed: covariances hardly change otherwise, and a
+        linearisation is a third of the total cost.
         """
         scale, energy = self._scale, self._energy
         body = energy.evaluate(free, targets, scale, held, asked)
@@ -97,7 +108,7 @@ class NetworkDescent:
             before = robust_weight(body.squared, scale)
             there = energy.retract(body.free, body.step)
             slope = energy.linearise(there, targets, scale, held, slope_only=True)
-            body.move(slope.energy < body.energy, there, slope)  # a step into NaN is not better
+            body.move(slope.energy < body.energy, there, slope)  # false for NaN
             stale = np.flatnonzero(np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE)
             if len(stale) > 0:
                 given = targets.rows(stale), scale, held.rows(stale), None if asked is None else asked[stale]
@@ -106,7 +117,7 @@ class NetworkDescent:
 
 
 class LevenbergMarquardt:
-    """The optimum of the energy from a closed form: no training, any body."""
+    """Minimises the energy from a closed form, without training and for any body."""
 
     def __init__(self, energy: BodyEnergy, prior: PosePrior, kernel_scale: float):
         self._energy, self._scale = energy, kernel_scale
@@ -115,7 +126,9 @@ class LevenbergMarquardt:
         self._mean_angles = prior.mean[energy.angles]
 
     def arrive(self, targets: EnergyTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
-        """The optimum (B, P), each with its own shape, held by the priors; from `start` where that is no NaN."""
+        """The optimum (B, P), each row with its own shape, under the priors; from `start` where it
+        is not NaN.
+        """
         rotation, pelvis = self._frame.place(targets.xyz, variance, self._slots)
         count = len(variance)
         angles = np.broadcast_to(self._mean_angles, (count, len(self._mean_angles)))
@@ -128,16 +141,18 @@ class LevenbergMarquardt:
         return self.solve(free, targets, warm, held), held
 
     def evaluated(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
-        """The bodies of `arrive` (B, P), and the energy around them for the keypoints `asked` or all."""
+        """The bodies of `arrive` (B, P), with the energy and the keypoints `asked`
+        (default: all).
+        """
         return self._energy.evaluate(free, targets, self._scale, held, asked)
 
     def again(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
-        """The optimum from `free` (B, P) on, held by something else."""
+        """The optimum from `free` (B, P), under other priors."""
         free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
         return self.evaluated(free, targets, held, asked)
 
     def solve(self, free: Array, targets: EnergyTargets, warm: Mask, held: Held) -> Array:
-        """Minimise from `free` (B, P); rows leave the batch as they finish. Returns (B, P)."""
+        """Minimise from `free` (B, P); converged rows leave the batch. Returns (B, P)."""
         energy, rows = self._energy, np.arange(len(free))
         result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)
         widening = np.where(warm, 0, ANNEAL_STEPS)
@@ -150,7 +165,7 @@ class LevenbergMarquardt:
             scale, annealed = self._scale * 2.0**widening, widening == 0
             there = energy.linearise(trial, targets, scale, held, nothing(len(trial)))
             gain = here.energy - there.energy
-            better = gain > 0  # a step into NaN is not
+            better = gain > 0  # false for NaN
             if not better.all():
                 for old, new in zip((free, *here), (trial, *there), strict=True):
                     new[~better] = old[~better]
@@ -181,6 +196,8 @@ class LevenbergMarquardt:
 
 
 def _next_damping(damping: Array, better: Mask, ratio: Array) -> Array:
-    """Nielsen's rule for steps that gained `ratio` of what they promised; eightfold after a refusal."""
+    """Nielsen's rule by the `ratio` of actual to predicted decrease; eightfold after a rejected
+    step.
+    """
     factor = np.where(better, np.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0), 8.0)
     return np.clip(damping * factor, _DAMPING_MIN, _DAMPING_MAX)

@@ -1,4 +1,4 @@
-"""The person's own frame, in closed form: where fits start, and in which learned descent works."""
+"""The person's own frame, in closed form: initial pose of fits, and frame of learned descent."""
 
 from dataclasses import dataclass
 
@@ -12,20 +12,21 @@ from shapepose_fg.core.decompositions import nearest_rotation
 
 @dataclass(frozen=True)
 class PersonFrame:
-    """Puts the mean body in its mean pose on joint targets (weighted Kabsch); its pelvis is the origin.
+    """Aligns the mean body in its mean pose with joint targets (weighted Kabsch); the pelvis is the
+    origin.
 
-    A joint weighs by how surely the mean pose knows its place: the trunk much, wrists little. So the trunk
-    decides where it is seen, and limbs only where there is nothing better.
+    Weights are inverse variances of the joints in the mean pose: large for the trunk, small for
+    wrists. So the trunk determines the alignment if it is seen, and limbs only otherwise.
     """
 
     rest_xyz: Array
-    """(K, 3) `BODY_POINTS` of the mean body in its mean pose, from the pelvis, metres."""
+    """(K, 3) `BODY_POINTS` of the mean body in its mean pose, relative to the pelvis, metres."""
     rest_variance: Array
-    """(K,) how far poses and shapes move each, mean over the axes, m²."""
+    """(K,) variance of each over poses and shapes, mean over the axes, m²."""
     local: Array
     """(24, 3, 3) the mean pose's local rotations; the root's is the identity."""
     transl: Array
-    """(3,) which puts the pelvis at the origin, metres."""
+    """(3,) translation that puts the pelvis at the origin, metres."""
 
     def __post_init__(self) -> None:
         K = len(BODY_POINTS)
@@ -38,14 +39,18 @@ class PersonFrame:
 
     @classmethod
     def of(cls, model: BodyModel, poses: Real, weight: Real) -> "PersonFrame":
-        """The frame of a body that takes `poses` (N, 24, 3), axis-angle, root first, weighing (N,)."""
+        """The frame of a body with sample `poses` (N, 24, 3), axis-angle, root first, weighted by
+        `weight` (N,).
+        """
         angles, share = poses[:, 1:].reshape(len(poses), 69).astype(np.float64), weight / weight.sum()
         mean = share @ angles
         return cls.of_angles(model, mean, (angles - mean).T @ ((angles - mean) * share[:, None]))
 
     @classmethod
     def of_angles(cls, model: BodyModel, mean: Array, covariance: Array) -> "PersonFrame":
-        """The frame of a body whose 69 joint angles have this mean (69,) and covariance (69, 69), rad."""
+        """The frame of a body with this mean (69,), rad, and covariance (69, 69), rad², of the
+        joint angles.
+        """
         still = np.zeros((1, 3))
         body = BodyParameters(np.zeros((1, 10)), still, mean.reshape(1, 23, 3), still)
         pelvis = model.joints(body)[0, 0]
@@ -55,13 +60,13 @@ class PersonFrame:
         return cls(xyz[0] - pelvis, variance.mean(-1), body.local[0], -pelvis)
 
     def place(self, xyz: Array, variance: Array, slots: tuple[int, ...]) -> tuple[Array, Array]:
-        """World from person: rotations (B, 3, 3), and where the pelvis is (B, 3).
+        """World from person: rotations (B, 3, 3), and positions of the pelvis (B, 3).
 
         Parameters
         ----------
         xyz: (B, J, 3) targets, metres.
-        variance: (B, J) mean variance of each over the three axes; infinite where it is not to be used.
-        slots: (J,) places of the targets among `BODY_POINTS`.
+        variance: (B, J) mean variance of each over the three axes; infinite for targets to ignore.
+        slots: (J,) indices of the targets in `BODY_POINTS`.
         """
         rows = list(slots)
         rest_xyz, rest_variance = self.rest_xyz[rows], self.rest_variance[rows]

@@ -1,4 +1,4 @@
-"""What passes say: of joints, given all targets and without each joint's own; and of shapes, put together."""
+"""Posteriors of passes: joints, with and without their own targets, and pooled shapes."""
 
 from dataclasses import dataclass
 
@@ -11,36 +11,37 @@ from shapepose_fg.core.rows import Rows
 
 @dataclass(frozen=True)
 class JointPosterior(Rows):
-    """What B passes say of their joints."""
+    """Posterior of the joints in B passes."""
 
     free: Array
     """(B, P) parameters of the body."""
     xyz: Array
     """(B, J, 3) joints, metres."""
     covariance: Array
-    """(B, N, 3, 3) covariances of the joints that were asked for (`Passes.asked`), m² (Laplace)."""
+    """(B, N, 3, 3) covariances of the joints asked for (`Passes.asked`), m² (Laplace)."""
     squared: Array
     """(B, J) squared Mahalanobis distance of each joint to its target."""
     left: Array
-    """(B,) by how much a Newton step would still lower the energy."""
+    """(B,) predicted decrease of the energy by a further Newton step."""
 
     @classmethod
     def of(cls, body: Evaluated) -> "JointPosterior":
-        """From bodies whose systems hold the joints that are asked for."""
+        """Build it from evaluated bodies, with systems for the joints asked for."""
         return cls(body.free, body.xyz, body.covariances()[0], body.squared, body.left)
 
 
 def pooled_betas(alone: Array, precision: Array, pool: Index, votes: Mask, held: Held) -> Array:
-    """Shapes (B, 10) at which the rows of each `pool` (B,) agree best, to first order; single rows keep their own.
+    """Pooled shapes (B, 10) of the rows of each `pool` (B,), to first order; single rows keep their
+    own.
 
-    A row's fit is a Gaussian over its betas: `precision` S (B, 10, 10) around the shape `alone` (B, 10). Taken out
-    of it, what the row was held by leaves what its joints said, so that what a pool was held by counts once, not
-    once a row:
+    A row's fit is a Gaussian over its betas: `precision` S (B, 10, 10) around the shape `alone` (B,
+    10). Subtracting each row's prior leaves its measurements, so that a pool's prior counts once,
+    not once per row:
 
         (W + sum_i (S_i - W)) b = W c + sum_i (S_i b_i - W c_i)
 
-    with W the stiffness and c_i where row i was held. Bone lengths that were well seen decide. Rows that do not
-    vote (B,) take the shape of the others.
+    with W the stiffness and c_i the prior centre of row i. Well observed bone lengths dominate.
+    Rows that do not contribute (B,) take the shape of the others.
     """
     eye = held.stiffness[:, None, None] * np.eye(10)
     centre = held.betas
@@ -64,6 +65,6 @@ def pooled_betas(alone: Array, precision: Array, pool: Index, votes: Mask, held:
 
 
 def shared(pool: Index, votes: Mask) -> Mask:
-    """(B,) which rows take a shape that others of their `pool` (B,) have a part in."""
+    """(B,) rows that take a shape to which other rows of their `pool` (B,) contribute."""
     _, place = np.unique(pool, return_inverse=True)
     return np.asarray(np.bincount(place, weights=votes)[place] - votes > 0)

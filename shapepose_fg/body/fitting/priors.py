@@ -1,4 +1,4 @@
-"""What bodies do: the poses that people take, how fast these change, how far joints can be apart.
+"""Priors on human poses and motion, and bounds on bone lengths.
 
 Both priors were learnt from motion capture (`body/data/*.md`).
 """
@@ -15,25 +15,27 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.npz import read_npz
 
 NUM_ANGLES = 69
-"""The 23 local rotations below the root, axis-angle, in SMPL's order."""
+"""Number of angles: 23 local rotations below the root, axis-angle, in SMPL's order."""
 NUM_MOVING = 3 + NUM_ANGLES + 3
-"""Rotation of the root, the other 69 angles, the root's place."""
+"""Number of moving parameters: rotation of the root, the other 69 angles, position of the root."""
 
 _DATA = Path(__file__).parents[1] / "data"
 _CURE = "install the package again"
 _SAMPLES = 2000
 _MARGIN, _NOISE_M = 1.25, 0.05
-"""Other people than the body model knows, and the errors of two joints (3 cm each, one and a half sigma)."""
+"""Margin for people outside the body model, and for the errors of two joints (3 cm each, 1.5
+sigma)."""
 _UNKNOWN_M = 0.75
-"""No bone is longer: the trunk of a tall adult, hip to neck, is about 0.65 m."""
+"""Maximum length of a bone unknown to the body, m: the trunk of a tall adult, hip to neck, is about
+0.65 m."""
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """A Gaussian over the axis-angle of every joint but the root, and limits for drawing from it.
+    """A Gaussian over the axis-angles of all joints but the root, with limits for sampling.
 
-    Angles are relative to the T-pose, in radians. Fits do not need the limits: with them as a penalty, no error
-    changed on held-out motions, noisy or seen by one view only.
+    Angles are relative to the T-pose, in radians. Fits do not need the limits: as a penalty, they
+    changed no error on held-out motions, noisy or seen by one view only.
     """
 
     mean: Array
@@ -41,11 +43,11 @@ class PosePrior:
     covariance: Array
     """(69, 69) covariance, rad², positive definite."""
     lower: Array
-    """(69,) angles under which a joint is bent the wrong way, rad; -inf where there is no limit."""
+    """(69,) lower limits of the angles, rad; -inf for none."""
     upper: Array
-    """(69,) angles over which a joint is bent the wrong way, rad; inf where there is no limit."""
+    """(69,) upper limits of the angles, rad; inf for none."""
     provenance: str
-    """Where the motions came from and how the prior was made."""
+    """Source of the motions, and how the prior was fitted."""
 
     def __post_init__(self) -> None:
         for name in ("mean", "covariance", "lower", "upper"):
@@ -76,7 +78,7 @@ class PosePrior:
         return replace(self, covariance=factor**2 * self.covariance)
 
     def marginal_precision(self, angles: Index) -> Array:
-        """(A, A) inverse covariance of some `angles` (A,), the others free, 1/rad²."""
+        """(A, A) inverse of the marginal covariance of some `angles` (A,), 1/rad²."""
         precision = np.linalg.inv(self.covariance[angles[:, None], angles])
         return np.asarray((precision + precision.T) / 2, dtype=np.float64)
 
@@ -90,8 +92,8 @@ class PosePrior:
         return np.asarray(G.T, dtype=np.float64)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw `count` poses (count, 23, 3), rad; angles past a limit are brought back to it."""
-        rng.random(count)  # once chose between Gaussians: what a seed gives stays what it was
+        """Draw `count` poses (count, 23, 3), rad; angles are clipped to the limits."""
+        rng.random(count)  # unused draw; keeps the samples of each seed unchanged
         white = rng.normal(size=(count, NUM_ANGLES))
         factor = np.broadcast_to(np.linalg.cholesky(self.covariance), (count, NUM_ANGLES, NUM_ANGLES))
         draw = self.mean + np.einsum("nij,nj->ni", factor, white)
@@ -100,21 +102,21 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """Power spectral densities of the 75 numbers that move, in the order root, angles, place.
+    """Power spectral densities of the 75 moving parameters: root, angles, position.
 
-    Between rows at the times t_k, with h_k = t_k+1 - t_k and v_k = (q_k+1 - q_k) / h_k:
+    Between rows at times t_k, with h_k = t_k+1 - t_k and v_k = (q_k+1 - q_k) / h_k:
 
         v_k ~ N(0, velocity / h_k),   v_k+1 - v_k ~ N(0, acceleration (h_k + h_k+1) / 2)
 
-    the second for smooth motion, the first so that what nothing shows does not drift away.
+    The second makes motion smooth, the first limits the drift of unobserved parameters.
     """
 
     acceleration: Array
-    """(75,) power spectral density of the acceleration: angles rad²/s³, place m²/s³."""
+    """(75,) power spectral density of the acceleration: angles rad²/s³, position m²/s³."""
     velocity: Array
-    """(75,) power spectral density of the velocity: angles rad²/s, place m²/s."""
+    """(75,) power spectral density of the velocity: angles rad²/s, position m²/s."""
     provenance: str
-    """Where the motions came from and how the prior was made."""
+    """Source of the motions, and how the prior was fitted."""
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "velocity"):
@@ -133,17 +135,20 @@ class MotionPrior:
         return MotionPrior(data["acceleration"], data["velocity"], str(data["provenance"]))
 
     def part(self, angles: Index) -> tuple[Array, Array]:
-        """Acceleration and velocity (N,) of the root, some of the `angles` (A,) and the place."""
+        """Acceleration and velocity densities (N,) of the root, some of the `angles` (A,) and the
+        position.
+        """
         kept = np.concatenate([np.arange(3), 3 + angles, np.arange(-3, 0) + NUM_MOVING])
         return self.acceleration[kept], self.velocity[kept]
 
 
 @cache
 def longest_bones(skeleton: Skeleton) -> Array:
-    """(J,) metres from each joint to its parent that hardly anybody exceeds; infinite for the root.
+    """(J,) upper bounds on the distance of each joint from its parent, metres; infinite for the
+    root.
 
-    The 99.9 % quantile over bodies within three standard deviations of shape, in poses drawn from the pose prior,
-    with a margin. Joints that the body does not have get the longest of all.
+    The 99.9 % quantile over bodies within three standard deviations of shape, in poses drawn from
+    the pose prior, plus a margin. Joints unknown to the body get the maximum over all.
     """
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 

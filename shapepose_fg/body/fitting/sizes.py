@@ -1,9 +1,10 @@
-"""People whom the shapes of adults do not reach: children, and the very tall.
+"""People outside the range of adult shapes: children, and the very tall.
 
-A body's shapes are those of adults, and their stature extrapolates badly: at 1.10 m, five standard deviations
-below the mean, thighs are a sixth too short for a child, and joints that are where a child's are make a body that
-is 6 cm too tall. So whoever is so small or tall is fitted at the size of an adult. The body of that shape and size
-is then the nearest one that the model has *of the same stature*.
+A body's shapes are those of adults, and extrapolate badly: at 1.10 m, five standard deviations
+below the mean, thighs are a sixth too short for a child, and a body fitted to a child's joints is 6
+cm too tall. Such people are therefore fitted after scaling to an adult's size. The result is then
+the body closest to the scaled one that has
+*the same stature*.
 """
 
 from dataclasses import dataclass
@@ -15,13 +16,15 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Mask
 
 _ADULT = 2.0
-"""Standard deviations from the mean that adults' stature is within."""
+"""Range of adults' stature, standard deviations from the mean."""
 _POINT_M = 0.02
-"""How near a point must be to its place to be worth a beta of 1."""
+"""Distance of a point, m, that costs as much as a beta of 1."""
 
 
 def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
-    """All points of the mean body's T-pose from its pelvis, (150,), metres, and how betas move them, (150, 10)."""
+    """All points of the mean body in T-pose, relative to its pelvis, (150,), metres, and
+    derivatives by betas, (150, 10).
+    """
     betas = np.concatenate((np.zeros((1, 10)), np.eye(10)))
     xyz = body.points.positions(np.tile(np.eye(3), (11, 24, 1, 1)), betas, np.zeros((11, 3)))
     xyz = (xyz - xyz[:, [BODY_POINTS.index("pelvis")]]).reshape(11, -1)
@@ -30,12 +33,12 @@ def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Stature of a body model by its shape."""
+    """Stature of a body model as a function of shape."""
 
     stature_m: float
     """Stature of the mean body, metres."""
     taller: Array
-    """(10,) metres of stature for each beta."""
+    """(10,) change of stature per beta, metres."""
 
     @classmethod
     def of(cls, body: BodyModel) -> "Sizes":
@@ -45,17 +48,18 @@ class Sizes:
         return cls(float(template[top, 1] - template[sole, 1]), shapes[top, 1] - shapes[sole, 1])
 
     def far(self, betas: Array) -> Mask:
-        """(G,) whose stature, of those of `betas` (G, 10), is not one of an adult."""
+        """(G,) whether the stature for `betas` (G, 10) is outside the range of adults."""
         return np.abs(betas @ self.taller) > _ADULT * np.linalg.norm(self.taller)
 
     def ratio(self, betas: Array) -> Array:
-        """(G,) how many times as tall as the mean body those of `betas` (G, 10) are."""
+        """(G,) stature for `betas` (G, 10), relative to the mean body."""
         return 1 + betas @ self.taller / self.stature_m
 
     def resized(self, body: BodyModel, betas: Array, size: Array) -> Array:
-        """(G, 10) betas near those of bodies `betas` (G, 10) that are `size` (G,) times as large, and as tall.
+        """(G, 10) betas of the bodies closest to bodies `betas` (G, 10) scaled by `size` (G,), with
+        the same stature as these.
 
-        min |points - wanted|² / sigma² + |betas|², with the stature as a constraint.
+        Minimises |points - wanted|² / sigma² + |betas|², with the stature as a constraint.
         """
         mean, by_betas = points_at_rest(body)
         wanted = size[:, None] * (mean + betas @ by_betas.T) - mean

@@ -1,4 +1,4 @@
-"""The trained weights of the learned fitter: what is in the file, and which body they are for."""
+"""Trained weights of the learned fitter, and the body model that they are for."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from shapepose_fg.core.storage.files import open_regular, user_cache, write_cont
 _DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
 _KINDS = ("F32", "F64")
-"""Number types that are read, by their safetensors names."""
+"""Supported number types, by their safetensors names."""
 _CURE = "train or fetch it again"
 _FRAME, _SPREAD = "frame.", "spread"
 
@@ -33,17 +33,17 @@ class FitterWeights:
     """A trained update network and the frame in which it works."""
 
     network: UpdateNetwork
-    """What it has learnt."""
+    """The trained network."""
     frame: PersonFrame
-    """Mean body and mean pose from which it starts."""
+    """Frame with mean body and mean pose, from which it starts."""
     body: str
-    """Fingerprint of the body model it was trained on (see `fingerprint`)."""
+    """Fingerprint of the body model used in training (see `fingerprint`)."""
     spread: Array = field(default_factory=lambda: np.ones(len(BODY_POINTS)))
-    """(K,) by which the variance of each of `BODY_POINTS` without its own target is multiplied: calibrated."""
+    """(K,) calibrated factors on the variance of each of `BODY_POINTS` without its own target."""
     card: dict[str, str] = field(default_factory=dict)
-    """What it was trained on, by which command, and its errors."""
+    """Training data, command, and errors."""
     file: Path | None = None
-    """What they were read from; None where they ship with the package, or are new."""
+    """File that they were read from; None for those of the package and new ones."""
 
     def __post_init__(self) -> None:
         if self.spread.shape != (len(BODY_POINTS),):
@@ -52,25 +52,27 @@ class FitterWeights:
     @staticmethod
     @cache
     def default() -> "FitterWeights":
-        """The weights that ship with the package (read once)."""
+        """The weights of the package (read once)."""
         return replace(FitterWeights.load(_DEFAULT), file=None)
 
     @staticmethod
     def of(model: BodyModel) -> "FitterWeights":
-        """Those that `shapepose-fg train-fitter` keeps for this body; where it has not run, the shipped ones."""
+        """The weights that `shapepose-fg train-fitter` stored for this body; if there are none,
+        those of the package.
+        """
         shipped = FitterWeights.default()
         kept = adapted_file(model)
-        # The user's cache may be closed to us: then `Path.is_file` raises.
+        # `Path.is_file` raises if the user's cache is not accessible.
         own = fingerprint(model) != shipped.body and os.path.isfile(kept)  # noqa: PTH113
         return FitterWeights.load(kept) if own else shipped
 
     def spread_of(self, names: tuple[str, ...]) -> Array:
-        """(J,) `spread` of the keypoints with these names."""
+        """(J,) factors `spread` for the named keypoints."""
         return np.asarray(self.spread[list(slots(names))], dtype=np.float64)
 
     @classmethod
     def load(cls, path: Path) -> "FitterWeights":
-        """Read a safetensors file; InputError naming it where it cannot be used."""
+        """Read a safetensors file; raises InputError naming the file if it is invalid."""
         about, tensors = _read_tensors(path)
         if about.get("format") != _FORMAT:
             raise InputError(
@@ -106,7 +108,9 @@ class FitterWeights:
         write_content(path, save(tensors, metadata=about))
 
     def check(self, model: BodyModel) -> None:
-        """InputError where `model` is not the body they were trained on: betas would mean other shapes."""
+        """Raise InputError if `model` is not the body used in training: betas would have another
+        meaning.
+        """
         if fingerprint(model) != self.body:
             raise InputError(
                 "these weights were trained on another body model: train weights for yours with shapepose-fg"
@@ -115,7 +119,7 @@ class FitterWeights:
 
 
 def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.floating]]]:
-    """Texts and tensors of a safetensors file; InputError where it cannot be read."""
+    """Metadata and tensors of a safetensors file; raises InputError if it is not readable."""
     try:
         with open_regular(path, _CURE), safe_open(path, framework="np") as file:
             names = list(file.keys())
@@ -129,7 +133,9 @@ def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.floa
 
 
 def fingerprint(model: BodyModel) -> str:
-    """What tells body models apart: SHA-256 of template, shapes and joint regressor, rounded to float32."""
+    """Identifies a body model: SHA-256 of template, shapes and joint regressor, rounded
+    to float32.
+    """
     digest = hashlib.sha256()
     for array in (model.arrays.template, model.arrays.shapes, model.arrays.joint_regressor):
         digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
@@ -137,7 +143,9 @@ def fingerprint(model: BodyModel) -> str:
 
 
 def adapted_file(model: BodyModel) -> Path:
-    """Where `shapepose-fg train-fitter` keeps weights for this body, begun as those that ship now."""
+    """File in which `shapepose-fg train-fitter` stores weights for this body, specific to the
+    package's weights.
+    """
     digest = hashlib.sha256(fingerprint(model).encode() + _DEFAULT.read_bytes())
     for array in (model.arrays.weights, model.arrays.keypoint_regressor):
         digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())

@@ -1,1 +1,1 @@
-"""What is compiled: bodies row by row, and their normal equations."""
+"""Compiled kernels: bodies row by row, and their normal equations."""

@@ -1,9 +1,9 @@
-"""Bodies row by row, compiled: points, their Jacobian, the energy of `body/fitting/energy.py` around them, and
-what the update network sees of them.
+"""Compiled kernels for bodies, row by row: points, their Jacobian, the energy of
+`body/fitting/energy.py`, and the inputs of the update network.
 
-A row's unknowns are betas 10, three for each rotation that has a column in `Limbs`, place 3; P in all. Gradients
-are accumulated from the points backwards: a force on a point turns every bone that it hangs on, by the sum of the
-torques on the terms (`Limbs`) of that bone and of those below it.
+The P unknowns of a row are 10 betas, three per rotation with a column in `Limbs`, and 3 for the
+translation. Gradients are accumulated backwards from the points: a force on a point rotates every
+bone above it, by the sum of the torques on the terms (`Limbs`) of that bone and its descendants.
 """
 
 import math
@@ -12,18 +12,18 @@ from shapepose_fg.body.kernels.rows import Limbs, Linear, Own, Priors, Rows, Wor
 from shapepose_fg.core.compiled import kernel, part
 
 REACH_M = 0.1
-"""A target is believed against where the body is now as if that were known to this, metres."""
+"""Standard deviation of the current body, m, against which the network weights targets."""
 TRUST_M = 0.03
-"""Sigma of a target that is half trusted, metres."""
+"""Standard deviation of a target that has weight one half, m."""
 FAR_M = 0.5
-"""Residuals above this are seen by the network compressed, metres."""
+"""Distance, m, above which residuals are compressed for the network."""
 STEEP = 3.0
-"""Scaled slopes above this are cut off."""
+"""Limit of scaled gradients for the network."""
 
 
 @part
 def _copied(source, to):
-    """A row of numbers; a slice that is assigned to takes seconds to compile."""
+    """Copy a row of numbers; slice assignment takes seconds to compile."""
     for i in range(len(source)):
         to[i] = source[i]
 
@@ -61,7 +61,9 @@ def _product(A, B, C):
 
 @part
 def _bent(slope, L, T, q, c):
-    """What turning joint q about its axis c does by the pose blend shapes: `slope` (207,) is along these."""
+    """Effect of rotating joint q about its axis c through the pose blend shapes; `slope` (207,) is
+    their gradient.
+    """
     x, y, z, at, total = T[0, c], T[1, c], T[2, c], 9 * q - 9, 0.0
     for i in range(3):
         total += slope[at + 3 * i] * (L[i, 1] * z - L[i, 2] * y)
@@ -72,7 +74,7 @@ def _bent(slope, L, T, q, c):
 
 @part
 def _share(M, sigma_m, S):
-    """S = I - (I + sigma² M)^-1 of a symmetric M (3, 3), by its minors."""
+    """S = I - (I + sigma² M)^-1 for a symmetric M (3, 3), by minors."""
     v = sigma_m * sigma_m
     a, b, c, d, e, f = v * M[0, 0] + 1, v * M[0, 1], v * M[0, 2], v * M[1, 1] + 1, v * M[1, 2], v * M[2, 2] + 1
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
@@ -85,7 +87,9 @@ def _share(M, sigma_m, S):
 
 @part
 def _laid(limbs, betas, place, w):
-    """World rotations and axes from `local` and `tangent`, the terms of all points, and these; no forces."""
+    """Compute world rotations and axes, and the terms of all points, from `local` and `tangent`;
+    clear all forces.
+    """
     d, v, xyz = w.inside, w.term, w.xyz
     for q in range(len(w.local)):
         if q == 0:
@@ -129,7 +133,7 @@ def _laid(limbs, betas, place, w):
 
 @part
 def _pulled(limbs, k, f0, f1, f2, w):
-    """A force on point k, as torques and forces on its terms, and on the place."""
+    """Distribute a force on point k to torques and forces on its terms, and to the translation."""
     v, u, at = w.term, w.force, len(w.gradient) - 3
     for p in range(limbs.first[k], limbs.first[k + 1]):
         R, T, i = w.world[limbs.bone[p]], w.torque[limbs.bone[p]], 3 * p
@@ -147,7 +151,7 @@ def _pulled(limbs, k, f0, f1, f2, w):
 
 @part
 def _gathered(limbs, w):
-    """The gradient of betas and rotations, from the forces on all points."""
+    """Accumulate the gradient of betas and rotations from the forces on all points."""
     u, g = w.force, w.gradient
     for n in range(len(limbs.by_shape)):
         total = 0.0
@@ -174,8 +178,8 @@ def _gathered(limbs, w):
 
 @part
 def _slopes(limbs, w):
-    """The Jacobian of all points. An arm is what of a point a bone turns: turning it about an axis a moves the
-    point by a x arm. Arms take the place of the terms.
+    """Jacobian of all points. An arm is the part of a point that a bone rotates: rotation about an
+    axis a moves the point by a x arm. Arms overwrite the terms.
     """
     blend = len(limbs.by_pose) > 0
     for k in range(len(limbs.share)):
@@ -186,9 +190,9 @@ def _slopes(limbs, w):
                 J[x, n] = limbs.root_by_shape[n, 3 * k + x]
         for e in range(207 if blend else 0):
             w.entry[0, e] = w.entry[1, e] = w.entry[2, e] = 0.0
-        for p in range(end - 1, first - 1, -1):  # a bone's arm is whole when its parent takes it
+        for p in range(end - 1, first - 1, -1):  # children before parents
             R, S = w.world[limbs.bone[p]], limbs.shape[p]
-            for x in range(len(R)):  # loops of known length take long to compile
+            for x in range(len(R)):  # loops of constant length compile slowly
                 a, b, c = R[x, 0], R[x, 1], R[x, 2]
                 for n in range(S.shape[1]):
                     J[x, n] += a * S[0, n] + b * S[1, n] + c * S[2, n]
@@ -217,7 +221,9 @@ def _slopes(limbs, w):
 
 @part
 def _turned(priors, free, w):
-    """Rotations and tangents of row's joints from its unknowns; the root turns in its own tangent."""
+    """Rotations and tangents of a row's joints from its unknowns; the root is updated in its own
+    tangent.
+    """
     A, pose = len(priors.mean), w.entry[0]
     for q in range(len(w.local)):
         for x in range(3):
@@ -235,8 +241,8 @@ def _turned(priors, free, w):
 
 @part
 def _normal(priors, rows, b, asked, H, w):
-    """Half the Gauss-Newton Hessian where `_slopes` was last, its lower triangle; below it the
-    gradient, the Jacobian of the points that are `asked` for, and the unit vectors of the betas.
+    """Lower triangle of half the Gauss-Newton Hessian at the last `_slopes`, followed by the
+    gradient, the Jacobian of the points `asked`, and the unit vectors of the betas.
     """
     M, P, A, K, N = w.entry, len(w.gradient), len(priors.mean), len(w.squared), len(asked)
     for i in range(len(H)):
@@ -266,7 +272,7 @@ def _normal(priors, rows, b, asked, H, w):
             t2 = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z
             for j in range(10):
                 row[j] += t0 * J[0, j] + t1 * J[1, j] + t2 * J[2, j]
-            for j in range(10, i + 1, 3):  # after the betas come threes, which rise
+            for j in range(10, i + 1, 3):  # after the betas, columns ascend in threes
                 at = column[j]
                 row[at] += t0 * J[0, j] + t1 * J[1, j] + t2 * J[2, j]
                 row[at + 1] += t0 * J[0, j + 1] + t1 * J[1, j + 1] + t2 * J[2, j + 1]
@@ -275,8 +281,8 @@ def _normal(priors, rows, b, asked, H, w):
 
 @kernel(Limbs, Priors, "f2", Rows, "f1 i2", Linear, Work)
 def linearised(limbs, priors, free, rows, scale, asked, linear, w):
-    """The energy of B rows around `free` (B, P), the robust kernel of each having this `scale` (B,); systems are
-    for the points `asked` (B, N).
+    """Linearise the energy of B rows at `free` (B, P), with a scale of the robust kernel per row,
+    `scale` (B,); systems include the points `asked` (B, N).
     """
     A, g, pose = len(priors.mean), w.gradient, w.entry[0]
     for b in range(len(free)):
@@ -322,8 +328,9 @@ def linearised(limbs, priors, free, rows, scale, asked, linear, w):
 
 @kernel(Limbs, "f4 f2 f2 f3 f4", Work)
 def placed(limbs, local, betas, place, xyz, jacobian, w):
-    """Points `xyz` (B, K, 3) of bodies with rotations `local` (B, 24, 3, 3), and their `jacobian` (B, K, 3, P) or
-    (0, K, 3, P). Rotations turn in the tangents of the scratch arrays `w`.
+    """Compute points `xyz` (B, K, 3) of bodies with rotations `local` (B, 24, 3, 3), and their
+    `jacobian` (B, K, 3, P), or none if it is (0, K, 3, P). Rotations are updated in the tangents of
+    the workspace `w`.
     """
     for b in range(len(xyz)):
         for q in range(len(w.local)):
@@ -344,10 +351,10 @@ def placed(limbs, local, betas, place, xyz, jacobian, w):
 
 @kernel(Limbs, Own, "f2 f4 f2 f3 f4 f0 f1 s2", Work)
 def seen(limbs, own, betas, local, place, target, information, kernel_scale, steepness, inputs, w):
-    """Fill the network's `inputs` (B, 574) with what is seen of B bodies, `betas` (B, 10), `local` (B, 24, 3, 3)
-    rotations and `place` (B, 3), with targets (B, N, 3) of this `information` (B, N, 3, 3). Slopes, of the robust
-    energy of the targets, are multiplied by `steepness` (79,). Who has which target, and how far the body's `own`
-    points are from the detector's, say `Own`.
+    """Fill in the network's `inputs` (B, 574) for B bodies, `betas` (B, 10), `local` (B, 24, 3, 3)
+    rotations and `place` (B, 3), with targets (B, N, 3) of `information` (B, N, 3, 3). Gradients of
+    the targets' robust energy are multiplied by `steepness` (79,). `own` assigns targets to points,
+    with the offsets of the detector's points.
     """
     S, K, g = w.entry, len(limbs.share), w.gradient
     for b in range(len(betas)):
@@ -395,5 +402,5 @@ def seen(limbs, own, betas, local, place, target, information, kernel_scale, ste
                 row[at + 10 + 6 * q + x], row[at + 13 + 6 * q + x] = local[b, q, x, 0], local[b, q, x, 1]
         for x in range(3):
             row[at + 142 + x] = place[b, x]
-        for i in range(79):  # all but the hands', towards the targets
+        for i in range(79):  # descent direction, without the hands
             row[at + 145 + i] = min(max(g[i if i < 76 else i + 6] * steepness[i], -STEEP), STEEP)

@@ -1,4 +1,4 @@
-"""What the kernels of bodies (`body/kernels/bodies.py`) are given and fill in: C-contiguous arrays."""
+"""Inputs, outputs and workspace of the kernels in `body/kernels/bodies.py`: C-contiguous arrays."""
 
 from typing import NamedTuple
 
@@ -8,65 +8,65 @@ from shapepose_fg.core.arrays import Array, Index
 
 
 class Limbs(NamedTuple):
-    """K points as sums over bones; L terms, those of a point next to each other, parents first."""
+    """K points as sums over bones: L terms, grouped by point, parents first."""
 
     kinds = "i1 i1 i1 f1 f2 f3 f2 f1 f2 f1 i1 i1"
     first: Index
-    """(K + 1,) where the terms of each point begin."""
+    """(K + 1,) offset of the terms of each point."""
     bone: Index
-    """(L,) whose."""
+    """(L,) bone of each term."""
     before: Index
-    """(L,) the term of the bone's parent; -1 for the root's."""
+    """(L,) index of the term of the bone's parent; -1 for the root."""
     offset: Array
-    """(3 L,) in the frame of the bone, metres."""
+    """(3 L,) vectors in the frame of the bone, metres."""
     by_shape: Array
-    """(10, 3 L) metres per unit of each beta."""
+    """(10, 3 L) derivative by each beta, metres."""
     shape: Array
-    """(L, 3, 10) `by_shape` in another order of axes."""
+    """(L, 3, 10) `by_shape` with another order of axes."""
     by_pose: Array
-    """(3 L, 207) metres per unit of each entry of R - I; (0, 207) without pose blend shapes."""
+    """(3 L, 207) derivative by each entry of R - I, metres; (0, 207) without pose blend shapes."""
     root: Array
-    """(3 K,) what does not turn, metres."""
+    """(3 K,) part of each point that does not rotate, metres."""
     root_by_shape: Array
-    """(10, 3 K) metres per unit of each beta."""
+    """(10, 3 K) derivative of `root` by each beta, metres."""
     share: Array
-    """(K,) how much of the translation a point takes."""
+    """(K,) share of the translation that each point moves by."""
     parent: Index
     """(24,) index of each bone's parent."""
     column: Index
-    """(24,) where the unknowns of each rotation begin; -1 where it is none."""
+    """(24,) first unknown of each rotation; -1 if it is fixed."""
 
 
 class Own(NamedTuple):
-    """How K points, which a detector sees, belong to the body and to targets."""
+    """Relation of K detected points to the body and to targets."""
 
     kinds = "i1 f2 i1"
     target: Index
-    """(K,) which target is of the point; -1: none."""
+    """(K,) index of the point's target; -1 for none."""
     offset: Array
-    """(K, 3) how far the detector's point is from the body's, metres."""
+    """(K, 3) offset of the detector's point from the body's, metres."""
     bone: Index
-    """(K,) in the frame of which bone."""
+    """(K,) bone in the frame of which the offset is constant."""
 
 
 class Priors(NamedTuple):
-    """The pose prior: A of the 69 angles are unknowns, the rest are where it expects them."""
+    """The pose prior: A of the 69 angles are unknowns, the others are at their conditional mean."""
 
     kinds = "f1 f2 i1 f2 f1"
     mean: Array
-    """(A,) rad."""
+    """(A,) mean, rad."""
     precision: Array
-    """(A, A) 1/rad²."""
+    """(A, A) precision, 1/rad²."""
     place: Index
-    """(69,) which unknown each angle is; -1 - h where it is the hidden angle h."""
+    """(69,) index of the unknown for each angle; -1 - h for the dependent angle h."""
     gain: Array
-    """(69 - A, A) how the hidden angles follow."""
+    """(69 - A, A) derivative of the dependent angles by the unknowns."""
     at_zero: Array
-    """(69 - A,) where they are when those are zero, rad."""
+    """(69 - A,) dependent angles if the unknowns are zero, rad."""
 
 
 class Rows(NamedTuple):
-    """What B rows are fitted to, and what holds them."""
+    """Targets and priors of B rows."""
 
     kinds = "f3 f4 f2 f1 f2"
     xyz: Array
@@ -74,15 +74,15 @@ class Rows(NamedTuple):
     information: Array
     """(B, K, 3, 3) inverse covariances of the targets, 1/m²."""
     betas: Array
-    """(B, 10) around which shape."""
+    """(B, 10) centre of the shape prior."""
     stiffness: Array
     """(B,) precision of each beta."""
     angles: Array
-    """(B, A) around which angles, rad."""
+    """(B, A) centre of the pose prior, rad."""
 
 
 class Linear(NamedTuple):
-    """The energy of B rows around their unknowns; written over."""
+    """Linearised energy of B rows; filled in by kernels."""
 
     kinds = "f1 f3 f2 f2 f3"
     energy: Array
@@ -94,9 +94,9 @@ class Linear(NamedTuple):
     gradient: Array
     """(B, P) half the gradient."""
     system: Array
-    """(B, P + 1 + 3 N + 10, P): the lower triangle of half the Gauss-Newton Hessian, robust weights included;
-    below it the gradient, the Jacobian of some keypoints, and the unit vectors of the betas. (0, ...) where only
-    the slope is asked for."""
+    """(B, P + 1 + 3 N + 10, P): the lower triangle of half the Gauss-Newton Hessian, including
+    robust weights; below it the gradient, the Jacobian of some keypoints, and the unit vectors of
+    the betas. (0, ...) if only the gradient is needed."""
 
     @property
     def hessian(self) -> Array:
@@ -111,47 +111,49 @@ class Linear(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch arrays of one row."""
+    """Workspace for one row."""
 
     kinds = "f3 f3 f3 f3 f1 f1 f1 f2 f2 f1 f1 f3 i2 i1 f1 f1 f1"
     local: Array
     """(24, 3, 3) rotations relative to the parent."""
     tangent: Array
-    """(24, 3, 3) in which tangents they turn: R <- R exp(T delta)."""
+    """(24, 3, 3) tangents T of the updates: R <- R exp(T delta)."""
     world: Array
     """(24, 3, 3) world from bone."""
     axes: Array
-    """(24, 3, 3) about which the bones turn, in the world."""
+    """(24, 3, 3) axes of the bones' rotations, in the world."""
     inside: Array
     """(3 L,) the terms in the frames of their bones, metres."""
     term: Array
     """(3 L,) the terms in the world, metres."""
     force: Array
-    """(3 L,) on them, in the frames of the bones."""
+    """(3 L,) forces on the terms, in the frames of the bones."""
     torque: Array
-    """(24, 3) on the bones, in the world."""
+    """(24, 3) torques on the bones, in the world."""
     entry: Array
-    """(3, 207) anything."""
+    """(3, 207) temporary values."""
     xyz: Array
-    """(3 K,) points."""
+    """(3 K,) points, metres."""
     push: Array
     """(3 K,) forces on them."""
     J: Array
     """(K, 3, 85) Jacobian of each point, its first `count` columns."""
     column: Index
-    """(K, 85) the unknowns of these."""
+    """(K, 85) unknown of each of these columns."""
     count: Index
-    """(K,) how many."""
+    """(K,) number of these columns."""
     squared: Array
     """(K,) squared Mahalanobis distance of each point to its target."""
     weight: Array
     """(K,) robust weights."""
     gradient: Array
-    """(P,) half the energy's."""
+    """(P,) half the gradient of the energy."""
 
     @classmethod
     def of(cls, limbs: Limbs, unknowns: int) -> "Work":
-        """For the rows of a body; as it is made, rotations turn in their own right tangents."""
+        """Workspace for the rows of a body; initially, rotations are updated in their own right
+        tangents.
+        """
         K, L = len(limbs.share), len(limbs.bone)
         eye = np.tile(np.eye(3), (24, 1, 1))
         rotations = (eye.copy(), eye.copy(), eye.copy(), eye.copy())

@@ -1,8 +1,8 @@
-"""Normal equations of bodies, row by row, compiled: steps, covariances, and chains of rows.
+"""Compiled kernels for the normal equations of bodies: steps, covariances, and chains of rows.
 
-A system (P + 1 + 3 N + 10, P) is as `linearised` (`body/kernels/bodies.py`) left it: the lower triangle of a
-Hessian H, below it vectors. It is reduced in place to the factor L, H = L Lᵀ, and L^-1 of the vectors. Everything
-is scalar products of rows.
+A system (P + 1 + 3 N + 10, P) is in the form of `linearised` (`body/kernels/bodies.py`): the lower
+triangle of a Hessian H, and vectors below it. It is reduced in place to the Cholesky factor L, H =
+L Lᵀ, and L^-1 times the vectors, by scalar products of rows.
 """
 
 import math
@@ -12,17 +12,18 @@ import numpy as np
 from shapepose_fg.core.compiled import kernel, part
 
 LIMB_M = 0.4
-"""Radius on which the end of a swinging limb moves, for the curvature that a linearisation leaves out.
-
-Chosen so that hidden wrists, arms and legs of held-out motions lie where their covariance says."""
+"""Radius of the path of a swinging limb's end, m, for the curvature that linearisation neglects.
+Chosen so that hidden wrists, arms and legs of held-out motions lie within their covariances."""
 
 _FIRST = np.intp(0)
-"""A literal 0 would have functions compiled once more."""
+"""A literal 0 would compile the functions again."""
 
 
 @part
 def _reduced(H, n, first, end):
-    """Reduce the rows `first` to `end` of a system with n unknowns; False where H is not positive definite."""
+    """Reduce the rows `first` to `end` of a system with n unknowns; returns False if H is not
+    positive definite.
+    """
     for i in range(first, end, 4):
         stop, begin = min(i + 4, end), 0
         if stop == i + 4:  # four rows and two columns at a time
@@ -62,7 +63,7 @@ def _reduced(H, n, first, end):
 
 @part
 def _back(H, n, row, step):
-    """`step` = -L^-T of a row."""
+    """Set `step` = -L^-T times a row."""
     for k in range(n):
         step[k] = -H[row, k]
     for k in range(n - 1, -1, -1):
@@ -73,7 +74,7 @@ def _back(H, n, row, step):
 
 @part
 def _products(Y, first, count, n, out):
-    """`out` = the scalar products of `count` rows (n,) of Y from `first` on."""
+    """Set `out` to the scalar products of `count` rows (n,) of Y, from `first` on."""
     for i in range(count):
         for j in range(i + 1):
             total = 0.0
@@ -84,19 +85,20 @@ def _products(Y, first, count, n, out):
 
 @kernel("f3")
 def reduce_systems(system):
-    """Reduce B whole systems (B, M, P)."""
+    """Reduce B systems (B, M, P) completely."""
     for b in range(len(system)):
         _reduced(system[b], system.shape[2], _FIRST, system.shape[1])
 
 
 @kernel("f3 f1 f2 f1")
 def solved(system, damping, step, promised):
-    """Reduce the Hessians of B systems, their diagonals `damping` (B,) times larger, and their gradients; the
-    `step` (B, P), and by how much it would lower the energy, `promised` (B,), NaN where H is not positive
-    definite. With a negative damping the factor is there, and the gradient is new.
+    """Reduce the Hessians of B systems, with diagonals increased by the factor `damping` (B,), and
+    their gradients; fill in the `step` (B, P) and the predicted decrease of the energy `promised`
+    (B,), NaN if H is not positive definite. With negative damping the Hessian is reduced already
+    and only the gradient is new.
 
-    Priors say nothing of the root's turn and place: where too few joints are left to determine them, they are
-    known to a radian and a metre.
+    There is no prior on the root's rotation and position: for cases in which too few joints
+    determine them, weak ones of one radian and one metre are added.
     """
     P = step.shape[1]
     for b in range(len(system)):
@@ -113,8 +115,9 @@ def solved(system, damping, step, promised):
 
 @part
 def _with_sag(C, at):
-    """To first order a limb that may swing moves in a plane; in truth on a sphere. Where a joint's covariance A is
-    large, the sag tr(A) / (2 LIMB_M) is added as a sigma along every axis: a hidden wrist is not a thin disc.
+    """Add the neglected curvature to a covariance. To first order a swinging limb moves in a plane,
+    in reality on a sphere: the sag tr(A) / (2 LIMB_M) of a joint's covariance A is added as a
+    standard deviation along every axis, so that a hidden wrist is not a thin disc.
     """
     sag = (C[at, at] + C[at + 1, at + 1] + C[at + 2, at + 2]) / (2 * LIMB_M)
     for x in range(at, at + 3):
@@ -123,8 +126,9 @@ def _with_sag(C, at):
 
 @kernel("f3 f4 f3")
 def known(system, covariance, shape):
-    """From B systems with reduced Hessians: the `covariance` (B, N, 3, 3) of their joints (Laplace), m², as
-    `_with_sag` has it, and that of the betas, `shape` (B, 10, 10). The rest of the systems is reduced.
+    """From B systems with reduced Hessians: the `covariance` (B, N, 3, 3) of their joints
+    (Laplace), m², including `_with_sag`, and that of the betas, `shape` (B, 10, 10). Reduces the
+    rest of the systems.
     """
     for b in range(len(system)):
         H, P, K = system[b], system.shape[2], covariance.shape[1]
@@ -138,16 +142,15 @@ def known(system, covariance, shape):
 
 @kernel("f3 f3 f2 f3 f2 f0 f3 f2")
 def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
-    """Eliminate the rows of a chain one after the other; N of the unknowns of each are left without the betas.
+    """Eliminate the rows of a chain in order, each with N unknowns besides the common betas.
 
-    `system` (T, P + 1, P) are the rows' Hessians and gradients, the root's in its own tangents, which `turn` (T,
-    3, 3) takes to those of the world. Links add a `diagonal` (T, N), couplings `beyond` (T, N, n) with the next n
-    rows, of each unknown with itself only, and the gradient `pull` (T, N). The diagonal of all is `damping` times
-    larger.
-
-    `front` (M, M), zero, holds what is open: the row at hand, the n after it, and 11 right-hand sides, the
-    gradient and the couplings with the betas. Of these its last rows have the sums in the end, all poses
-    eliminated. `kept` (T, M, N) is the factor, and what `put_back` needs.
+    `system` (T, P + 1, P) are the rows' Hessians and gradients, for the root in its own tangents,
+    which `turn` (T, 3, 3) rotates to those of the world. Links add a `diagonal` (T, N), couplings
+    `beyond` (T, N, n) with the next n rows, of each unknown with itself only, and the gradient
+    `pull` (T, N). All diagonals are increased by the factor `damping`. `front` (M, M), initially
+    zero, is the frontal matrix: the current row, the n rows after it, and 11 right-hand sides, the
+    gradient and the couplings with the betas. In the end its last rows have the system of the
+    betas, with all poses eliminated. `kept` (T, M, N) is the factor, for `put_back`.
     """
     (T, N, n), M = beyond.shape, len(front)
     P, rhs, last = N + 10, M - 11, M - 11 - N
@@ -184,7 +187,7 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
             for j in range(m + 1):
                 front[rhs + 1 + m, rhs + 1 + j] += H[m, j]
         if not _reduced(K, N, _FIRST, M):
-            front[M - 1, M - 1] = math.nan  # and so in all that follows
+            front[M - 1, M - 1] = math.nan  # spreads to all that follows
         for i in range(N, M, 4):
             stop = min(i + 4, M)
             even = N + (i - N) // 2 * 2 if stop == i + 4 else N
@@ -214,7 +217,7 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
                     for p in range(N):
                         a += K[r, p] * K[j, p]
                     front[r, j] -= a
-        for i in range(N, M):  # the next row comes first
+        for i in range(N, M):  # shift to the next row
             to = i if i >= rhs else i - N
             for j in range(N, min(i + 1, rhs)):
                 front[to, j - N] = front[i, j]
@@ -225,8 +228,8 @@ def eliminated(system, turn, diagonal, beyond, pull, damping, kept, front):
 
 @kernel("f3 f1 f2")
 def put_back(kept, coefficients, step):
-    """The `step` (T, N) of the rows that `eliminated` left, the right-hand sides taken `coefficients` (11,)
-    times.
+    """Back-substitution after `eliminated`: the `step` (T, N), with right-hand sides weighted by
+    `coefficients` (11,).
     """
     (T, N), M = step.shape, kept.shape[1]
     for t in range(T - 1, -1, -1):

@@ -1,1 +1,1 @@
-"""The body: SMPL's format, its points on the skin, rotations, and where a detector's joints lie on it."""
+"""The body: SMPL's format, skinned points, rotations, and the offsets of a detector's joints."""

@@ -1,8 +1,8 @@
-"""A skinned body with SMPL's parameters: shape and pose in, mesh, joints and keypoints out.
+"""A skinned body with SMPL's parameters: computes mesh, joints and keypoints from shape and pose.
 
-The formulas are SMPL's (Loper et al. 2015): shape blend shapes, joints regressed from the shaped template, pose
-blend shapes (where the file has any), linear blend skinning.
-The model's own frame: metres, y up, facing +z, T-pose.
+The formulas are SMPL's (Loper et al. 2015): shape blend shapes, joints regressed from the shaped
+template, pose blend shapes (if the file has any), linear blend skinning. The model's own frame:
+metres, y up, facing +z, T-pose.
 """
 
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ class BodyParameters:
     body_pose: Array
     """(B, 23, 3) axis-angle in radians of each further joint, relative to its parent, in SMPL's order."""
     transl: Array
-    """(B, 3) metres, added to every vertex after posing; not the place of the pelvis."""
+    """(B, 3) metres, added to every vertex after posing; this is not the position of the pelvis."""
 
     def __post_init__(self) -> None:
         for name, shape in _SHAPES.items():
@@ -58,15 +58,15 @@ class BodyParameters:
 
     @property
     def local(self) -> Array:
-        """(B, 24, 3, 3) rotations relative to the parents."""
+        """(B, 24, 3, 3) rotations relative to the parents, pelvis first."""
         return exp_so3(np.concatenate((self.global_orient[:, None], self.body_pose), 1))
 
 
 class BodyModel:
-    """A body model in SMPL's file format, ready to pose batches of bodies.
+    """A body model in SMPL's file format that poses batches of bodies.
 
-    Keypoints are the 25 of BODY_25, as a detector would place them on the posed body, or those that
-    `with_keypoints` chose.
+    Keypoints are the 25 of BODY_25, where a detector places them on the posed body, or those chosen
+    by `with_keypoints`.
     """
 
     joint_names: tuple[str, ...] = SMPL_24
@@ -74,7 +74,7 @@ class BodyModel:
     parents: tuple[int, ...] = SMPL_PARENTS
     """(24,) parent of each joint, -1 for the pelvis."""
     num_betas: int = NUM_BETAS
-    """Shape components in use."""
+    """Number of shape components in use."""
 
     def __init__(
         self,
@@ -83,14 +83,16 @@ class BodyModel:
         keypoint_names: tuple[str, ...] = BODY_25.joints,
         contracted: SkinnedPoints | None = None,
     ):
-        """From checked arrays; most callers want `default` or `load`.
+        """Build it from validated arrays; most callers want `default` or `load`.
 
-        `contracted` is what another model made of the same arrays (`_contract`): it costs more than all else here.
+        `contracted` is the result of `_contract` for the same arrays, if it is available: it is the
+        main cost here.
         """
         self.arrays = arrays
-        """What the file held, in float64."""
+        """Arrays of the file, in float64."""
         self.keypoint_offsets = KeypointOffsets.identity() if offsets is None else offsets
-        """Where the detector's joints lie against the body's; in `keypoints`, not in `vertices` and `joints`."""
+        """Offsets of the detector's joints from the body's; they apply to `keypoints`, not to
+        `vertices` and `joints`."""
         self.keypoint_names = keypoint_names
         """(K,) names of the keypoints, some of `BODY_POINTS`."""
         self._contracted = _contract(arrays) if contracted is None else contracted
@@ -104,24 +106,26 @@ class BodyModel:
     @staticmethod
     @cache
     def default() -> "BodyModel":
-        """The open body that ships with the package; read once."""
+        """The open body of the package; read once."""
         return BodyModel.load(_DEFAULT_FILE)
 
     @classmethod
     def load(cls, path: str | Path, *, keypoint_regressor: Real | None = None) -> "BodyModel":
-        """A model from SMPL's `.npz` or official `.pkl`; InputError where it cannot be used.
+        """Read a model from SMPL's `.npz` or official `.pkl`; raises InputError if it is unusable.
 
-        `keypoint_regressor` (25, Nv) makes the BODY_25 keypoints from vertices. Without it the file's own
-        `keypoint_regressor` serves, or, for SMPL's 6,890 vertices, one that is known for that mesh.
+        `keypoint_regressor` (25, Nv) maps vertices to BODY_25 keypoints. The default is the file's
+        own `keypoint_regressor`, or, for SMPL's 6,890 vertices, a built-in one.
         """
         return cls(read_smpl_file(Path(path), keypoint_regressor))
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "BodyModel":
-        """Return this body with a detector's keypoint offsets, which replace those that it has."""
+        """Return this body with other keypoint offsets of a detector."""
         return self._with(offsets=offsets)
 
     def with_keypoints(self, names: tuple[str, ...]) -> "BodyModel":
-        """Return this body with other keypoints: a skeleton of `TARGET_SKELETONS`, or any of `BODY_POINTS`."""
+        """Return this body with other keypoints: of a skeleton in `TARGET_SKELETONS`, or any of
+        `BODY_POINTS`.
+        """
         return self._with(keypoint_names=names)
 
     def _with(self, **changed: Any) -> "BodyModel":
@@ -135,13 +139,14 @@ class BodyModel:
 
     @property
     def num_vertices(self) -> int:
-        """Vertices of the mesh, Nv."""
+        """Number of vertices of the mesh, Nv."""
         return len(self.arrays.template)
 
     def vertices(self, parameters: BodyParameters, only: Index | None = None) -> Array:
-        """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3), the vertices `only` (M,) of it.
+        """(B, Nv, 3) the skinned mesh, metres; or (B, M, 3) for the vertices `only` (M,).
 
-        The only thing here whose cost grows with the mesh. ValueError where `only` has other than one axis.
+        This is the only method with a cost that grows with the mesh. Raises ValueError unless
+        `only` is one-dimensional.
         """
         mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
         B, local, betas = len(parameters), parameters.local, parameters.betas
@@ -153,7 +158,7 @@ class BodyModel:
         rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(B, *mesh.rest_joints.shape)
         shift = self.joints(parameters)[:, mesh.bones] - (rotations @ rest[..., None])[..., 0]
         posed = mesh.weights @ shift
-        for axis in range(3):  # of the vertex at rest
+        for axis in range(3):  # of the vertices at rest
             posed += (mesh.weights @ rotations[..., axis]) * shaped[..., axis, None]
         return np.asarray(posed)
 
@@ -162,7 +167,9 @@ class BodyModel:
         return self._joints.positions(parameters.local, parameters.betas, parameters.transl)
 
     def keypoints(self, parameters: BodyParameters) -> Array:
-        """(B, K, 3) keypoints, metres: keypoint regressor x vertices, without the mesh."""
+        """(B, K, 3) keypoints, metres: keypoint regressor times vertices, computed without the
+        mesh.
+        """
         return self.keypoint_points.positions(parameters.local, parameters.betas, parameters.transl)
 
     def keypoints_with_jacobian(self, parameters: BodyParameters) -> tuple[Array, Array]:
@@ -176,7 +183,9 @@ class BodyModel:
 
     @property
     def offsets_of_keypoints(self) -> tuple[Array, Index] | None:
-        """What the keypoint offsets add to each keypoint (K, 3) and on which bone (K,); None where nothing."""
+        """Keypoint offsets of each keypoint (K, 3), metres, and their bones (K,); None if all are
+        zero.
+        """
         if not self.keypoint_offsets.xyz_m.any():
             return None
         xyz, bones = np.zeros((len(self.points.root), 3)), np.zeros(len(self.points.root), dtype=np.intp)
@@ -185,15 +194,19 @@ class BodyModel:
         return xyz[chosen], bones[chosen]
 
     def rest_pelvis(self, betas: Array) -> Array:
-        """(B, 3) the pelvis of bodies (B, 10) in the T-pose, metres: what `global_orient` turns about."""
+        """(B, 3) pelvis in T-pose for betas (B, 10), metres: the centre of the rotation
+        `global_orient`.
+        """
         return np.asarray(self._joints.root[0] + betas @ self._joints.root_shape[:, 0])
 
     def bone_rotations(self, parameters: BodyParameters) -> Array:
-        """(B, 24, 3, 3) world from bone: in the T-pose every bone's frame is the model's own."""
+        """(B, 24, 3, 3) world from bone; in T-pose every bone's frame is the model's own."""
         return accumulate(parameters.local)
 
     def _part_of_mesh(self, only: Index) -> "_Mesh":
-        """What some of the vertices need; the last part is kept, for it is asked for frame after frame."""
+        """Arrays for some of the vertices; the last result is cached, because it is used frame
+        after frame.
+        """
         if only.ndim != 1:
             raise ValueError(f"only must be (M,) numbers of vertices, got {only.shape}")
         key = only.tobytes()
@@ -203,7 +216,7 @@ class BodyModel:
 
     @cached_property
     def _mesh(self) -> "_Mesh":
-        """The big arrays, made when vertices are first asked for."""
+        """The large arrays, computed at the first use of vertices."""
         arrays = self.arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
         rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes
@@ -221,25 +234,25 @@ class BodyModel:
 
 @dataclass(frozen=True)
 class _Mesh:
-    """What only the vertices need."""
+    """Arrays that only the vertices need."""
 
     template: Array
-    """(Nv, 3) metres."""
+    """(Nv, 3) vertices at rest, metres."""
     shapes: Array
-    """(10, Nv * 3) metres per unit of each beta."""
+    """(10, Nv * 3) derivatives by each beta, metres."""
     pose_blend: Array | None
-    """(207, Nv * 3) metres per unit of each entry of R - I."""
+    """(207, Nv * 3) derivatives by each entry of R - I, metres."""
     rest_joints: Array
-    """(N, 3) metres."""
+    """(N, 3) joints at rest, metres."""
     rest_joint_shapes: Array
-    """(10, N * 3) metres per unit of each beta."""
+    """(10, N * 3) derivatives of the joints by each beta, metres."""
     weights: Array
     """(Nv, N) skinning weights."""
     bones: Index
-    """(N,) those of SMPL's on which any vertex hangs."""
+    """(N,) SMPL's bones with a non-zero weight."""
 
     def part(self, vertices: Index) -> "_Mesh":
-        """What some of the vertices need."""
+        """Arrays for some of the vertices."""
         columns, bones = (
             (3 * vertices[:, None] + np.arange(3)).ravel(),
             np.flatnonzero(self.weights[vertices].any(0)),
@@ -257,21 +270,23 @@ class _Mesh:
 
 
 def accumulate(local: Array) -> Array:
-    """World rotations of SMPL's bones from those relative to their parents; (B, 24, 3, 3) both."""
+    """World rotations of SMPL's bones (B, 24, 3, 3) from those relative to their parents, of equal
+    shape.
+    """
     world = local.copy()
-    for bone in range(1, len(SMPL_PARENTS)):  # parents come before their children
+    for bone in range(1, len(SMPL_PARENTS)):  # parents first
         world[:, bone] = world[:, SMPL_PARENTS[bone]] @ local[:, bone]
     return world
 
 
 def _contract(arrays: SmplArrays) -> SkinnedPoints:
-    """All `BODY_POINTS` of a mesh, float64, where the body itself has them."""
+    """All `BODY_POINTS` of a body, without detector offsets, contracted from the mesh, float64."""
     components = np.concatenate((arrays.template[..., None], arrays.shapes), -1)
     joints = np.einsum("jv,vxn->jxn", arrays.joint_regressor, components, optimize=True)  # at rest, (24, 3, 11)
     top = np.zeros((1, len(arrays.template)))  # of the head: the highest vertex of the T-pose
     top[0, np.argmax(arrays.template[:, 1])] = 1
     keypoints, head = (_regressed(arrays, each, joints) for each in (arrays.keypoint_regressor, top))
-    # Joint j rides on bone j at the joint's own rest position.
+    # Joint j moves with bone j, at the joint's own rest position.
     eye = np.eye(len(SMPL_PARENTS))
     moments = eye[:, :, None, None] * joints[:, None]
     own = contract(moments, eye, joints, SMPL_PARENTS, np.ones(len(eye)), has_pose_blend=False)
@@ -279,7 +294,7 @@ def _contract(arrays: SmplArrays) -> SkinnedPoints:
 
 
 def _regressed(arrays: SmplArrays, regressor: Array, joints: Array) -> SkinnedPoints:
-    """The contraction of a regressor (K, Nv)."""
+    """Contract the points of a regressor (K, Nv)."""
     touched = np.flatnonzero(np.any(regressor != 0, axis=0))
     regressor, weights = regressor[:, touched], arrays.weights[touched]
     components = [arrays.template[touched, :, None], arrays.shapes[touched]]
@@ -290,7 +305,9 @@ def _regressed(arrays: SmplArrays, regressor: Array, joints: Array) -> SkinnedPo
 
 
 def _moved(points: SkinnedPoints, offsets: KeypointOffsets) -> SkinnedPoints:
-    """`BODY_POINTS`, BODY_25's a constant offset away on one bone each: x_k + R_b o_k, so d_kb + o_k."""
+    """`BODY_POINTS` with a constant offset of each BODY_25 point on its bone: x_k + R_b o_k, so
+    d_kb + o_k.
+    """
     moved = points.offsets.copy()
     moved[np.arange(len(offsets.bones)), :, offsets.bones] += offsets.xyz_m
     return replace(points, offsets=moved)

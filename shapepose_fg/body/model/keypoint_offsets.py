@@ -1,7 +1,7 @@
-"""Where a detector puts its joints on the body, against where the body model has them.
+"""Offsets of a detector's joints from the body model's.
 
-A detector's hips are not SMPL's hips: how people annotate a joint differs from model to model. The difference is
-nearly constant in the frame of the bone that the joint rides on, so it is one vector per joint.
+A detector's hips are not SMPL's hips: annotation conventions differ. The offset is nearly constant
+in the frame of the bone that the joint moves with, so it is one vector per joint.
 """
 
 import json
@@ -36,30 +36,31 @@ _RIDES_ON = {
     "RBigToe RSmallToe RHeel": "right_ankle",
     "LBigToe LSmallToe LHeel": "left_ankle",
 }
-"""A bone has the name of the SMPL joint that it turns about: a wrist rides on the fore-arm, so on the elbow.
-Each is a bone whose turn the keypoints show; a hand's is not among them."""
+"""Bones have the name of the SMPL joint that they rotate about: a wrist moves with the forearm, so
+with the elbow. Only bones with a rotation observable from the keypoints are used, so not a
+hand's."""
 _BONE_OF = {joint: bone for joints, bone in _RIDES_ON.items() for joint in joints.split()}
 RIDES_ON = np.array([SMPL_24.index(_BONE_OF[joint]) for joint in BODY_25.joints])
-"""(25,) index in `SMPL_24` of the bone that each joint of BODY_25 rides on."""
+"""(25,) index in `SMPL_24` of the bone with which each joint of BODY_25 moves."""
 LARGEST_M = 0.2
-"""No detector puts a joint farther from the body's: a longer offset is a mistake, in unit or in data."""
+"""Maximum length of an offset, m; a longer one indicates an error in units or data."""
 
 
 @dataclass(frozen=True)
 class KeypointOffsets:
-    """How far a detector's joints lie from the body's, in the frames of its bones.
+    """Offsets of a detector's joints from the body's, in the frames of its bones.
 
-    In the T-pose every bone's frame is the body's own: x to its left, y up, z to its front.
+    In T-pose every bone's frame is the body's own: x to its left, y up, z to its front.
     """
 
     xyz_m: Array
-    """(25, 3) added to each keypoint in the frame of its bone, metres."""
+    """(25, 3) offset of each keypoint in the frame of its bone, metres."""
     sigma_m: Array
-    """(25,) how surely each is known, root mean square over the axes, metres."""
+    """(25,) standard deviation of each offset, root mean square over the axes, metres."""
     count: Index
-    """(25,) how many observed joints each was learnt from; 0 where nothing was."""
+    """(25,) number of observed joints from which each was estimated; 0 for none."""
     bones: Index
-    """(25,) index in `SMPL_24` of the bone that each joint rides on."""
+    """(25,) index in `SMPL_24` of the bone with which each joint moves."""
 
     def __post_init__(self) -> None:
         for name, kind in {"xyz_m": float, "sigma_m": float, "count": np.intp, "bones": np.intp}.items():
@@ -80,15 +81,16 @@ class KeypointOffsets:
 
     @classmethod
     def identity(cls) -> "KeypointOffsets":
-        """The detector's joints are the body's."""
+        """Zero offsets."""
         return cls(np.zeros((25, 3)), np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
 
     @classmethod
     def symmetric(cls, metres: Mapping[str, Sequence[float]]) -> "KeypointOffsets":
-        """Offsets by the joint's name, (x, y, z) metres; the mirror joint gets the mirrored one.
+        """Offsets by joint name, (x, y, z) metres; the mirror joint gets the mirrored offset.
 
-        `symmetric({"LHip": (0.035, 0.02, 0.0)})` has both hips farther out and higher. ValueError for an unknown
-        joint, for both sides of a pair, and for a joint in the middle that would not stay there.
+        `symmetric({"LHip": (0.035, 0.02, 0.0)})` moves both hips outwards and up. Raises ValueError
+        for an unknown joint, if both sides of a pair are given, and for a central joint with an
+        offset to one side.
         """
         xyz = np.zeros((25, 3))
         given = [BODY_25.index(name) for name in metres]
@@ -105,7 +107,7 @@ class KeypointOffsets:
         return cls(xyz, np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, for run.json and `save`: an entry per joint, millimetres to 3 digits."""
+        """Plain values for run.json and `save`: an entry per joint, millimetres with 3 digits."""
         joints = {
             name: {
                 "bone": SMPL_24[self.bones[joint]],
@@ -118,13 +120,15 @@ class KeypointOffsets:
         return {"format": _FORMAT, "joints": joints}
 
     def save(self, path: str | Path) -> None:
-        """Write as JSON, whole or not at all."""
+        """Write as JSON, atomically."""
         text = json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
         write_atomically(Path(path), lambda stream: stream.write(text.encode()))
 
     @classmethod
     def load(cls, path: str | Path) -> "KeypointOffsets":
-        """Read what `save` wrote, or the run.json of a reconstruction; InputError on anything else."""
+        """Read a file of `save`, or the run.json of a reconstruction; raises InputError for
+        anything else.
+        """
         path = Path(path)
         content = read_json(path)
         if isinstance(content, dict) and isinstance(content.get("keypoint_offsets"), dict):
@@ -133,7 +137,7 @@ class KeypointOffsets:
 
     @classmethod
     def read(cls, content: Any, path: Path) -> "KeypointOffsets":
-        """The offsets that a file at `path` has as `content`; InputError on anything else."""
+        """The offsets in the `content` of a file at `path`; raises InputError if there are none."""
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise InputError(
                 f"{path}: holds no keypoint offsets; give a run.json that does, or what KeypointOffsets.save wrote"
@@ -146,7 +150,9 @@ class KeypointOffsets:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "KeypointOffsets":
-        """What `as_dict` gave; KeyError, TypeError or ValueError for anything else. Files: `load`."""
+        """Inverse of `as_dict`; raises KeyError, TypeError or ValueError if invalid. For files use
+        `load`.
+        """
         rows = [content["joints"][name] for name in BODY_25.joints]
         return cls(
             np.array([[_number(value) for value in row["xyz_mm"]] for row in rows]) / 1e3,
@@ -157,14 +163,14 @@ class KeypointOffsets:
 
 
 def _bone(name: object) -> int:
-    """The place of a joint of SMPL; ValueError for anything else."""
+    """The index of a joint of SMPL; raises ValueError for any other name."""
     if name not in SMPL_24:
         raise ValueError(f"{name!r:.80} is not a joint of SMPL")
     return SMPL_24.index(str(name))
 
 
 def _number(value: object) -> float:
-    """A finite JSON number as float; ValueError for anything else."""
+    """A finite JSON number as float; raises ValueError for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{value!r:.80} is not a number")
     return float(value)

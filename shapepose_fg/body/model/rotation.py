@@ -1,7 +1,7 @@
 """Rotations: axis-angle to matrix and back, and Jacobians.
 
-Everything takes leading batch dimensions and is exact at angle 0 (no epsilon).
-The tangent convention of the whole package is the right one: `R exp(delta)`.
+All functions take leading batch dimensions and are exact at angle 0 (no epsilon). The whole package
+uses right tangents: `R exp(delta)`.
 """
 
 import math
@@ -12,7 +12,8 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.compiled import kernel
 
 _SERIES_BELOW = 1e-2
-"""Squared angle (rad^2) under which closed forms lose digits to cancellation and their series is used."""
+"""Squared angle (rad²) below which series are used, since closed forms lose digits to
+cancellation."""
 
 
 def hat(v: Array) -> Array:
@@ -39,7 +40,8 @@ def quaternion(R: Array) -> Array:
 def log_so3(R: Array) -> Array:
     """Axis-angle vectors of rotation matrices, norm at most pi; (..., 3, 3) -> (..., 3).
 
-    Goes by way of the quaternion, so that nothing is lost near pi; at exactly pi either axis may come out.
+    Computed by quaternions, so that it is accurate near pi; at exactly pi the axis may have either
+    sign.
     """
     found = np.empty(R.shape[:-1])
     _log(np.require(R, float, ["C", "W"]).reshape(-1, 3, 3), found.reshape(-1, 3))
@@ -72,7 +74,7 @@ def _log(R, vectors):
         a, e, i = R[n, 0, 0], R[n, 1, 1], R[n, 2, 2]
         x, y, z = R[n, 2, 1] - R[n, 1, 2], R[n, 0, 2] - R[n, 2, 0], R[n, 1, 0] - R[n, 0, 1]
         b, c, f = R[n, 0, 1] + R[n, 1, 0], R[n, 0, 2] + R[n, 2, 0], R[n, 1, 2] + R[n, 2, 1]
-        # The quaternion times four times one of its components: the largest divides best.
+        # The quaternion times four times one of its components; the largest is the best divisor.
         if a + e + i >= max(a, e, i):
             w = 1 + a + e + i
         elif a >= e and a >= i:
@@ -90,7 +92,7 @@ def _log(R, vectors):
 def right_jacobian_inverse(axis_angle: Array) -> Array:
     """Inverse of the right Jacobian: `log(exp(a) exp(d)) ~ a + Jr^-1 d`; (..., 3) -> (..., 3, 3).
 
-    Good for angles under 2 pi, where Jr itself is singular; `log_so3` returns at most pi.
+    Valid for angles below 2 pi, where Jr is singular; `log_so3` returns at most pi.
     """
     square = np.square(axis_angle).sum(-1)[..., None, None]
     small = square < _SERIES_BELOW

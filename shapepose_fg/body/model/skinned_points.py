@@ -1,13 +1,15 @@
-"""Points on a skinned body without its mesh: regressor and skinning weights contract to a few numbers.
+"""Points on a skinned body without its mesh, by contraction of regressor and skinning weights.
 
-A point `k` is a fixed weighted sum of vertices, a vertex a weighted sum over bones. Exchanging the sums leaves,
-for each point and bone, one offset that is linear in the shape (and in the pose blend shapes, if any):
+A point `k` is a fixed weighted sum of vertices, a vertex a weighted sum over bones. Exchanging the
+sums leaves, for each point and bone, one offset that is linear in the shape (and in the pose blend
+shapes, if any):
 
     x_k = a_k J_0(betas) + sum_j R_j d_kj(betas, pose) + s_k transl
 
-with `R_j` the world rotation of bone j and `J_0` the rest position of the root. This is `regressor @ vertices`
-exactly. Turning joint j by `R_j exp(delta)` turns the terms of its subtree, so the derivative is a cross product
-with their sum. `body/kernels/bodies.py` is where that is computed.
+with `R_j` the world rotation of bone j and `J_0` the rest position of the root. This equals
+`regressor @ vertices` exactly. A rotation of joint j, `R_j exp(delta)`, rotates the terms of its
+subtree, so that the derivative is a cross product with their sum; `body/kernels/bodies.py` computes
+it.
 """
 
 from dataclasses import dataclass, replace
@@ -23,26 +25,28 @@ from shapepose_fg.core.arrays import Array, Index
 
 NUM_BONES = 24
 NUM_COLUMNS = 10 + 3 * NUM_BONES + 3
-"""Columns of a Jacobian: betas, global_orient, body_pose, transl."""
+"""Number of columns of a Jacobian: betas, global_orient, body_pose, transl."""
 _EVERY = 10 + 3 * np.arange(NUM_BONES)
 
 
 @dataclass(frozen=True, eq=False)
 class SkinnedPoints:
-    """K points that ride on a skinned body."""
+    """K points that move with a skinned body."""
 
     offsets: Array
     """(K, 3, 24) metres: d_kj of the mean shape, in the frame of bone j."""
     offsets_shape: Array
-    """(10, K, 3, 24) metres per unit of each beta."""
+    """(10, K, 3, 24) derivatives of `offsets` by each beta, metres."""
     offsets_pose: Array | None
-    """(207, K, 3, 24) metres per unit of each entry of R - I; None for a model without pose blend shapes."""
+    """(207, K, 3, 24) derivatives by each entry of R - I, metres; None without pose
+    blend shapes."""
     root: Array
     """(K, 3) metres: a_k J_0 of the mean shape."""
     root_shape: Array
-    """(10, K, 3) metres per unit of each beta."""
+    """(10, K, 3) derivatives of `root` by each beta, metres."""
     translation: Array
-    """(K,) s_k, how much of `transl` a point takes: 1 for a regressor whose rows sum to 1."""
+    """(K,) s_k, the share of `transl` that each point moves by: 1 for a regressor with rows that
+    sum to 1."""
 
     def part(self, rows: list[int]) -> "SkinnedPoints":
         """Some of the points."""
@@ -58,7 +62,9 @@ class SkinnedPoints:
         )
 
     def joined(self, other: "SkinnedPoints") -> "SkinnedPoints":
-        """These points, then those of `other`, of the same body; points without pose blend shapes have zeros."""
+        """These points, then those of `other`, of the same body; missing pose blend shapes are
+        zeros.
+        """
         both = (self, other)
         pose = None
         if any(points.offsets_pose is not None for points in both):
@@ -76,13 +82,15 @@ class SkinnedPoints:
         )
 
     def limbs(self, column: Index = _EVERY) -> Limbs:
-        """For kernels, with unknowns that begin at `column` (24,) for each rotation, -1 for none.
+        """The points in the form that kernels take; `column` (24,) is the first unknown of each
+        rotation, -1 for none.
 
-        A point has terms of the bones that it rides on and all above them; with pose blend shapes of all.
+        A point has a term for each of its bones and for all bones above these; with pose blend
+        shapes, for all bones.
         """
         size = np.abs(self.offsets).max(1) + np.abs(self.offsets_shape).max((0, 2))
         rides = size > 0 if self.offsets_pose is None else np.ones_like(size, dtype=bool)
-        for bone in range(NUM_BONES - 1, 0, -1):  # children come after their parents
+        for bone in range(NUM_BONES - 1, 0, -1):  # children first
             rides[:, SMPL_PARENTS[bone]] |= rides[:, bone]
         rides[:, 0] = True
         point, bone = np.nonzero(rides)
@@ -125,7 +133,7 @@ class SkinnedPoints:
 
 
 def _contiguous(part: Any) -> Any:
-    """As kernels want it."""
+    """A C-contiguous copy, as kernels require."""
     return np.array(part, order="C")
 
 
@@ -150,7 +158,7 @@ def contract(
     has_pose_blend: whether the pose blend shapes are other than zero.
     """
     subtree = np.eye(NUM_BONES)
-    for bone in range(NUM_BONES - 1, 0, -1):  # children come after their parents
+    for bone in range(NUM_BONES - 1, 0, -1):  # children first
         subtree[:, parents[bone]] += subtree[:, bone]
     hanging = shares @ subtree
     offsets = moments.copy()

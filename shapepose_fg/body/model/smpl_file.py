@@ -1,4 +1,4 @@
-"""Reads a body model in SMPL's file format, `.npz` or the official `.pkl`, and checks that it is a person's."""
+"""Reads body models in SMPL's file format, `.npz` or the official `.pkl`, and validates them."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,7 +15,7 @@ from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
 
 NUM_BETAS = 10
-"""Shape components in use; a file may hold more."""
+"""Number of shape components in use; a file may have more."""
 SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """Parent of each of SMPL's 24 joints."""
 _NUM_KEYPOINTS = len(BODY_25)
@@ -24,51 +24,52 @@ _SMPL_VERTEX_KEYPOINTS = {
     "Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216, "LSmallToe": 3226,
     "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787,
 }  # fmt: skip
-"""Vertices of SMPL's own mesh that lie on keypoints."""
+"""Vertices of SMPL's own mesh for keypoints."""
 _SMPL_JOINT_KEYPOINTS = {
     "RShoulder": 17, "RElbow": 19, "RWrist": 21, "LShoulder": 16, "LElbow": 18, "LWrist": 20,
     "RHip": 2, "RKnee": 5, "RAnkle": 8, "LHip": 1, "LKnee": 4, "LAnkle": 7,
 }  # fmt: skip
-"""SMPL joints that stand for keypoints."""
+"""SMPL joints for keypoints."""
 _HEIGHT_M = (0.4, 3.0)
-"""From a newborn to more than any adult: a template in centimetres or millimetres is far outside."""
+"""Range of body heights, m, from a newborn to above any adult; detects templates in other units."""
 _SUM_TOLERANCE = 0.02
-"""Regressors are weighted means, printed with a few digits."""
+"""Tolerance for row sums of regressors, which are weighted means printed with few digits."""
 _BELONGS = {
     "RShoulder": "right_shoulder", "RElbow": "right_elbow", "RWrist": "right_wrist",
     "LShoulder": "left_shoulder", "LElbow": "left_elbow", "LWrist": "left_wrist",
     "RHip": "right_hip", "RKnee": "right_knee", "RAnkle": "right_ankle",
     "LHip": "left_hip", "LKnee": "left_knee", "LAnkle": "left_ankle",
 }  # fmt: skip
-"""SMPL joints that keypoints lie at."""
+"""SMPL joints near which keypoints must lie."""
 _FARTHEST = 0.15
-"""How far they may be from these, as a part of the body's height."""
+"""Maximum distance of these keypoints, as a share of the body's height."""
 _RISING = ("ankle", "knee", "hip", "shoulder")
-"""Joints from below to above in the T-pose."""
+"""Joints in ascending order of height in T-pose."""
 
 
 @dataclass(frozen=True)
 class SmplArrays:
-    """A body model's arrays, checked, in float64."""
+    """Validated arrays of a body model, in float64."""
 
     template: Array
     """(Nv, 3) vertices of the mean body in T-pose, metres, y up, facing +z."""
     shapes: Array
-    """(Nv, 3, 10) metres per unit of each beta."""
+    """(Nv, 3, 10) derivatives by each beta, metres."""
     pose_blend: Array | None
-    """(Nv, 3, 207) metres per unit of each entry of R - I; None where the file has none or only zeros."""
+    """(Nv, 3, 207) derivatives by each entry of R - I, metres; None if the file has none or only
+    zeros."""
     joint_regressor: Array
-    """(24, Nv) joints from the shaped template."""
+    """(24, Nv) regressor of the joints from the shaped template."""
     weights: Array
     """(Nv, 24) skinning weights; rows sum to 1."""
     keypoint_regressor: Array
-    """(25, Nv) BODY_25 keypoints from the posed vertices."""
+    """(25, Nv) regressor of BODY_25 keypoints from the posed vertices."""
     faces: NDArray[np.int64]
     """(F, 3) vertex indices of the triangles."""
 
 
 def read_smpl_file(path: Path, keypoint_regressor: Real | None = None) -> SmplArrays:
-    """The model in `path`; InputError naming the file, the key and the cure where it cannot be used."""
+    """Read the model in `path`; raises InputError naming file, key and cure if it is unusable."""
     entries = _Entries(path, _read_entries(path))
     template = entries.floats("v_template", (None, 3))
     count = len(template)
@@ -98,7 +99,7 @@ def read_smpl_file(path: Path, keypoint_regressor: Real | None = None) -> SmplAr
 
 
 def _read_entries(path: Path) -> dict[str, Any]:
-    """The file's arrays or stand-ins for them, by name."""
+    """The file's arrays, or records of them, by name."""
     if path.suffix not in (".npz", ".pkl"):
         raise InputError(f"{path}: a body model must be .npz or .pkl; give one of these")
     try:
@@ -112,30 +113,32 @@ def _read_entries(path: Path) -> dict[str, Any]:
             f"{path}: cannot be read safely ({error}); use the unchanged file from the model's site, or save"
             " its arrays as .npz"
         ) from error
-    except Exception as error:  # a damaged pickle can raise anything at all
+    except Exception as error:  # a damaged pickle can raise any error
         raise InputError(
             f"{path}: cannot be read as a body model ({type(error).__name__}: {error}); download the file again"
         ) from error
 
 
 class _Entries:
-    """The entries of one file, taken out one by one and checked."""
+    """Validates the entries of one file."""
 
     def __init__(self, path: Path, content: dict[str, Any]):
         self.path, self.content = path, content
 
     def array(self, name: str) -> NDArray[Any]:
-        """The array called `name`."""
+        """The array called `name`; raises InputError if it is missing or not an array."""
         if name not in self.content:
             raise InputError(f"{self.path}: {name} is missing; a body model has {' '.join(_KEYS)}")
         value = self.content[name]
         try:
             return value if isinstance(value, np.ndarray) else as_array(value)
-        except Exception as error:  # records of a damaged pickle can hold anything
+        except Exception as error:  # records of a damaged pickle can contain anything
             raise InputError(f"{self.path}: {name} is not an array ({error}); download the file again") from error
 
     def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> Array:
-        """The array called `name`, or a `value` for it, finite and of that shape; None is any length but 0."""
+        """The array `name`, or `value` in its place, validated as finite and of this shape; None is
+        any positive length.
+        """
         value = self.array(name) if value is None else np.asarray(value)
         fits = value.ndim == len(shape) and all(
             n == m if n is not None else m > 0 for n, m in zip(shape, value.shape, strict=True)
@@ -151,7 +154,7 @@ class _Entries:
         return np.ascontiguousarray(value, dtype=np.float64)
 
     def shapes(self, count: int) -> Array:
-        """The first 10 shape components."""
+        """The first 10 shape components, (Nv, 3, 10)."""
         shapes = self.array("shapedirs")
         if shapes.ndim != 3 or shapes.shape[2] < NUM_BETAS:
             raise InputError(
@@ -161,21 +164,21 @@ class _Entries:
         return self.floats("shapedirs", (count, 3, NUM_BETAS), shapes[..., :NUM_BETAS])
 
     def pose_blend(self, count: int) -> Array | None:
-        """The pose blend shapes, or None for a model without."""
+        """The pose blend shapes, or None if the model has none."""
         if "posedirs" not in self.content or not np.any(self.array("posedirs")):
             return None
         return self.floats("posedirs", (count, 3, 207))
 
     def weights(self, count: int) -> Array:
-        """Skinning weights whose rows sum to 1 exactly."""
+        """Skinning weights, normalised so that rows sum to 1 exactly."""
         weights = self.floats("weights", (count, 24))
         total = weights.sum(1, keepdims=True)
-        if np.any(weights < -1e-6) or np.any(np.abs(total - 1) > 1e-2):  # files round to some digits
+        if np.any(weights < -1e-6) or np.any(np.abs(total - 1) > 1e-2):  # files round
             raise InputError(f"{self.path}: weights must be >= 0 with rows that sum to 1: not this model's file")
         return weights / total
 
     def faces(self, count: int) -> NDArray[np.int64]:
-        """Triangles between existing vertices."""
+        """Triangles, validated to use existing vertices."""
         faces = self.array("f")
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
             raise InputError(f"{self.path}: f must be whole numbers (F, 3), got {faces.dtype} {faces.shape}")
@@ -185,7 +188,9 @@ class _Entries:
         return faces
 
     def check_tree(self) -> None:
-        """Refuses any tree but SMPL's: fitters and priors speak of its 24 joints by number."""
+        """Raise InputError for any kinematic tree but SMPL's: fitters and priors use its 24 joints
+        by index.
+        """
         table = self.array("kintree_table")
         fits = table.shape == (2, 24) and table.dtype.kind in "iuf"
         if fits:
@@ -203,7 +208,9 @@ _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintr
 
 
 def _smpl_keypoint_regressor(joint_regressor: Array) -> Array:
-    """BODY_25 keypoints of SMPL's own mesh: its joints for the limbs, single vertices for face and feet."""
+    """Regressor of BODY_25 keypoints for SMPL's own mesh: joints for the limbs, single vertices for
+    face and feet.
+    """
     regressor = np.zeros((_NUM_KEYPOINTS, _SMPL_NUM_VERTICES))
     for name, vertex in _SMPL_VERTEX_KEYPOINTS.items():
         regressor[BODY_25.index(name), vertex] = 1
@@ -215,7 +222,8 @@ def _smpl_keypoint_regressor(joint_regressor: Array) -> Array:
 
 
 def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Array) -> str | None:
-    """What is wrong, as the end of a sentence that names the array; None where it may be a person.
+    """The first problem, as the end of a sentence that names the array; None if the body is
+    plausible.
 
     `template` (Nv, 3) in T-pose, y up, facing +z; regressors (24, Nv) and (25, Nv).
     """

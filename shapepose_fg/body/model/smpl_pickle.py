@@ -1,10 +1,11 @@
-"""Reads the official SMPL `.pkl` without running anything that it names.
+"""Reads the official SMPL `.pkl` without running code from it.
 
-A pickle is a program for a small machine: loading one from the internet can do whatever Python can, a few bytes of
-it fill the memory or never end. Python's machine in Python (`pickle._Unpickler`) runs here with the instructions
-that arrays need and no others, for so many steps; it looks up no name and calls nothing: a name is a name, an
-object a `Record` of what the file says of it. The few names that SMPL's files need (numpy arrays, scipy sparse
-matrices, chumpy arrays) become arrays here.
+A pickle is a program for a virtual machine: loading an untrusted one can do anything Python can,
+and a few bytes can fill the memory or loop forever. Here Python's own virtual machine
+(`pickle._Unpickler`) runs with only the instructions that arrays need, and a limit of steps. No
+names are imported and nothing is called: names stay `Name` values, objects become a `Record` of
+their description in the file. The few names that SMPL's files need (NumPy arrays, SciPy sparse
+matrices, chumpy arrays) are then converted to arrays.
 """
 
 import io
@@ -22,20 +23,20 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.storage.files import read_bytes
 
 _MOST_STEPS = 200_000
-"""SMPL's files take a few thousand."""
+"""Maximum number of steps; SMPL's files take a few thousand."""
 _MOST_BYTES = 2**30
-"""SMPL's own files have 40 to 250 MB."""
+"""Maximum size of a file, bytes; SMPL's own have 40 to 250 MB."""
 _MOST_DENSE = 2**23
-"""Entries of a sparse matrix when it is written out: 24 joints from 350,000 vertices."""
+"""Maximum number of entries of a dense matrix: 24 joints from 350,000 vertices."""
 
 
 class RefusedPickle(Exception):
-    """The pickle asks for something that a body model does not need."""
+    """The pickle uses something that a body model does not need."""
 
 
 @dataclass(frozen=True)
 class Name:
-    """A class or function that the pickle names; nothing of that kind is ever looked up."""
+    """Name of a class or function in the pickle; it is never imported."""
 
     module: str
     name: str
@@ -43,7 +44,9 @@ class Name:
 
 @dataclass
 class Record:
-    """What the pickle says of one object: which name was called with which arguments, and its state."""
+    """Description of an object in the pickle: the name called, its arguments, and the object's
+    state.
+    """
 
     name: Name
     arguments: tuple[Any, ...]
@@ -59,7 +62,7 @@ _BYTES = {Name("_codecs", "encode")}
 _COLUMNS = {Name(f"scipy.sparse{part}", "csc_matrix") for part in ("", ".csc", "._csc")}
 _ROWS = {Name(f"scipy.sparse{part}", "csr_matrix") for part in ("", ".csr", "._csr")}
 _REBUILDS = {Name("copy_reg", "_reconstructor"), Name("copyreg", "_reconstructor")}
-"""Functions that make an object of the class that is their first argument."""
+"""Functions that create an object of the class given as their first argument."""
 _OTHERS = {Name("numpy", "ndarray"), Name("__builtin__", "object"), Name("builtins", "object")} | _REBUILDS
 _KNOWN = _RECONSTRUCT | _SCALAR | _FROM_BUFFER | _DTYPE | _BYTES | _COLUMNS | _ROWS | _OTHERS
 
@@ -88,14 +91,14 @@ def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 class _Instructions(dict[int, Callable[[Any], None]]):
-    """What a reader can do."""
+    """The instructions that the reader supports."""
 
     def __missing__(self, code: int) -> None:
         raise RefusedPickle(f"it has the instruction {bytes([code])!r}, which no array needs")
 
 
 class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
-    """Python's machine, on a short leash; text of Python 2 is read as Latin-1."""
+    """Python's unpickler with restricted instructions; Python 2 text is read as Latin-1."""
 
     dispatch: ClassVar[_Instructions]
     stack: list[Any]
@@ -130,7 +133,7 @@ class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
         self.stack[-1].state = state
 
     def fill(self, values: list[Any]) -> None:
-        """Entries of a dict; keys that are no text could take for ever to be told apart."""
+        """Add entries to a dict; keys other than text could have very slow comparisons."""
         if not isinstance(self.stack[-1], dict) or not all(isinstance(key, str | int) for key in values[::2]):
             raise RefusedPickle("it has keys that are not text")
         self.stack[-1].update(zip(values[::2], values[1::2], strict=True))
@@ -142,7 +145,7 @@ class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
 
     def byte_array(self) -> None:
         (size,) = struct.unpack("<Q", self.read(8))
-        self.append(bytearray(self.read(size)))  # no longer than what there is
+        self.append(bytearray(self.read(size)))  # at most the rest of the file
 
 
 _OWN: dict[str, Callable[[Any], None]] = {
@@ -162,9 +165,9 @@ _Reader.dispatch = _Instructions(
 
 
 def read_smpl_pickle(path: Path) -> dict[str, Any]:
-    """The entries of a pickled dict; those that are arrays or sparse matrices are made by `as_array`.
+    """The entries of a pickled dict; `as_array` converts those that are arrays or sparse matrices.
 
-    Raises RefusedPickle where the file asks for anything but data, and whatever a damaged pickle raises.
+    Raises RefusedPickle if the file needs anything but data; a damaged pickle can raise any error.
     """
     content = _Reader(read_bytes(path, _MOST_BYTES)).load()
     if not isinstance(content, dict):
@@ -173,7 +176,7 @@ def read_smpl_pickle(path: Path) -> dict[str, Any]:
 
 
 def as_array(value: Any) -> NDArray[Any]:
-    """The array that a record stands for; ValueError or TypeError where it stands for none."""
+    """The array described by a record; raises ValueError or TypeError if it is not an array."""
     if isinstance(value, list | tuple):
         if not all(isinstance(each, int | float) for each in value):
             raise TypeError("a list of anything but numbers is not an array")
@@ -202,7 +205,7 @@ def _shaped(content: bytes, dtype: Any, shape: Any, order: str) -> NDArray[Any]:
 
 
 def _number_type(record: Any) -> np.dtype[Any]:
-    """The dtype that a record names: plain numbers only, never Python objects."""
+    """The dtype named by a record: only plain numbers, never Python objects."""
     if not isinstance(record, Record) or record.name not in _DTYPE:
         raise TypeError("an array without a dtype")
     name = record.arguments[0]
@@ -213,7 +216,7 @@ def _number_type(record: Any) -> np.dtype[Any]:
 
 
 def _raw_bytes(value: Any) -> bytes:
-    """Raw memory as the different pickle protocols write it."""
+    """Raw bytes, as written by the different pickle protocols."""
     if isinstance(value, Record) and value.name in _BYTES:
         text, encoding = value.arguments
         if encoding != "latin1":
@@ -253,7 +256,7 @@ def _sparse_array(value: Record) -> Array:
 
 
 def _chumpy_array(value: Record) -> NDArray[Any]:
-    """The content of a chumpy array: `x` of a plain one, the chosen entries of `a` of a Select."""
+    """Content of a chumpy array: `x` of a plain one, the selected entries of `a` for a Select."""
     if not isinstance(value.state, dict):
         raise TypeError("a chumpy object without content")
     if "x" in value.state:

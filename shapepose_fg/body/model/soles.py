@@ -1,4 +1,6 @@
-"""Bodies on a floor: the lowest point of each foot, and how what sinks gets out of it."""
+"""Contact of bodies with a floor: lowest points of the feet, and correction of bodies
+that sink in.
+"""
 
 import numpy as np
 
@@ -10,26 +12,27 @@ from shapepose_fg.core.skeleton import SMPL_24
 _BONES = tuple([SMPL_24.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("right", "left"))
 _ANKLES, _KNEES = ([SMPL_24.index(f"{side}_{name}") for side in ("right", "left")] for name in ("ankle", "knee"))
 SINK_M = 0.01
-"""Bodies may be this far below the floor: flesh and soles give way."""
+"""Depth below the floor that is tolerated, m: flesh and soles are soft."""
 _BEND_RAD = 0.6
-"""Largest angle by which an ankle is bent to lift a foot, rad."""
+"""Maximum rotation of an ankle to lift a foot, rad."""
 _OF_FEET, _BEYOND = 3, 10
-"""Every third vertex of the feet is tested, and every tenth of the rest of the skin: 1 to 3 cm apart."""
+"""Every third vertex of the feet and every tenth of the other skin are tested; they are 1 to 3 cm
+apart."""
 _ROWS = 8
-"""Bodies whose vertices are made at a time."""
+"""Number of bodies per batch of vertices."""
 
 Bodies = tuple[Array, Array, Array, Array]
 """`betas` (B, 10), `global_orient` (B, 3), `body_pose` (B, 23, 3) and `transl` (B, 3) as in `BodyParameters`."""
 
 
 def feet_vertices(model: BodyModel) -> list[Index]:
-    """Vertices of the right foot, and of the left."""
+    """Sampled vertices of the right foot, and of the left."""
     bone = model.arrays.weights.argmax(axis=1)
     return [np.flatnonzero(np.isin(bone, bones))[::_OF_FEET] for bones in _BONES]
 
 
 def lowest_of_feet(model: BodyModel, bodies: Bodies, up: Array) -> Array:
-    """(B, 2, 3) the lowest point of each foot, right and left, metres; NaN where there is no body."""
+    """(B, 2, 3) lowest point of each foot, right and left, metres; NaN without a body."""
     feet = feet_vertices(model)
     points = _vertices(model, bodies, np.concatenate(feet))
     parts = points[:, : len(feet[0])], points[:, len(feet[0]) :]
@@ -38,11 +41,13 @@ def lowest_of_feet(model: BodyModel, bodies: Bodies, up: Array) -> Array:
 
 
 def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> Bodies:
-    """Return the bodies moved so that none is much deeper than `SINK_M` below the floor `normal` x = `height_m`.
+    """Return the bodies moved so that none is much deeper than `SINK_M` below the floor `normal` x
+    = `height_m`.
 
-    A foot that points into it is bent at the ankle, of which views say least; what sinks then is lifted, by
-    millimetres mostly. In simulated recordings of 3 to 6 cameras the bodies' joints are as near to the truth as
-    before (29.6, 29.4, 16.1 mm: 29.6, 29.3, 16.1), and nearer where the detector sees no feet (38.3: 37.1).
+    A foot that points into the floor is rotated at the ankle, which views observe least; the rest
+    of the depth, mostly millimetres, is removed by lifting the body. In simulated recordings of 3
+    to 6 cameras joint errors are unchanged (29.6, 29.4, 16.1 mm before; 29.6, 29.3, 16.1 after),
+    and smaller if the detector sees no feet (38.3 before, 37.1 after).
     """
     betas, orient, pose, transl = bodies
     turned = exp_so3(_bends(model, bodies, normal, height_m))
@@ -53,8 +58,8 @@ def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float
 
 
 def _bends(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> Array:
-    """(B, 2, 3) by how much the ankles turn so that the lowest points of the feet come up, as rotation vectors in
-    the frame of the shank.
+    """(B, 2, 3) rotations of the ankles that lift the lowest points of the feet, as rotation
+    vectors in the frame of the shank, rad.
     """
     parameters = BodyParameters(*bodies)
     ankles = model.joints(parameters)[:, _ANKLES]
@@ -69,13 +74,13 @@ def _bends(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> 
 
 
 def _lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
-    """(B,) how low bodies reach along a `normal` (3,), metres, to 1 cm."""
+    """(B,) smallest height of each body along a `normal` (3,), metres, accurate to 1 cm."""
     chosen = np.union1d(np.concatenate(feet_vertices(model)), np.arange(0, model.num_vertices, _BEYOND))
     return np.asarray((_vertices(model, bodies, chosen) @ normal).min(axis=1))
 
 
 def _vertices(model: BodyModel, bodies: Bodies, only: Index) -> Array:
-    """(B, M, 3) some of the vertices."""
+    """(B, M, 3) positions of the vertices `only`, metres."""
     parts = [
         model.vertices(BodyParameters(*(column[at : at + _ROWS] for column in bodies)), only)
         for at in range(0, len(bodies[0]), _ROWS)

@@ -1,1 +1,1 @@
-"""Where a detector puts its joints on the body, learnt without truth."""
+"""Offsets of a detector's joints from the body's, estimated without ground truth."""

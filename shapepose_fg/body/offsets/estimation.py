@@ -1,15 +1,18 @@
-"""Learning where a detector puts its joints on the body: from joints that the views know well, without any truth.
+"""Estimates the offsets of a detector's joints from the body's, from well observed joints and
+without ground truth.
 
-Each row (a person in a frame) is explained by a body, and what no body explains, the same in all rows in the frame
-of the bone, is the offset. Around the fits the energy is quadratic; summed over the rows
+A body is fitted to each row (a person in a frame). The part of the residuals that is constant over
+the rows, in the frame of the bone, is the offset. Around the fits the energy is quadratic; summed
+over the rows it is
 
     E(o, c) = sum_i min_dtheta |r - J dtheta - R o|²_W + |theta + dtheta - mean - c|²_P  +  |o|²_Q + |c|²_P
 
-with r the residuals, R the bones' rotations, W the information of the joints, P the precision of the prior of
-shape and pose. `c` is the recording's own mean shape and pose: were it zero, a room full of tall people who stand
-would be as many independent reasons to call their stature and their straight knees the detector's habit. It is
-bounded by one draw from the prior only, so it goes first. What pose and shape can explain (moving all joints
-alike, turning a limb) is not mistaken for an offset; the prior Q keeps that at zero.
+with r the residuals, R the bones' rotations, W the information of the joints, P the precision of
+the prior of shape and pose. `c` is the recording's own mean shape and pose: without it, a room full
+of tall standing people would be as many independent reasons to attribute their stature and straight
+knees to the detector. As `c` is constrained by a single draw from the prior, it absorbs such
+differences first. Anything that pose and shape can explain (a common translation, a rotated limb)
+is not attributed to an offset; the prior Q keeps that part at zero.
 """
 
 from dataclasses import dataclass
@@ -30,28 +33,29 @@ from shapepose_fg.core.bounds import Metres, Repeats, Settings
 from shapepose_fg.core.skeleton import BODY_25
 
 _CHUNK = 128
-"""Rows that are linearised at a time."""
+"""Number of rows per batch of linearisations."""
 _POSE_WIDENING = 3.0
-"""The pose prior is this many times as wide while offsets are learnt: a prior is never quite right about how poses
-vary, and what it has wrong would look like an offset, the same in hundreds of rows."""
+"""Factor on the standard deviations of the pose prior for this estimation. No prior has the exact
+distribution of poses, and its error would look like an offset, the same in hundreds of rows."""
 _MANY = 0.1
-"""Share of rows far from an adult's size from which on these are taken at that: a room full of children is no
-detector's habit. A row or two in a hundred is joints of two people."""
+"""Share of rows far from an adult's size above which these are scaled to it: a room full of
+children must not change the offsets. One or two rows in a hundred are mixtures of two people."""
 _ROWS_PER_DRAW = 4.0
-"""How many rows say as much as one that is independent: a detector's error lasts, and people come back."""
+"""Number of rows that count as one independent row: a detector's errors are correlated, and people
+reappear."""
 
 
 @dataclass(frozen=True)
 class OffsetPrior(Settings):
-    """What is believed of a detector's offsets before it is seen."""
+    """Prior on a detector's offsets."""
 
     sigma_m: Metres = 0.02
-    """How far joints lie from the body's, metres per axis: offsets are shrunk towards zero by this."""
+    """Prior standard deviation of the offsets, metres per axis; they are shrunk towards zero."""
     asymmetry_sigma_m: Metres = 0.003
-    """How far left and right may differ from being mirror images, metres per axis."""
+    """Prior standard deviation of the asymmetry between left and right, metres per axis."""
     rounds: Repeats = 1
-    """How often bodies are fitted and offsets are solved. As bodies are eliminated and not held, the first
-    solution is nearly the last: more rounds change what the body predicts by 0.2 mm."""
+    """Number of alternations between fits and offsets. Because bodies are eliminated, not fixed,
+    the first solution is nearly the last: more rounds change the body's predictions by 0.2 mm."""
 
 
 def learn_offsets(
@@ -61,10 +65,12 @@ def learn_offsets(
     config: BodyConfig | None = None,
     prior: OffsetPrior | None = None,
 ) -> KeypointOffsets:
-    """The offsets of the detector that gave `targets` (BODY_25), rows with too few joints left out.
+    """Estimate the offsets of the detector of `targets` (BODY_25), from rows with sufficient
+    joints.
 
-    Give only joints that are known well: information zero for all others. Offsets that `model` has already are
-    replaced, not added to. With no row that a body fits, the offsets are zero and their sigma is the prior's.
+    Give only well observed joints, with zero information for all others. Existing offsets of
+    `model` are replaced, not added to. If no row can be fitted, the offsets are zero with the
+    prior's sigma.
     """
     pose_prior = PosePrior.default() if pose_prior is None else pose_prior
     prior = OffsetPrior() if prior is None else prior
@@ -91,7 +97,9 @@ def learn_offsets(
 def _solved(
     energy: BodyEnergy, fit: BodyFit, evidence: Evidence, kernel_scale: float, precision: Real
 ) -> KeypointOffsets:
-    """One Newton step in offsets and mean; the mean starts from zero, which is where the bodies were fitted."""
+    """One Newton step in offsets and mean; the mean starts at zero, at which the bodies were
+    fitted.
+    """
     rows, size = np.flatnonzero(fit.ok), 75 + energy.num_free
     hessian, gradient, prior = np.zeros((size, size)), np.zeros(size), np.zeros((size - 75, size - 75))
     for start in range(0, len(rows), _CHUNK):
@@ -105,13 +113,15 @@ def _solved(
     hessian, gradient = hessian / _ROWS_PER_DRAW, gradient / _ROWS_PER_DRAW
     hessian[:75, :75] += precision
     gradient[:75] += precision @ current
-    # The root's place and turn have no prior, and no say in the sums either: any small number holds them at zero.
+    # The root's pose has neither prior nor influence on the sums: a small number keeps it at zero.
     hessian[75:, 75:] += prior + 1e-9 * np.eye(len(prior))
     return _made(current - np.linalg.solve(hessian, gradient)[:75], hessian, count)
 
 
 def _made(xyz_m: Real, precision: Real, count: Real) -> KeypointOffsets:
-    """Offsets (75,) with the sigmas that the joint `precision` (75 + ..., 75 + ...) leaves them."""
+    """Offsets (75,) with their standard deviations from the joint `precision` (75 +
+    ..., 75 + ...).
+    """
     variance = np.diagonal(np.linalg.inv(precision))[:75].reshape(25, 3).mean(axis=1)
     xyz = xyz_m.reshape(25, 3)
     length = np.linalg.norm(xyz, axis=1, keepdims=True)
@@ -122,9 +132,10 @@ def _made(xyz_m: Real, precision: Real, count: Real) -> KeypointOffsets:
 def _eliminate(
     energy: BodyEnergy, free: Array, targets: EnergyTargets, kernel_scale: float
 ) -> tuple[Real, Real, Real]:
-    """Sums over the rows (R, P) `free`, each row's body eliminated.
+    """Sums over the rows `free` (R, P), with each row's body eliminated.
 
-    Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's Hessian (P, P).
+    Returns Hessian and gradient by (offsets 75, mean of the free parameters P), and the prior's
+    Hessian (P, P).
     """
     (R, P), K = free.shape, len(BODY_25)
     linear = energy.linearise(free, targets, kernel_scale, energy.held_by_priors(R))
@@ -141,7 +152,7 @@ def _eliminate(
     gradient = np.concatenate([by_own, -prior_gradient], axis=1)
     system = np.concatenate([here, both, linear.gradient[:, None]], axis=1)
     reduce_systems(system)
-    half = system[:, P:].swapaxes(0, 1).reshape(76 + P, -1)  # all rows' in one matrix
+    half = system[:, P:].swapaxes(0, 1).reshape(76 + P, -1)  # all rows in one matrix
     hessian = -(half[:-1] @ half[:-1].T)
     own = (by_offset.swapaxes(-1, -2) @ information @ by_offset).sum(axis=0)
     for joint in range(K):
@@ -152,11 +163,11 @@ def _eliminate(
 
 
 def _prior_covariance(prior: OffsetPrior) -> Real:
-    """(75, 75) covariance of the offsets: what mirrored joints share, and what they do not."""
+    """(75, 75) prior covariance of the offsets: symmetric and antisymmetric part."""
     flip = np.diag([-1.0, 1.0, 1.0])
-    mirrored = np.zeros((75, 75))  # takes every offset to the mirrored one of its mirror joint
+    mirrored = np.zeros((75, 75))  # maps offsets to the mirror joints
     for joint, mirror in enumerate(BODY_25.mirror):
         mirrored[3 * joint : 3 * joint + 3, 3 * mirror : 3 * mirror + 3] = flip
     even, odd = (np.eye(75) + mirrored) / 2, (np.eye(75) - mirrored) / 2
-    # Projections onto what is symmetric and what is not.
+    # Projections onto the symmetric and the antisymmetric part.
     return prior.sigma_m**2 * even + prior.asymmetry_sigma_m**2 * odd

@@ -255,7 +255,7 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
     whole, free = sum(sizes.values()), shutil.disk_usage(output).free
     if free < _LEAST * whole:
         raise InputError(
-            f"{output}: {decimal(int(_LEAST * whole))} recordings need at least {len(entries)} of disk space,"
+            f"{output}: {len(entries)} recordings need at least {decimal(int(_LEAST * whole))} of disk space,"
             f" and {decimal(free)} are free; free some space, give another --output, or split the table"
         )
     if free < _USUAL * whole:

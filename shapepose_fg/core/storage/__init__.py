@@ -1,1 +1,1 @@
-"""Arrays in files: written in columns, read without running anything."""
+"""Arrays in files: written column by column, and read without executing code."""

@@ -1,4 +1,4 @@
-"""Reads files within bounds and with one clear error, and writes them whole or not at all."""
+"""Reads files within size limits and with one clear error, and writes them atomically."""
 
 import codecs
 import glob
@@ -17,29 +17,31 @@ from typing import Any, BinaryIO
 from shapepose_fg.core.errors import InputError
 
 SMALL, MIDDLE, BIG, LARGE = 2**20, 2**26, 2**28, 2**32
-"""Maximum size of a file, bytes: settings and tables of a few lines; cameras, or one frame; times of a recording;
-detections."""
+"""Maximum sizes of files, bytes: settings and small tables; cameras, or detections of one frame;
+times of a recording; detections of a recording."""
 PIECE = SMALL
-"""Number of bytes that are read at a time where a file may be larger than memory."""
+"""Number of bytes that are read at a time from files that may be larger than memory."""
 MOST_DEPTH = 64
-"""Maximum depth of nested lists and objects: no format has a fifth of it, and libyaml's loader is recursive."""
+"""Maximum depth of nested lists and objects: no format needs a fifth of it, and libyaml's loader is
+recursive."""
 _MOST_DOTS = 100
 """Maximum number of dots in a line of TOML: the parser's time grows with the square of the parts of a dotted
 key."""
 _LONG_NUMBER = re.compile(r"\d{19}")
 _BROKEN_OFF = re.compile(r"(-|\.|[eE][+-]?|tr?u?|fa?l?s?|nu?l?)?\s*")
-"""What is left of a JSON text that ends within a number or a word, or between two values."""
+"""Matches the rest of a truncated JSON text, which ends within a number or a word, or between two
+values."""
 
 
 def open_regular(path: Path, cure: str = "check the path", most: int | None = None) -> BufferedReader:
-    """The file at `path`, open for reading bytes.
+    """Open the file at `path` for reading bytes.
 
-    InputError where it is missing, unreadable, over `most` bytes, or no regular file: a pipe would wait for ever,
-    and a device may have no end.
+    InputError if it is missing, unreadable, larger than `most` bytes, or not a regular file:
+    reading from a pipe could block forever, and a device may be endless.
     """
     try:
         _refuse_unusable(path, path.stat(), most)
-        # Whatever takes the file's place in between is not waited for.
+        # Opened without blocking, in case the file is replaced by a pipe in between.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         stream = os.fdopen(os.open(path, flags), "rb")
     except InputError:
@@ -48,7 +50,7 @@ def open_regular(path: Path, cure: str = "check the path", most: int | None = No
         raise InputError(f"{path}: there is no such file; {cure}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
-    except ValueError:  # a zero byte
+    except ValueError:  # a zero byte in the path
         raise InputError(f"{str(path)!r}: this is not a valid file name; check the path") from None
     _refuse_unusable(path, os.fstat(stream.fileno()), most)
     return stream
@@ -64,15 +66,19 @@ def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> No
 
 
 def is_inside(folder: Path, name: str | Path) -> bool:
-    """Whether `folder / name` lies in the folder, links followed; False where no file can have that name."""
+    """Whether `folder / name` lies in the folder after resolving links; False if the name is not a
+    valid path.
+    """
     try:
         return (folder / name).resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # links that lead to each other, a zero byte
+    except (OSError, RuntimeError, ValueError):  # cyclic links, or a zero byte
         return False
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder / name`; InputError where a link there leads out of the folder, so that nothing is written there."""
+    """`folder / name`; InputError if a link there leads out of the folder, so that nothing is
+    written outside.
+    """
     if not is_inside(folder, name):
         cure = "remove it, or give that folder"
         raise InputError(f"{folder / name}: this link leads out of its folder; {cure}")
@@ -80,7 +86,9 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
-    """Content of the file at `path`; InputError as in `open_regular`, and where it has more than `most` bytes."""
+    """Content of the file at `path`. Raises InputError as `open_regular` does, also if it has more
+    than `most` bytes.
+    """
     with open_regular(path, most=most) as stream:
         content = stream.read(most + 1)
     _check_size(path, len(content), most)
@@ -93,7 +101,9 @@ def _check_size(path: Path, size: int, most: int) -> None:
 
 
 def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> str:
-    """Text of the UTF-8 file at `path`; InputError as of `read_bytes`, and where it is not text, or empty."""
+    """Text of the UTF-8 file at `path`. Raises InputError as `read_bytes` does, and if the file is
+    empty or not UTF-8.
+    """
     try:
         text = read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -104,7 +114,9 @@ def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> s
 
 
 def text_pieces(path: Path) -> Iterator[str]:
-    """Text of the UTF-8 file at `path` in pieces of up to `PIECE` bytes; InputError as of `read_text`."""
+    """Text of the UTF-8 file at `path` in pieces of up to `PIECE` bytes. Raises InputError as
+    `read_text` does.
+    """
     decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
     with open_regular(path, most=LARGE) as stream:
         ended = False
@@ -128,9 +140,9 @@ def _empty(path: Path) -> InputError:
 
 
 def read_json(path: Path, *, most: int = LARGE) -> Any:
-    """Value of the JSON file at `path`; InputError that names the line, also for a key that occurs twice.
+    """Content of the JSON file at `path`; InputError that names the line, also for a duplicate key.
 
-    NaN and Infinity are accepted as floats: validation of the values names their key.
+    NaN and Infinity are accepted as floats; later validation of the values names their key.
     """
     return parse_json(read_text(path, most=most), path)
 
@@ -143,7 +155,7 @@ def parse_json(text: str, path: Path | str) -> Any:
         raise not_json(path, error.lineno, error.colno, error.msg, rest=text[error.pos :]) from None
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
+    except (ValueError, RecursionError) as error:  # such as an integer of 5,000 digits, or 10,000 open brackets
         raise InputError(f"{path}: cannot be read as JSON ({error}); write the file again") from None
     return bounded(value, path, numbers=has_long_number(text))
 
@@ -154,7 +166,9 @@ def not_text(path: Path, byte: int) -> InputError:
 
 
 def not_json(path: Path | str, line: int, column: int, problem: str, *, rest: str | None) -> InputError:
-    """An error about JSON text, at a line and column from 1; `rest` is the text from there on, if it is known."""
+    """An error about JSON text at a line and column, counted from 1; `rest` is the text from there
+    on, if known.
+    """
     cut = rest is not None and (problem.startswith("Unterminated") or _BROKEN_OFF.fullmatch(rest))
     ends = " (the file ends too early)" if cut else ""
     return InputError(
@@ -163,17 +177,17 @@ def not_json(path: Path | str, line: int, column: int, problem: str, *, rest: st
 
 
 def has_long_number(text: str, start: int = 0, stop: int | None = None) -> bool:
-    """Whether some number of a JSON text may have more than 64 bits."""
+    """Whether a number in a JSON text may have more than 64 bits."""
     return _LONG_NUMBER.search(text, start, len(text) if stop is None else stop) is not None
 
 
 def read_toml(path: Path, *, may_be_empty: bool = False) -> dict[str, Any]:
-    """Tables of the TOML file at `path`; InputError that names what is wrong with it."""
+    """Content of the TOML file at `path`; InputError that names what is wrong with it."""
     return parse_toml(path, read_text(path, may_be_empty=may_be_empty, most=SMALL))
 
 
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
-    """Tables of `text`, read from `path`."""
+    """Parse the TOML `text` of the file at `path`."""
     if len(text) > SMALL:
         raise InputError(f"{path}: the file has {len(text)} characters, too many for TOML; check the path")
     for number, line in enumerate(text.splitlines(), 1):
@@ -185,15 +199,16 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read as TOML ({error}); correct it or write the file again") from None
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:  # a date that is none, an integer of 5,000 digits
+    except (ValueError, RecursionError) as error:  # such as an invalid date, or an integer of 5,000 digits
         raise InputError(f"{path}: cannot be read as TOML ({error}); write the file again") from None
 
 
 def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
-    """`value`, parsed from `path`; InputError if its lists and objects are nested too deep.
+    """Return `value`, parsed from `path`; InputError if its lists and objects are nested too
+    deeply.
 
-    With `numbers`, also if its integers have more than 64 bits: these fit no float and no array, and the time to
-    print them grows with the square of their length.
+    With `numbers`, also if an integer has more than 64 bits: these do not fit into floats and
+    arrays, and the time to print them is quadratic in their length.
     """
     waiting: list[tuple[tuple[Any, ...], Any]] = [((), value)]
     while len(waiting) > 0:
@@ -212,16 +227,16 @@ def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then put it in place in one step.
+    """Write a file atomically: `write` fills a temporary file beside `path`, which is then renamed.
 
-    At `path` is the old file or the whole new one, whenever this process dies. OSError that names
-    `path` where that fails.
+    If the process dies, `path` is the old file or the complete new one. OSError that names `path`
+    if that fails.
     """
     write_together({path: write})
 
 
 def write_content(path: Path, content: str | bytes) -> None:
-    """`write_atomically` of a whole content; text is UTF-8."""
+    """Write `content` with `write_atomically`; text as UTF-8."""
     data = content.encode() if isinstance(content, str) else content
     write_atomically(path, lambda stream: stream.write(data))
 
@@ -230,7 +245,7 @@ def write_together(
     files: Mapping[Path, Callable[[BinaryIO], object]],
     check: Callable[[Mapping[Path, Path]], object] = lambda _: None,
 ) -> None:
-    """`write_atomically` for several files in order, none of which is put in place before all are complete.
+    """`write_atomically` for several files, in order; none is put in place before all are complete.
 
     Before that, `check` is called with the temporary names of the complete files.
     """
@@ -252,7 +267,8 @@ def write_together(
     finally:
         for left in temporary.values():
             left.unlink(missing_ok=True)
-    # The new names themselves survive a power cut, where the system can do that; some network file systems cannot.
+    # The renaming itself is synced to disk, if the system supports it; some network file systems do
+    # not.
     for folder in {path.parent for path in files} if os.name == "posix" else ():
         descriptor = os.open(folder, os.O_RDONLY)
         with suppress(OSError):
@@ -261,7 +277,7 @@ def write_together(
 
 
 def user_cache(what: str) -> Path:
-    """The folder of the user's cache for `what`; below XDG_CACHE_HOME where that is set.
+    """The folder of the user's cache for `what`; below XDG_CACHE_HOME if that is set.
 
     It may not exist, or not be writable: the user of a container may have no home.
     """
@@ -271,7 +287,8 @@ def user_cache(what: str) -> Path:
 
 
 def sweep(folder: Path, name: str | None = None) -> None:
-    """Remove what a killed process was writing in `folder`, as the file `name` or as any.
+    """Remove temporary files that a killed process left in `folder`, of the file `name` or of any
+    file.
 
     No other process may be writing there.
     """
@@ -285,7 +302,9 @@ _PART = ".part"
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """An OSError inside the block names `path`, where it names none, or a temporary file beside `path`."""
+    """Add `path` to an OSError inside the block that names no file, or a temporary file beside
+    `path`.
+    """
     try:
         yield
     except OSError as error:
@@ -295,7 +314,9 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def unique_keys(pairs: list[tuple[str, Any]], path: Path | str) -> dict[str, Any]:
-    """An object's members; InputError if a key occurs twice, of which JSON itself would keep the last."""
+    """The members of an object; InputError for a duplicate key, of which JSON parsers silently keep
+    the last.
+    """
     members: dict[str, Any] = {}
     for key, value in pairs:
         if key in members:

@@ -1,4 +1,6 @@
-"""Named sets of arrays that are kept during a run: in memory, or as files that survive the process."""
+"""Named sets of arrays that are stored during a run: in memory, or in files that survive the
+process.
+"""
 
 import hashlib
 import json
@@ -21,35 +23,36 @@ Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
 ANEW = "start that run again with --restart"
-"""Cure for a damaged set."""
+"""What an error message tells the user to do about a damaged set."""
 _SAID = {"about", "arrays", "sha256"}
-"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all this."""
+"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all
+metadata."""
 _ALIGNED = 64
 """Alignment of arrays, bytes."""
 
 
 class KeptArrays:
-    """Sets of arrays, each under a name, with plain values about it; kept in memory.
+    """Sets of arrays by name, each with plain values about it; stored in memory.
 
-    The memory of a set that is dropped is returned to the system at once.
+    When a set is dropped, its memory is returned to the system immediately.
     """
 
     lasting = False
-    """Whether the arrays outlive this process."""
+    """Whether the arrays survive this process."""
 
     def __init__(self) -> None:
         self._sets: dict[str, tuple[Arrays, Any]] = {}
 
     def names(self, prefix: str) -> list[str]:
-        """Names of the sets that begin with `prefix`, in order."""
+        """Names of the sets that begin with `prefix`, sorted."""
         return sorted(name for name in self._sets if name.startswith(prefix))
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
-        """Keep a set, whole or not at all; one of the same name is replaced."""
+        """Store a set atomically; replaces one of the same name."""
         self._sets[name] = (_mapped(arrays), about)
 
     def drop(self, name: str) -> None:
-        """Remove a set, if there is one."""
+        """Remove a set, if it exists."""
         self._sets.pop(name, None)
 
     def about(self, name: str) -> Any:
@@ -57,19 +60,19 @@ class KeptArrays:
         return self._sets[name][1]
 
     def array(self, name: str, key: str, rows: slice = slice(None)) -> NDArray[Any]:
-        """Rows of an array of a set."""
+        """Rows of one array of a set."""
         return self._sets[name][0][key][rows]
 
     def keys(self, name: str) -> list[str]:
-        """Which arrays a set has."""
+        """Names of the arrays of a set."""
         return list(self._sets[name][0])
 
     def place(self, name: str) -> str:
-        """Description of the place of a set."""
+        """Description of where a set is stored, for messages."""
         return name
 
     def columns(self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
-        """Arrays of a set; InputError where one is not as its column says, or not of these `sizes`."""
+        """Arrays of a set; InputError if one does not match its column, or these `sizes`."""
         with naming(self.place(name), ANEW):
             found = {key: column.checked(key, self.array(name, key), sizes) for key, column in columns.items()}
             for key, column in columns.items():
@@ -81,8 +84,8 @@ InMemory = KeptArrays
 
 
 def _mapped(arrays: Arrays) -> Arrays:
-    """Copies in a memory mapping of their own, which is released at once; the allocator's memory would stay in
-    use.
+    """Copies of arrays in a separate memory mapping, which is released immediately when they are
+    deleted; memory of the allocator would remain in use.
     """
     starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values())]).tolist()
     if starts[-1] == 0:
@@ -96,18 +99,18 @@ def _mapped(arrays: Arrays) -> Arrays:
 
 
 class InFolder(KeptArrays):
-    """Arrays kept in a folder, one safetensors file per set: the format holds no code and gives single arrays and
-    rows.
+    """Arrays stored in a folder, one safetensors file per set: the format contains no code and
+    allows reading single arrays and rows.
 
-    A file is on the disk when `keep` returns. It has a digest of each array, and one of these digests, its name
-    and its run: what is read is checked once, and again when the file has changed. InputError names a damaged
-    file.
+    When `keep` returns, the file is on disk. It has a digest of each array, and one of all these
+    digests, its name and its run. An array is verified when it is first read, and again if the file
+    has changed. InputError names a damaged file.
     """
 
     lasting = True
 
     def __init__(self, folder: Path, run: str = "") -> None:
-        """`run` is the run that they belong to: files of another one are refused."""
+        """`run` identifies the run of the arrays: files of another run are refused."""
         self.folder, self.run = folder, run
         self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
@@ -143,14 +146,14 @@ class InFolder(KeptArrays):
         return self.folder / f"{name}{_SUFFIX}"
 
     def _seal(self, name: str, said: Mapping[str, str]) -> str:
-        """The digest of all metadata of a file; its arrays have their own digests in it."""
+        """Digest of all metadata of a file, which include the digests of its arrays."""
         return hashlib.sha256(json.dumps([self.run, name, said["about"], said["arrays"]]).encode()).hexdigest()
 
     @contextmanager
     def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
-        """Open a file of arrays, whose metadata, and the array `key`, are verified by their digests.
+        """Open a file of arrays; its metadata and the array `key` are verified by their digests.
 
-        Damage, found now or when it is read, is an InputError.
+        InputError if it is damaged, now or when it is read.
         """
         file = self._file(name)
         try:
@@ -178,7 +181,7 @@ class InFolder(KeptArrays):
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:
-    """Digest of an array: of its name, type, shape and bytes."""
+    """Digest of an array: its name, type, shape and bytes."""
     digest = hashlib.sha256(json.dumps([key, array.dtype.str, array.shape]).encode())
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()

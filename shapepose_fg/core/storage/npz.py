@@ -1,4 +1,6 @@
-"""`.npz` files: written piece by piece, and read within bounds, whole or only some of their rows."""
+"""`.npz` files: written piece by piece, and read within limits, completely or only some of their
+rows.
+"""
 
 import math
 import os
@@ -18,40 +20,40 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import PIECE, open_regular
 
 _LEVEL = 1
-"""Level of compression: half the time of zlib's usual 6 for files that are 3 % larger."""
+"""Compression level: half the time of zlib's default 6, for files that are 3 % larger."""
 _SMALL_BYTES = 2**28
-"""Maximum total size of the arrays of a small file, bytes, whatever their compression: NaN compresses 1000 to
-1."""
+"""Maximum total size of the arrays of a small file, bytes, independent of their compression: NaN
+compresses 1000 to 1."""
 MOST_PACKED = 50
 """Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
 _BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
-"""Bytes of the rows that are unpacked at a time, and of those that are skipped at a time."""
+"""Number of bytes of rows that are decompressed at a time, and that are skipped at a time."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """An array that comes in pieces of its first axis."""
+    """An array that is produced in pieces along its first axis."""
 
     dtype: np.dtype[Any]
-    """The type of its values."""
+    """Type of its values."""
     shape: tuple[int, ...]
     """Shape of the whole array."""
     pieces: Callable[[], Iterable[NDArray[Any]]]
-    """The pieces in order; can be asked for several times."""
+    """Function that yields the pieces in order; may be called several times."""
 
     @classmethod
     def of(cls, array: NDArray[Any], dtype: DTypeLike | None = None) -> "Pieces":
-        """An array in one piece, as values of `dtype` where that is given."""
+        """An array in one piece, converted to `dtype` if given."""
         return cls(np.dtype(array.dtype if dtype is None else dtype), array.shape, lambda: (array,))
 
     def array(self) -> NDArray[Any]:
-        """All of it."""
+        """The whole array."""
         pieces = [np.asarray(piece, dtype=self.dtype) for piece in self.pieces()]
         return np.concatenate(pieces) if len(pieces) > 0 else np.zeros(self.shape, dtype=self.dtype)
 
     def blocks(self) -> Iterator[bytes]:
-        """Bytes of the array in C order; ValueError where the pieces do not make up the shape."""
+        """Bytes of the array in C order; ValueError if the pieces do not have the total shape."""
         length, waiting = 0, b""
         for piece in self.pieces():
             if piece.shape[1:] != self.shape[1:]:
@@ -71,14 +73,15 @@ class Pieces:
 
 
 def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> None:
-    """Write `arrays` as a compressed `.npz` that NumPy alone reads; the same values give the same bytes.
+    """Write `arrays` as a compressed `.npz` that NumPy alone can read; equal values give equal
+    bytes.
 
-    They are taken in order, each when the one before it is written, and need not be in memory.
+    Arrays are requested in order, one after the other is written, and need not be in memory.
     """
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
         for name, each in arrays.items():
             array = each if isinstance(each, Pieces) else Pieces.of(np.asarray(each))
-            # A name instead of a file gives every member the same date.
+            # With a name instead of a file, all members get the same date.
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 header = {"descr": npy.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
                 npy.write_array_header_1_0(member, header)
@@ -87,11 +90,11 @@ def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> 
 
 
 def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an `.npz` file whose names are among `names`; InputError with the `cure` where that
+    """Read the arrays of an `.npz` file that are in `names`; InputError with the `cure` if that
     fails.
 
-    Other members of the file are not read. An array takes memory only after its size, from the headers of zip and
-    NumPy, was found to be one that the file can hold.
+    Other members of the file are not read. Memory is allocated only after the size in the headers
+    of zip and NumPy was found plausible for the size of the file.
     """
     with NpzFile(file, names, cure) as opened:
         return {name: opened.array(name) for name in opened.names}
@@ -99,7 +102,9 @@ def read_npz(file: Path, names: Collection[str], cure: str) -> dict[str, NDArray
 
 @dataclass
 class _Member:
-    """An array of a file: its bytes, where the first row begins, and whether rows lie in Fortran's order."""
+    """An array of a file: its stream, the position of the first row, and whether it is in Fortran
+    order.
+    """
 
     stream: IO[bytes]
     begin: int
@@ -113,14 +118,14 @@ class _Member:
 
 
 class NpzFile(ExitStack):
-    """An `.npz` file that is open, until it is closed or the block is left of which it is the context.
+    """An open `.npz` file; a context manager that closes it.
 
-    Rows are packed: those in front of the wanted ones are unpacked and passed over. Who asks for rows in rising
-    order, as `rows` of one call after the other, unpacks each once.
+    Rows are compressed: those before the requested ones are decompressed and skipped. If rows are
+    requested in increasing order, over all calls of `rows`, each is decompressed only once.
     """
 
     def __init__(self, file: Path, names: Collection[str], cure: str) -> None:
-        """Only arrays that are called one of `names` are looked at. InputError with the `cure` where it fails."""
+        """Only arrays in `names` are read. InputError with the `cure` if the file cannot be opened."""
         super().__init__()
         self.file, self._cure = file, cure
         self._open: dict[str, _Member] = {}
@@ -138,28 +143,28 @@ class NpzFile(ExitStack):
 
     @property
     def names(self) -> list[str]:
-        """The arrays that are there."""
+        """Names of the arrays that exist."""
         return list(self._members)
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """The shape of an array."""
+        """Shape of an array."""
         with self._telling():
             return self._member(name).shape
 
     def row_bytes(self, name: str) -> int:
-        """Size of a row of an array in memory, bytes."""
+        """Size of one row of an array in memory, bytes."""
         with self._telling():
             return self._member(name).row_bytes
 
     def array(self, name: str) -> NDArray[Any]:
-        """All of an array."""
+        """A whole array."""
         with self._telling():
             self._member(name)
             with self._archive.open(self._members[name]) as stream:
                 return _with_letters(name, npy.read_array(stream, allow_pickle=False))
 
     def rows(self, name: str, index: Index) -> NDArray[Any]:
-        """The rows `index` (R,), rising, of an array."""
+        """The rows `index` (R,), increasing, of an array."""
         with self._telling():
             member = self._member(name)
             if member.fortran:
@@ -182,7 +187,9 @@ class NpzFile(ExitStack):
             return _with_letters(name, array)
 
     def _member(self, name: str) -> _Member:
-        """An array's stream, behind its header; ValueError where zip and header disagree on its size."""
+        """The stream of an array, positioned after its header; ValueError if the headers of zip and
+        NumPy disagree on its size.
+        """
         if name not in self._open:
             info = self._members[name]
             stream = self.enter_context(self._archive.open(info))
@@ -196,7 +203,7 @@ class NpzFile(ExitStack):
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
-        """Whatever is wrong with the file is an InputError: zipfile, zlib and NumPy fail in a dozen ways."""
+        """Convert any error of zipfile, zlib or NumPy about the file to an InputError."""
         try:
             yield
         except InputError:
@@ -209,7 +216,8 @@ class NpzFile(ExitStack):
 
 
 def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in Fortran's order, and type of an array in NumPy's format; its numbers follow in the stream.
+    """Shape, whether in Fortran order, and type of an array in NumPy's format; its values follow in
+    the stream.
 
     ValueError for other versions of the format than 1.0 and 2.0; NumPy raises many others for a damaged header.
     """
@@ -220,7 +228,7 @@ def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[
 
 
 def _go_to(stream: IO[bytes], place: int) -> None:
-    """Pass over what is in front of `place`, a little at a time: `seek` would unpack 16 MB at once."""
+    """Skip to the position `place` in small steps: `seek` would decompress 16 MB at once."""
     if place < stream.tell():
         stream.seek(0)
     while stream.tell() < place:
@@ -229,7 +237,9 @@ def _go_to(stream: IO[bytes], place: int) -> None:
 
 
 def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
-    """ValueError for members of a zip that `np.savez` does not write, or too large for a file of `size` bytes."""
+    """ValueError for members of a zip file that `np.savez` would not write, or that are too large
+    for a file of `size` bytes.
+    """
     for member in members:
         if member.flag_bits & 1:
             raise ValueError(f"{member.filename} is encrypted")
@@ -243,7 +253,9 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
 
 
 def _with_letters(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    """The array, if its text is of letters that there are: Python text of others crashes where it is printed."""
+    """Return the array; ValueError if its text has invalid code points, with which Python fails on
+    printing.
+    """
     if array.dtype.kind == "U" and array.size > 0 and array.dtype.itemsize > 0:
         letters = np.frombuffer(array.tobytes(), np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
         if np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))):

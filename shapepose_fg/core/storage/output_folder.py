@@ -1,4 +1,4 @@
-"""The folder of results: tested before a long run instead of after it, and locked for one run at a time."""
+"""The results folder: tested for writing before a long run, and locked for one run at a time."""
 
 import os
 import tempfile
@@ -15,7 +15,7 @@ _LOCK = ".lock"
 
 
 def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
-    """Make the folder, and try whether the files `names` can be written there; InputError where they cannot."""
+    """Make the folder, and test whether the files `names` can be written there; InputError if not."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as trial:
@@ -31,11 +31,11 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
 
 @contextmanager
 def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
-    """`prepare_output`, as the only run that writes results there during the block; InputError if another one
-    does.
+    """Call `prepare_output`, and lock the folder for this run during the block; InputError if
+    another run has locked it.
 
-    What a killed run was writing is removed, and so is a new folder into which nothing was written. The lock is
-    the system's: it ends with the process, however that ends.
+    Temporary files of a killed run are removed, and so is a new folder if it stays empty. The lock
+    is one of the operating system, so it always ends with the process.
     """
     names, is_new = tuple(names), not folder.exists()
     prepare_output(folder, names)
@@ -57,9 +57,10 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
             sweep(folder, name)
         yield
     finally:
-        # Before it is released: who waits for it then sees that it is gone, and makes a new one.
+        # Removed before the lock is released: a waiting run then sees that the file is gone, and
+        # makes a new one.
         file.unlink(missing_ok=True)
         lock.release()
         if is_new:
-            with suppress(OSError):  # it has something in it
+            with suppress(OSError):  # not empty
                 folder.rmdir()

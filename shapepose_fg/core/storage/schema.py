@@ -1,4 +1,5 @@
-"""Tables of arrays whose columns are declared in the types of fields and checked whenever a table is created.
+"""Tables of arrays with columns that are declared in the types of the fields and checked whenever a
+table is created.
 
 For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
@@ -15,48 +16,52 @@ from numpy.typing import NDArray
 from shapepose_fg.core.storage.npz import Pieces
 
 _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
-"""Kinds of NumPy types that are accepted for a column's own kind: integers, floats, text, booleans."""
+"""NumPy type kinds that are accepted for each kind of a column: integers, floats, text, booleans."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """Axes, type, unit and bounds of an array of a table."""
+    """Axes, type, unit and bounds of a column."""
 
     axes: str
-    """Axes, separated by spaces: a letter is a length that is the same in all columns of a table, N counts
-    rows."""
+    """Axes, separated by spaces: a letter stands for a length that is the same in all columns of a
+    table; N is the number of rows."""
     dtype: Any = np.float64
-    """The type of its values."""
+    """Type of its values."""
     unit: str = ""
-    """The unit of its values, where they have one."""
+    """Unit of its values; empty if they have none."""
     most: float = np.inf
-    """Largest magnitude in a file; no result exceeds it, and products of larger numbers overflow."""
+    """Maximum magnitude in a file; real results are smaller, and products of larger numbers could
+    overflow."""
     missing: Any = None
-    """Value of a column that is not given, as in files of earlier versions; None where it must be given."""
+    """Default value of a column, for example for files of earlier versions; None if the column is
+    required."""
     codes: type[Enum] | None = None
-    """Meanings of the codes, counted from 0."""
+    """Meanings of the codes, numbered from 0."""
     stored: Any = None
-    """Type in files, where it is another."""
+    """Type in files, if it differs."""
 
     @property
     def has_rows(self) -> bool:
-        """Whether it has an entry per row."""
+        """Whether the first axis is the rows."""
         return self._lengths[0] == "N"
 
     @cached_property
     def _lengths(self) -> tuple[int | str, ...]:
-        """A number or a letter for each axis."""
+        """For each axis, its length or its letter."""
         return tuple(int(axis) if axis.isdecimal() else axis for axis in self.axes.split())
 
     def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
-        """Shape of the array where letters have these lengths."""
+        """Shape of the array for given lengths of the letters."""
         return tuple(sizes.get(each, 0) if isinstance(each, str) else each for each in self._lengths)
 
     def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
-        """`value` as an array of the column's shape and type; ValueError naming the column where it is not.
+        """Convert `value` to an array of the column's type; ValueError naming the column if shape
+        or type do not match.
 
-        Lengths that are not in `sizes` yet are taken from it. Numbers of another size are converted, but real
-        numbers are not cut to whole ones, and whole numbers that do not fit are refused. Text keeps its own width.
+        Lengths that are not yet in `sizes` are added to it. Numbers of another size are converted,
+        but floats are not truncated to integers, and integers that do not fit are refused. Text
+        keeps its own width.
         """
         wanted = np.dtype(self.dtype)
         if value is None and self.missing is not None:
@@ -82,7 +87,7 @@ class Column:
         return array
 
     def check_range(self, name: str, array: NDArray[Any]) -> None:
-        """ValueError where a number is larger than any result has, or a whole one negative."""
+        """ValueError if a magnitude exceeds the column's bound, or if an integer is negative."""
         if array.size == 0 or not np.isfinite(self.most):
             return
         if array.dtype.kind == "i" and array.min() < 0:
@@ -94,7 +99,7 @@ class Column:
 
 @cache
 def columns_of(kind: type) -> dict[str, Column]:
-    """The columns of a class of tables by the names of its fields, in their order."""
+    """The columns of a table class, by the names of its fields, in their order."""
     hints = get_type_hints(kind, include_extras=True)
     marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
     return {name: mark for name, found in marks.items() for mark in found if isinstance(mark, Column)}
@@ -103,11 +108,12 @@ def columns_of(kind: type) -> dict[str, Column]:
 class Table:
     """Base of frozen dataclasses whose fields are arrays, each annotated with its `Column`.
 
-    ValueError that names the column where one has another shape or type.
+    ValueError that names the column if its shape or type does not match.
     """
 
     ROWS: ClassVar[Sequence[str]] = ()
-    """The columns with an entry per row, in the order in which files have them; by default that of the fields."""
+    """The columns with one entry per row, in the order of files; by default the order of the
+    fields."""
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -124,7 +130,7 @@ class Table:
 
     @classmethod
     def shared(cls) -> list[str]:
-        """The columns that all rows share, such as the names of joints."""
+        """Names of the columns that all rows share, such as the names of joints."""
         return [name for name, column in columns_of(cls).items() if not column.has_rows]
 
     @classmethod
@@ -139,9 +145,10 @@ class Table:
 
     @classmethod
     def joined(cls, parts: Sequence[Self], **others: Any) -> Self:
-        """The rows of parts (one at least), one after the other; what they share, and `others`, as it is.
+        """Concatenate the rows of one or more parts; shared columns, and `others`, are taken
+        unchanged.
 
-        ValueError where two parts have not the same shared columns.
+        ValueError if two parts differ in shared columns.
         """
         for part in parts[1:]:
             for name in cls.shared():
@@ -151,27 +158,29 @@ class Table:
         return replace(cast(Any, parts[0]), **rows, **others)
 
     def rows(self, index: Any) -> Self:
-        """The rows that `index` picks: a mask (N,) or row numbers."""
+        """The rows selected by `index`: a mask (N,) or row numbers."""
         return replace(cast(Any, self), **{name: getattr(self, name)[index] for name in self.ROWS})
 
     def check_ranges(self) -> None:
-        """ValueError for what no result gives: negative frames, joints thousands of kilometres away."""
+        """ValueError for impossible values, such as negative frames, or joints thousands of
+        kilometres away.
+        """
         for name, column in columns_of(type(self)).items():
             column.check_range(name, getattr(self, name))
 
     def columns(self) -> dict[str, Pieces]:
-        """The arrays of a file: rows, shared columns, and meanings of codes."""
+        """The arrays of a file: columns with rows, shared columns, and meanings of codes."""
         stored = {name: column.stored for name, column in columns_of(type(self)).items()}
         own = {name: Pieces.of(getattr(self, name), stored[name]) for name in (*self.ROWS, *self.shared())}
         return own | {name: Pieces.of(words) for name, words in self.meanings().items()}
 
     @classmethod
     def meanings(cls) -> dict[str, NDArray[np.str_]]:
-        """Meanings of codes, as the arrays that make a file readable: `gate_names` for the column `gate`."""
+        """Meanings of codes, as arrays for readers of the file: `gate_names` for the column `gate`."""
         coded = {name: column.codes for name, column in columns_of(cls).items() if column.codes is not None}
         return {f"{name}_names": code_names(codes) for name, codes in coded.items()}
 
 
 def code_names(kinds: type[Enum]) -> NDArray[np.str_]:
-    """(K,) what each code of `kinds` means, in words."""
+    """(K,) the meaning of each code of `kinds`, in words."""
     return np.array([kind.name.lower().replace("_", " ") for kind in kinds])

@@ -1,4 +1,6 @@
-"""An experiment: cases that are measured one by one, and a table whose rows pool their figures."""
+"""An experiment: cases that are measured one by one, and a table with rows that combine their
+figures.
+"""
 
 import json
 import re
@@ -14,7 +16,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
 
 Figures = dict[str, Any]
-"""Figures of a case: numbers and texts by name, None where there is nothing to measure; JSON holds them."""
+"""Figures of a case: numbers and texts by name, None if there is nothing to measure; saved as JSON."""
 
 _POOLED = {"mean": np.average, "least": np.min, "most": np.max, "sum": np.sum}
 
@@ -43,7 +45,7 @@ class Column:
     """How the figures of a row's cases are combined. Shares of joints of a class are weighted by their count."""
 
     def cell(self, cases: Sequence[Figures]) -> str:
-        """Text in a row of these cases; a dash where none has the figure."""
+        """Text in a row of these cases; a dash if none has the figure."""
         those = [case for case in cases if case.get(self.figure) is not None]
         values = [case[self.figure] for case in those]
         if len(values) == 0 or isinstance(values[0], str):
@@ -56,16 +58,16 @@ class Column:
 
 
 def columns(*given: tuple[Any, ...]) -> tuple[Column, ...]:
-    """Columns from what `Column` takes."""
+    """Columns from tuples of the arguments of `Column`."""
     return tuple(Column(*each) for each in given)
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table of the documents."""
+    """A measured table in the documentation."""
 
     name: str
-    """Name of its marks in the documents."""
+    """Name in the table's marks in the documentation."""
     rows: Mapping[str, Sequence[Case]]
     """Name of each row, and the cases whose figures it combines; a case may be in several rows."""
     columns: Sequence[Column]
@@ -80,7 +82,7 @@ class Experiment:
         return every
 
     def only(self, wanted: Callable[[str], bool]) -> "Experiment":
-        """Return the experiment with only the cases whose names are wanted."""
+        """Return the experiment with only the cases for whose names `wanted` is true."""
         rows = {label: [case for case in row if wanted(case.name)] for label, row in self.rows.items()}
         return replace(self, rows={label: row for label, row in rows.items() if len(row) > 0})
 
@@ -99,10 +101,11 @@ class Experiment:
 def measured(
     experiment: Experiment, folder: Path, *, afresh: bool = False, told: Callable[[str], None] = print
 ) -> tuple[dict[str, Figures], float]:
-    """The figures of every case by name, and the total time in seconds, over interruptions.
+    """The figures of every case by name, and the total computing time in seconds, summed over
+    interrupted runs.
 
-    Each case has a file in `folder`: an interrupted run is resumed, unless it begins `afresh`. InputError for a
-    file that has no figures.
+    Each case has a file in `folder`: an interrupted run is resumed, unless `afresh` is set.
+    InputError if a file has no figures.
     """
     figures, seconds = dict[str, Figures](), 0.0
     for case in experiment.cases:
@@ -113,7 +116,7 @@ def measured(
             found = {"figures": case.measure(), "seconds": time.perf_counter() - began}
             write_content(file, json.dumps(found, indent=1) + "\n")
             told(f"  {experiment.name}: {case.name}, {found['seconds']:.0f} s")
-        kept = read_json(file)  # as JSON gives it back, so that a run that goes on is no other
+        kept = read_json(file)  # after a round trip through JSON, so that a resumed run has equal values
         try:
             figures[case.name] = dict(kept["figures"])
             seconds += float(kept["seconds"])

@@ -1,4 +1,4 @@
-"""Experiments on real footage: Shelf by its annotation, and by cameras that are left out."""
+"""Experiments on real footage: Shelf, scored by its annotation and by held-out cameras."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -45,14 +45,14 @@ def shelf_footage(folder: Path) -> tuple[Rig, DetectionTable]:
 def _reconstructed(
     folder: Path, config: PipelineConfig | None = None, frames: range | None = None
 ) -> Reconstruction:
-    """Shelf's people; only in `frames`, if given."""
+    """Reconstruction of Shelf, in all frames or only in `frames`."""
     rig, detections = shelf_footage(folder)
     times = FrameTimes.from_fps(SHELF_FPS, len(detections))
     return reconstruct(detections, rig, config, frames=frames, times=times)
 
 
 def shelf(scale: Scale) -> Experiment:
-    """PCP of our method, of its steps, and of others on the whole recording."""
+    """PCP on the whole recording: our method, its intermediate steps, and other methods."""
     rows = dict[str, list[Case]]()
     if (folder := scale.recording("shelf")) is not None and not scale.quick:
         rows = {name: [Case(name, partial(_scores, folder, name))] for name in _SHELF}
@@ -63,8 +63,8 @@ def shelf(scale: Scale) -> Experiment:
 
 
 def views(scale: Scale) -> Experiment:
-    """Shelf solved without each of its cameras, whose detections are compared with the 95 % regions of the
-    rest.
+    """Shelf solved without each of its cameras in turn. The detections of the held-out camera are
+    compared with the 95 % regions of the others.
     """
     rows = {}
     if (folder := scale.recording("shelf")) is not None:
@@ -80,7 +80,7 @@ def _ours(folder: Path, mode: str) -> Reconstruction:
 
 
 def _bodies(folder: Path) -> People:
-    """The joints of the bodies instead of those of the graphs."""
+    """The result with the joints of the fitted bodies instead of those of the graphs."""
     people = _ours(folder, "frame by frame")
     return replace(people, joints=body_joints(people))
 

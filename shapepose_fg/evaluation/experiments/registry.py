@@ -1,4 +1,4 @@
-"""All experiments, in the order of the documents."""
+"""All experiments, in the order of the documentation."""
 
 from collections.abc import Iterator
 

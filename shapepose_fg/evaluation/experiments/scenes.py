@@ -24,7 +24,7 @@ SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
     "report": {"salsa": (108, 618), "crossing": (0, 726), "crowd": (0, 826)},
     "tune": {"salsa": (0, 564), "crossing": (0, 564), "crowd": (241, 900)},
 }
-"""First frames of the segments of the named sequences without a cut; each has 300 frames."""
+"""First frames of the segments of the named sequences; each segment has 300 frames without a cut."""
 RECORDINGS = ("shelf", "cmu_mocap")
 """Folders of the recordings and of the recorded motions for experiments."""
 QUICK_FRAMES = 4
@@ -94,7 +94,7 @@ class Scale:
     split: Split = "report"
     """Split of the recorded motions: choose on `tune`, report on `report`."""
     seeds: tuple[int, ...] = tuple(range(6101, 6106))
-    """Seeds of the sequences that are drawn anew (`who is there`)."""
+    """Seeds of the random sequences of `who is there`."""
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -106,7 +106,7 @@ class Scale:
         return tuple(Segment(name, range(n, n + 300), self.split, mocap=self.mocap) for name, n in begins)
 
     def recording(self, name: str) -> Path | None:
-        """The folder of one of the `RECORDINGS`; None where there is none."""
+        """The folder of one of the `RECORDINGS`; None if it is missing."""
         folder = None if self.data is None else self.data / name
         return folder if folder is not None and folder.is_dir() else None
 
@@ -150,7 +150,8 @@ COLUMNS = columns(
     ("u 50 %", "unseen_inside_50"), ("u 95 %", "unseen_inside_95"), ("v", "velocity_error", 2),
     ("v 95 %", "velocity_inside_95"), ("ms", "cpu_ms", 0),
 )  # fmt: skip
-"""mm, m/s², cm, m/s; `u`: joints unseen for ten frames; ms: the processor's, a frame. Means over segments."""
+"""Columns of the tables: lengths in mm, accelerations in m/s², velocities in m/s, `u`: joints that
+no view has seen for ten frames; ms: processor time per frame. Means over segments."""
 CLASSES = {"seen": "2 views", "one_view": "1", "no_view": "0", "unseen": "0 for ten frames"}
 THERE_COLUMNS = columns(
     ("F1, mean", "f1", 2), ("least", "f1", 2, "least"), ("IDF1, mean", "idf1", 2), ("least", "idf1", 2, "least"),
@@ -165,7 +166,7 @@ THERE_COLUMNS = columns(
     )
 )  # fmt: skip
 HELD_BACK_SEED, HELD_BACK = 1001, {"salsa": 0, "crossing": 108, "crowd": 0}
-"""First of 300 frames of each sequence without a cut."""
+"""First of 300 frames without a cut, for each sequence."""
 SECONDS, RATES, CAMERAS = 4.0, (10, 15, 20, 30, 60), (2, 3, 4, 6)
 """Duration, s, frame rates, Hz, and numbers of cameras of the recordings of `who is there`."""
 
@@ -186,20 +187,21 @@ def case(name: str, segment: Segment, config: PipelineConfig = OVER_TIME) -> Cas
 
 
 def with_mean(cases: Sequence[Case], label: str = "**mean**") -> dict[str, list[Case]]:
-    """A row for each case, and one for all."""
+    """A row for each case, and one for the mean of all."""
     return {case.name: [case] for case in cases} | {label: list(cases)}
 
 
 def in_time(scale: Scale) -> Experiment:
-    """All segments, over time."""
+    """All segments, with `temporal = true`."""
     return Experiment("time", with_mean([case(each.label, each) for each in scale.segments]), COLUMNS)
 
 
 def held_back(scale: Scale) -> Experiment:
-    """Held-out people, in sequences that were made after every setting had been chosen.
+    """Held-out people, in sequences that were created after all settings had been chosen.
 
-    The dancers are the same takes as in the reported segments, which nothing is trained on; people who stand and
-    walk around them are test subjects only; places, bodies, cameras and the detector's errors are drawn anew.
+    The dancers are the same recordings as in the reported segments, which are not used for
+    training. People who stand and walk around them are test subjects only. Positions, bodies,
+    cameras and the detector's errors are from new random draws.
     """
     rows = dict[str, list[Case]]()
     segments = () if scale.mocap is None or scale.quick else held_back_segments(scale.mocap)
@@ -220,7 +222,8 @@ def held_back_segments(mocap: Path) -> list[Segment]:
 
 
 def who_is_there(scale: Scale) -> Experiment:
-    """Crowds of eight and crossings of seven before 2 to 8 cameras, at 10 to 60 frames a second; two people.
+    """Crowds of eight people and crossings of seven with 2 to 8 cameras, at 10 to 60 frames a
+    second; and two people.
 
     A row for each kind of recording, over its seeds, and for each number of cameras. Eight cameras, two people and
     single frames are measured at 30 frames a second only: single frames are independent of the rate.

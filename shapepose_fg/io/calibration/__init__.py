@@ -1,4 +1,6 @@
-"""Calibration files: reads those of many programs as a `Rig`, and writes our own rig file."""
+"""Calibration files: reads the formats of many programs as a `Rig`, and writes this project's rig
+file.
+"""
 
 from shapepose_fg.core.rig_file import RIG_FORMAT as RIG_FORMAT
 from shapepose_fg.core.rig_file import write_rig as write_rig

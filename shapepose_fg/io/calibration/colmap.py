@@ -1,4 +1,6 @@
-"""COLMAP's text model: cameras.txt and images.txt. Camera from world, without a unit and an up axis."""
+"""COLMAP's text model: cameras.txt and images.txt. Poses are camera from world; unit and up axis
+are not defined.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +18,8 @@ from shapepose_fg.io.validation import is_number
 FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")
 HALF_PIXEL = 0.5
-"""COLMAP's (0, 0) is the corner of the first pixel; ours is its centre."""
+"""Offset of pixel coordinates: COLMAP's (0, 0) is the corner of the first pixel, ours is its
+centre."""
 MODELS: dict[str, tuple[str, Lens]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "perspective"),
     "PINHOLE": ("fx fy cx cy", "perspective"),
@@ -28,7 +31,8 @@ MODELS: dict[str, tuple[str, Lens]] = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
 }
-"""COLMAP's camera models that OpenCV has, and their parameters: distortion coefficients in OpenCV's order."""
+"""COLMAP's camera models that OpenCV supports, with their parameters (distortion coefficients in
+OpenCV's order) and lens model."""
 _CURES = {
     "unit": "pass --unit (a model has no scale until colmap model_aligner or known distances between cameras"
     " determine one)",
@@ -37,7 +41,7 @@ _CURES = {
 
 
 def _read(content: Content) -> WrittenRig | None:
-    """A camera per image, in the order of images.txt; named after the image, or its folder."""
+    """A camera per image, in the order of images.txt; named after the image or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
     names = [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
     if content.syntax not in ("folder", "text") or not set(names) & {*FILES, *_BINARY}:
@@ -54,7 +58,9 @@ def _read(content: Content) -> WrittenRig | None:
 
 
 def _lenses(path: Path) -> dict[str, WrittenCamera]:
-    """The cameras of cameras.txt, without poses, by their id: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
+    """The cameras of cameras.txt by id, without poses; a line is CAMERA_ID, MODEL, WIDTH, HEIGHT,
+    PARAMS[].
+    """
     lenses = {}
     for number, line in enumerate(read_text(path, most=LARGE).splitlines(), 1):
         words = line.split()
@@ -77,7 +83,9 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
 
 
 def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]:
-    """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each followed by a line of points."""
+    """images.txt: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; each line is followed by a
+    line of points.
+    """
     every = enumerate(read_text(path, most=LARGE).splitlines(), 1)
     lines = iter([(number, line) for number, line in every if line[:1] != "#"])
     rows = []
@@ -103,7 +111,9 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
 
 
 def _names(files: Sequence[str]) -> list[str]:
-    """Names of cameras from names of images: the folders where these are unique, else the files."""
+    """Names of cameras from file names of images: the folders if these are unique, otherwise the
+    files.
+    """
     folders = [str(PurePosixPath(file).parent) for file in files]
     if "." not in folders and len(set(folders)) == len(folders):
         return folders

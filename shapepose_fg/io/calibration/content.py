@@ -1,7 +1,8 @@
-"""The content of a path, recognised by its first characters and parsed: JSON, TOML, XML, YAML, text, or a folder.
+"""Recognises the syntax of a file by its first characters, and parses it: JSON, TOML, XML, YAML,
+text, or a folder.
 
-YAML and XML of OpenCV's FileStorage become plain values and arrays. cv2.FileStorage is not used: it corrupts
-memory on damaged files (OpenCV 5.0, found by mutating files).
+YAML and XML of OpenCV's FileStorage are converted to plain values and arrays. cv2.FileStorage is
+not used, because damaged files can corrupt its memory (OpenCV 5.0, found by fuzzing).
 """
 
 import re
@@ -32,27 +33,28 @@ Syntax = Literal["JSON", "TOML", "XML", "OpenCV", "YAML", "text", "folder", "pic
 _TOML_LINE = re.compile(r"""\s*(\[\[?\s*[\w."' -]*[A-Za-z_."'][\w."' -]*\]\]?\s*(#.*)?$|[\w."'-]+\s*=)""")
 _YAML_LINE = re.compile(r"\s*(- )?[\w/.\"' -]+:(\s|$)")
 _MOST_OF_A_LINE = 1000
-"""Maximum number of characters by which a syntax is recognised; the time of these patterns grows with their
-square."""
+"""Number of characters that are used to recognise the syntax; the time of the patterns is quadratic
+in it."""
 _XML_DECLARATION = re.compile(r"<!(DOCTYPE|ENTITY)")
 _YAML_VERSION = re.compile(r"\A%YAML[^\n]*\n")
 _ARRAY_TAGS = ("opencv-matrix", "opencv-nd-matrix")
 _MOST_CHARACTERS = 2**23
-"""Maximum number of characters of a calibration; a camera has a thousand."""
+"""Maximum number of characters of a calibration file; a camera takes about a thousand."""
 _MOST_DIGITS = 100
-"""Maximum number of digits of a number: the time that YAML's base 60 takes grows with their square."""
+"""Maximum number of digits of a number: the time to parse YAML's base-60 numbers is quadratic in
+it."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a path."""
+    """Parsed content of a file or folder."""
 
     path: Path
     """The file or folder that the user named."""
     syntax: Syntax
     """Syntax of the content."""
     value: Any
-    """An object, table, XML element, or text; for a folder, its sorted paths."""
+    """The parsed value: object, table, XML element, or text; for a folder, its sorted paths."""
 
 
 def load(path: Path) -> Content:
@@ -80,15 +82,17 @@ def load(path: Path) -> Content:
 
 
 def _named(path: Path, value: Any) -> dict[str, Any]:
-    """Every node of a FileStorage by name."""
+    """All nodes of a FileStorage, by name."""
     if not isinstance(value, dict):
         raise InputError(f"{path}: this OpenCV FileStorage has no named values; write the file again")
     return {str(key): each for key, each in value.items()}
 
 
 def _parse_yaml(path: Path, text: str) -> Any:
-    """The first document that is not empty, by a loader that makes plain values and OpenCV's matrices only."""
-    text = _YAML_VERSION.sub("\n", text)  # OpenCV's first line, %YAML:1.0, is no YAML
+    """The first non-empty document, read by a loader that constructs only plain values and OpenCV's
+    matrices.
+    """
+    text = _YAML_VERSION.sub("\n", text)  # OpenCV's first line %YAML:1.0 is invalid YAML
     _refuse_long(path, text)
     try:
         _refuse_hostile(path, text)
@@ -110,8 +114,8 @@ def _refuse_long(path: Path, text: str) -> None:
 
 
 def _refuse_hostile(path: Path, text: str) -> None:
-    """InputError where nodes are very deep, or aliases are used: a few of them can stand for more than fits
-    memory.
+    """InputError for deeply nested nodes, and for aliases: a few of them can expand to more than
+    fits into memory.
     """
     depth = 0
     for event in yaml.parse(text, _Safe):
@@ -124,7 +128,9 @@ def _refuse_hostile(path: Path, text: str) -> None:
 
 
 def _parse_xml(path: Path, text: str) -> ET.Element:
-    """The root of XML without a document type: entities could make it read other files, or grow without end."""
+    """The root of an XML text without a document type: its entities could include other files, or
+    expand without limit.
+    """
     if _XML_DECLARATION.search(text):
         raise InputError(f"{path}: XML with a document type or entities is not accepted; delete the <!DOCTYPE")
     _refuse_long(path, text)
@@ -148,7 +154,9 @@ _Safe: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_Safe):
-    """A safe loader that knows OpenCV's matrices, and numbers as Python prints them (1e-05)."""
+    """A safe YAML loader that also reads OpenCV's matrices, and numbers as Python prints them
+    (1e-05).
+    """
 
 
 def _array_of_yaml(loader: Any, node: yaml.Node) -> Any:
@@ -179,7 +187,7 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _PRINTED, list("-+01234
 
 
 def _of_xml(node: ET.Element) -> Any:
-    """A node and all below it: a matrix, a map, a list, text or a number."""
+    """Convert an XML node with its children: to a matrix, a map, a list, text or a number."""
     if node.get("type_id") in _ARRAY_TAGS:
         return _array({child.tag: _of_xml(child) for child in node})
     if len(node) > 0:
@@ -195,13 +203,15 @@ def _of_xml(node: ET.Element) -> Any:
 
 
 def _array(node: dict[str, Any]) -> np.ndarray:
-    """The matrix of a node; NaN, which is no number of any camera, where its numbers do not fill its shape."""
+    """The matrix of a node; NaN, which later checks refuse, if the number of values does not match
+    its shape.
+    """
     data = node.get("data")
     sizes = node.get("sizes", [node.get("rows"), node.get("cols")])
     try:
         values = np.array(data if isinstance(data, list) else [data], dtype=np.float64)
         shape = [int(float(size)) for size in (sizes if isinstance(sizes, list) else [sizes])]
-        # The numbers of several channels stand beside each other.
+        # Values of several channels are interleaved.
         return values.reshape(shape if values.size == np.prod(shape) else [*shape, -1])
     except (TypeError, ValueError, OverflowError):
         return np.full(1, np.nan)

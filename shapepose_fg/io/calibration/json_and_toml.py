@@ -1,4 +1,6 @@
-"""Calibrations in JSON (our own rig file, 4D Association, CMU Panoptic, VoxelPose) and AniPose's kind of TOML."""
+"""Calibrations in JSON (our own rig file, 4D Association, CMU Panoptic, VoxelPose) and TOML in
+AniPose's style.
+"""
 
 import re
 from collections.abc import Mapping
@@ -38,11 +40,11 @@ _CURES = {
     **dict.fromkeys(("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of fisheyes"),
     "lens": "write perspective or fisheye",
 }
-"""Cures for values, by their names in any of the formats."""
+"""Advice for error messages, by the name of the value in any of the formats."""
 
 
 class _Camera(BaseModel, strict=True, extra="forbid"):
-    """A camera of a rig file; its numbers are checked as in all formats."""
+    """A camera of a rig file; its values are checked later, as in all formats."""
 
     name: Annotated[str, Field(min_length=1)]
     image_size: Any
@@ -71,12 +73,12 @@ class _Rig(BaseModel, strict=True, extra="forbid"):
 
 
 def _members(content: Content) -> dict[str, Any]:
-    """The object in a JSON file; empty where it holds another value."""
+    """The object in a JSON file; empty if the file has another value."""
     return content.value if content.syntax == "JSON" and isinstance(content.value, dict) else {}
 
 
 def _read_rig_file(content: Content) -> WrittenRig | None:
-    """Our own file, which holds everything that a `Rig` has."""
+    """Read this project's rig file, which has all fields of a `Rig`."""
     if "format" not in _members(content):
         return None
     if content.value["format"] != RIG_FORMAT:
@@ -108,7 +110,7 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
 
 
 def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
-    """The trajectory in the file `name` beside the rig file, in the rig's world."""
+    """Read the trajectory in the file `name` beside the rig file; poses in the world of the rig."""
     if Path(name).is_absolute() or not is_inside(path.parent, name):
         raise InputError(
             f"{path}: trajectory {name[:80]} must be in the folder of the rig file or below; move it there"
@@ -121,7 +123,9 @@ def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
 
 
 def _read_association(content: Content) -> WrittenRig | None:
-    """Zhang et al., CVPR 2020, an object of cameras: metres, z up; keys of other tools are ignored."""
+    """4D Association (Zhang et al., CVPR 2020): an object of cameras, metres, z up; keys of other
+    tools are ignored.
+    """
     members, known = _members(content).values(), {"K", "RT", "R", "T", "imgSize"}
     if not all(isinstance(each, dict) for each in members) or not any(known & each.keys() for each in members):
         return None
@@ -135,7 +139,7 @@ def _read_association(content: Content) -> WrittenRig | None:
 
 
 def _read_panoptic(content: Content) -> WrittenRig | None:
-    """The CMU studio's own file, a list of cameras: centimetres, y down, camera from world."""
+    """CMU's studio file: a list of cameras, centimetres, y down, camera from world."""
     listed = _members(content).get("cameras")
     if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
         return None
@@ -154,7 +158,9 @@ def _read_panoptic(content: Content) -> WrittenRig | None:
 
 
 def _read_voxelpose(content: Content) -> WrittenRig | None:
-    """An object or list of cameras, or under a sequence's name: mm, z up, R (X - T), distortion in two parts."""
+    """VoxelPose: an object or list of cameras, possibly under the name of a sequence; mm, z up, R
+    (X - T), distortion in two parts.
+    """
     value = content.value if content.syntax == "JSON" else None
     if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
         value = next(iter(value.values()))
@@ -175,10 +181,12 @@ def _read_voxelpose(content: Content) -> WrittenRig | None:
 
 
 def _program(tables: Mapping[str, dict[str, Any]], metadata: Mapping[str, Any]) -> str:
-    """The program that wrote a TOML file, by what only that program writes; AniPose, the plainest, by default.
+    """Identify the program that wrote a TOML file by features that only this program writes;
+    AniPose by default.
 
-    Pose2Sim writes a camera's size as floats and `fisheye = false` at the end. Caliscope writes `cam_id` or `port`
-    into its own file; in the one for AniPose cameras are named after their tables, [cam_0], and the error is 0.
+    Pose2Sim writes picture sizes as floats, and `fisheye = false` at the end. Caliscope writes
+    `cam_id` or `port` into its own file; in its file for AniPose, cameras have the names of their
+    tables, [cam_0], and the error is 0.
     """
     every = list(tables.values())
     if any("cam_id" in table or "port" in table for table in every):
@@ -203,8 +211,8 @@ _FREEMOCAP = ("charuco_", "freemocap", "groundplane_", "solver_method", "board")
 
 
 def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis | None]:
-    """Unit and up axis, from versions that write them: the board's size in mm, and z up for a board on the
-    floor.
+    """Unit and up axis of FreeMoCap's files, if its version wrote them: the board's size in mm; z
+    is up if the board was on the floor.
     """
     board = metadata.get("board")
     sizes = [*metadata, *(board if isinstance(board, dict) else ())]
@@ -213,20 +221,24 @@ def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis |
 
 
 def _tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The tables of cameras in a TOML file, by their keys."""
+    """The tables of cameras in a TOML file, by key."""
     inner = value.get("cameras")
     every = inner if isinstance(inner, dict) else value
     return {key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table}
 
 
 def wanted_tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The tables that are read: not to be ignored, and with a pose where any has one."""
+    """The tables of cameras that are read: without ignored ones, and, if any camera has a pose,
+    only those with a pose.
+    """
     tables = {key: table for key, table in _tables(value).items() if table.get("ignore") is not True}
     return {key: table for key, table in tables.items() if _POSE & table.keys()} or tables
 
 
 def _read_tables(content: Content, program: str) -> WrittenRig | None:
-    """The cameras that are not to be ignored: camera from world; keys of single programs are ignored."""
+    """Read cameras from TOML tables: camera from world. Ignored cameras, and keys of single
+    programs, are left out.
+    """
     tables = _tables(content.value) if content.syntax == "TOML" else {}
     metadata = content.value.get("metadata") if len(tables) > 0 else None
     metadata = metadata if isinstance(metadata, dict) else {}
@@ -239,7 +251,7 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
             notes.append(f"camera {table.get('name') or key} is left out: {why}")
             continue
         node = Node(table, f'{content.path}: camera "{key}"', _CURES)
-        # Caliscope's videos are called cam_0.mp4, those of its older versions port_0.mp4.
+        # Caliscope's videos are called cam_0.mp4; in older versions port_0.mp4.
         kinds = (("port", "port"), ("cam", "cam_id"))
         numbered = next((f"{kind}_{table[k]}" for kind, k in kinds if k in table), key)
         fisheye, wTc = table.get("fisheye", False), node.pose("rotation", "translation")
@@ -261,8 +273,8 @@ _DIALECTS: dict[str, tuple[Unit | None, Axis | None, dict[str, str]]] = {
     "Pose2Sim": ("m", "z", {}),
     "AniPose": (None, None, {"unit": "pass --unit, the unit of the board's squares", "up": _UP}),
 }
-"""Unit, up axis and cures per program. AniPose's world is not levelled and has the unit of the board;
-FreeMoCap's is the first camera."""
+"""Unit, up axis and advice for errors, by program. AniPose's world frame is not levelled and has
+the unit of the board; FreeMoCap's world frame is the first camera."""
 JSON_AND_TOML = (
     Format("rig file", _read_rig_file),
     Format("CMU Panoptic's JSON", _read_panoptic),

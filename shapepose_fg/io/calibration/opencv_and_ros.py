@@ -1,4 +1,6 @@
-"""OpenCV's FileStorage (its multi-view calibration, a node per camera, EasyMocap's), and ROS' camera_info."""
+"""OpenCV's FileStorage (multi-view calibration, a node per camera, EasyMocap), and ROS camera_info
+files.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,7 +18,7 @@ from shapepose_fg.io.calibration.written import Format, Node, WrittenCamera, Wri
 _FISHEYE = 1
 """OpenCV's CALIB_MODEL_FISHEYE."""
 _MOST = 2**20
-"""Maximum number of numbers of all cameras together."""
+"""Maximum number of values of all cameras together."""
 _ASK = {
     "unit": "pass --unit, the unit of the board's squares",
     "up": "pass --up (z or -z if the board lay on the floor; -y if the first camera was level)",
@@ -32,9 +34,9 @@ _STEREO_UP = "pass the axis of the first camera that points up with --up; it is 
 _SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
 _MATRICES = ("m", "k", "cameramatrix", "camera_matrix", "mtx", "intrinsic", "intrinsic_matrix")
 _BENDS = ("d", "distcoeffs", "dist_coeffs", "distortion_coefficients", "distortion", "dist", "distcoeff")
-"""Names of the distortion of a stereo pair's cameras, in small letters."""
+"""Lower-case names of the distortion coefficients of a stereo pair."""
 _GAP = ("none", "null", "")
-"""Names by which EasyMocap fills places in its list of cameras."""
+"""Names that EasyMocap uses for empty places in its list of cameras."""
 
 INTRINSIC, TURN, SHIFT = (
     "camera_matrix K intrinsic_matrix",
@@ -44,7 +46,7 @@ INTRINSIC, TURN, SHIFT = (
 BEND = "distortion_coefficients dist_coeffs distortion_vector dist D"
 _SIZE = "image_width img_width width", "image_height img_height height"
 POSE = "camera_pose_matrix"
-"""Name of MC-Calib's world from camera."""
+"""MC-Calib's name of the world-from-camera matrix."""
 
 
 def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
@@ -53,8 +55,8 @@ def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
 
 
 def _read_multiview(content: Content) -> WrittenRig | None:
-    """The file that OpenCV's multiview_calibration.py saves: camera from the first camera, in the unit of the
-    board.
+    """File saved by OpenCV's multiview_calibration.py: poses from the first camera, in the unit of
+    the board.
     """
     if content.syntax != "OpenCV" or not {"Rs", "Ts", "Ks"} <= content.value.keys():
         return None
@@ -69,7 +71,8 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     models, ids = nodes.numbers("models", count), content.value.get("cam_ids")
     fisheye = np.zeros(count, dtype=bool) if models is None else models == _FISHEYE
     numbers = nodes.needed("distortions", most=_MOST)
-    # The coefficients stand one after the other: four of a fisheye, equally many of every other camera.
+    # All coefficients are in one list: four per fisheye camera, and an equal number for each other
+    # camera.
     plain = (len(numbers) - 4 * fisheye.sum()) / max(1, (~fisheye).sum())
     if plain != int(plain) or plain < 0:
         raise nodes.refuse(
@@ -89,10 +92,12 @@ def _read_multiview(content: Content) -> WrittenRig | None:
 
 
 def _read_stereo(content: Content) -> WrittenRig | None:
-    """Two cameras as OpenCV's stereo sample saves them: M1 D1 M2 D2, and R T from the first to the second.
+    """Two cameras as saved by OpenCV's stereo sample: M1 D1 M2 D2, and R T from the first to the
+    second.
 
-    In one file, or in intrinsics.yml and extrinsics.yml; M may be K or cameraMatrix, 1 and 2 left and right.
-    The world is the first camera, in the unit of the board.
+    They are in one file, or in intrinsics.yml and extrinsics.yml. M may be called K or
+    cameraMatrix; 1 and 2 may be left and right. The world frame is the first camera, in the unit of
+    the board.
     """
     values, places = dict[str, Any](), [content.path]
     if content.syntax in ("OpenCV", "YAML", "JSON") and isinstance(content.value, dict):
@@ -124,13 +129,13 @@ def _read_stereo(content: Content) -> WrittenRig | None:
 
 
 def _of_side(values: Mapping[str, Any], names: Sequence[str], side: str) -> str | None:
-    """The key of one of `names` for a side of a stereo pair: m1, m_1, or 1_m."""
+    """The key of one of `names` for one side of a stereo pair: m1, m_1, or 1_m."""
     keys = (key for name in names for key in (f"{name}{side}", f"{name}_{side}", f"{side}_{name}"))
     return next((key for key in keys if values.get(key) is not None), None)
 
 
 def _read_nodes(content: Content) -> WrittenRig | None:
-    """Cameras with a node, or a file, each, of MC-Calib or written by hand: K, distortion, size and pose."""
+    """One node or file per camera (MC-Calib or hand-written): K, distortion, size and pose."""
     nodes = content.value if content.syntax == "OpenCV" else {}
     if content.syntax == "folder":
         files = _loaded(content, ".yml .yaml .xml").values()
@@ -167,7 +172,9 @@ def _named(inner: Node, name: str) -> bool:
 
 
 def _read_easymocap(content: Content) -> WrittenRig | None:
-    """EasyMocap's intri.yml and extri.yml, metres, z up: the cameras in the order of the names in the first."""
+    """EasyMocap's intri.yml and extri.yml, metres, z up; the cameras in the order of `names` in
+    intri.yml.
+    """
     paths = content.value if content.syntax == "folder" else [content.path]
     halves_of = [path for path in paths if re.search(r"(intri|extri).*\.ya?ml$", path.name)]
     values = [content.value] if content.syntax == "OpenCV" else []
@@ -189,11 +196,11 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
     names = inner.values.get("names")
     if not isinstance(names, list) or not all(isinstance(name, str | int | None) for name in names):
         raise inner.refuse("names", "must be a list of the cameras' names")
-    # EasyMocap leaves a gap between cameras by that name, and passes over it.
+    # EasyMocap marks gaps in its list of cameras with this name, and ignores them.
     wanted = [str(name) for name in names if str(name).lower() not in _GAP or _named(inner, str(name))]
     cameras = []
     for number, name in enumerate(wanted, 1):
-        # EasyMocap writes K_<name>; Pose2Sim's writer numbers them from 1.
+        # EasyMocap writes K_<name>; Pose2Sim's writer numbers the cameras from 1.
         def tagged(kind: str, name: str = name, number: int = number) -> list[str]:
             return [f"{kind}_{name}", f"{kind}_{number}"]
 
@@ -210,21 +217,21 @@ _LENSES: dict[str, Lens] = {
     **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "perspective"),
     **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
-"""ROS' distortion models that OpenCV has."""
+"""ROS distortion models that OpenCV supports."""
 _POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
 
 
 def is_info(value: Any) -> bool:
-    """Whether this is a file of ROS' camera_calibration, or an echoed CameraInfo message."""
+    """Whether the content is a file of ROS camera_calibration, or an echoed CameraInfo message."""
     known = isinstance(value, dict)
     return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
 
 
 def _read_ros(content: Content) -> WrittenRig | None:
-    """The cameras in the order of their files' names, metres, z up (REP 103).
+    """ROS camera files, sorted by name; metres, z up (REP 103).
 
-    `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or TransformStamped: the
-    camera's optical frame in the world, so world from camera.
+    `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or
+    TransformStamped: the pose of the camera's optical frame in the world (world from camera).
     """
     if content.syntax == "YAML" and (is_info(content.value) or message_of(content.value) is not None):
         what = "the intrinsics" if is_info(content.value) else "the pose"
@@ -250,7 +257,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
                 f"{path}: distortion_model {model} is not supported; use plumb_bob, rational_polynomial or"
                 " equidistant"
             )
-        # A matrix is a list of numbers, or has one under `data`.
+        # A matrix is a list of values, or an object with the list under `data`.
         plain = {key: each.get("data") if isinstance(each, dict) else each for key, each in value.items()}
         node = Node(plain, str(path), {"": "run the calibration again"})
         size = "image_width width", "image_height height"
@@ -260,7 +267,7 @@ def _read_ros(content: Content) -> WrittenRig | None:
 
 
 def _ros_pose(path: Path, value: Any) -> Array:
-    """World from camera, of a message with translation and rotation."""
+    """World from camera, from a message with translation and rotation."""
     message = message_of(value)
     if message is None:
         raise InputError(f"{path}: this is neither a camera_info nor a pose of ROS; {_POSE_CURE}")
@@ -280,7 +287,7 @@ def _ros_pose(path: Path, value: Any) -> Array:
 
 
 def message_of(value: Any) -> tuple[Any, Any] | None:
-    """Translation and rotation of a pose, for any depth of stamped messages."""
+    """Translation and rotation of a pose message, nested in stamped messages of any depth."""
     if isinstance(value, dict) and isinstance(value.get("transforms"), list):
         value = value["transforms"][0] if len(value["transforms"]) == 1 else None
     while isinstance(value, dict):

@@ -1,4 +1,6 @@
-"""Reads calibration files as a `Rig`: recognises the format, and asks for what the file does not state."""
+"""Reads calibration files as a `Rig`: recognises the format, and names values that the user must
+give because the file does not define them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,17 +22,17 @@ from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
-"""All known formats; the first one that recognises a file reads it."""
+"""All known formats, in the order in which they are tried."""
 
 _MISSING = {
     "unit": "pass --unit m, cm or mm",
     "up": "pass --up with the axis that points up (x -x y -y z -z)",
     "image_size": "pass --image-size WIDTHxHEIGHT, the size of the calibrated pictures in pixels",
 }
-"""Information that the user can give, and how, in the order of the sentence."""
+"""Values that the user can give, and the option for each, in the order of the error message."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of numbers like 1e300, which are refused
+@np.errstate(over="ignore", invalid="ignore")  # from numbers such as 1e300, which are refused
 def read_rig(
     path: str | Path,
     *,
@@ -42,11 +44,12 @@ def read_rig(
 ) -> Rig:
     """Read the cameras of a calibration file or folder; the format is recognised by the content.
 
-    The formats are `FORMATS`; docs/conventions.md lists their units and up axes. `up` and `unit` override the
-    file. `image_size` (width, height) is for formats that do not state the size of the pictures. `cameras` are the
-    names of those to read, all by default, and `without` of those to leave out. Information that neither the file
-    nor the caller gives is an InputError: one sentence that names the file, the key and the cure. `notes` of the
-    rig say what was left out.
+    The formats are `FORMATS`; docs/conventions.md lists their units and up axes. `up` and `unit`
+    override the file. `image_size` (width, height) is for formats that do not state the size of the
+    pictures. `cameras` are names of the cameras to read, all by default; `without` are names of
+    cameras to leave out. InputError, one sentence that names the file, the key and the cure, if a
+    required value is given neither by the file nor by the caller. `notes` of the rig list what was
+    left out.
     """
     path = Path(path)
     for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
@@ -86,13 +89,15 @@ def read_rig(
 
 
 def recognised(content: Content) -> tuple[Format, WrittenRig] | None:
-    """The first format that has this content, and the cameras; None where it is none. InputError where damaged."""
+    """The first format that recognises the content, and its cameras; None for an unknown format.
+    InputError if damaged.
+    """
     read = ((each, each.read(content)) for each in FORMATS)
     return next(((form, written) for form, written in read if written is not None), None)
 
 
 def carried(rig: Rig) -> Rig:
-    """The rig with each moving camera at the start of its trajectory."""
+    """The rig with the pose of each moving camera set to the start of its trajectory."""
     if not rig.moves:
         return rig
     first = {each.name: each.wTb[0] for each in rig.trajectories}
@@ -101,9 +106,10 @@ def carried(rig: Rig) -> Rig:
 
 
 def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
-    """The rig with cameras that move as in `given`, `CAMERA=FILE` each: the file has the camera's own poses.
+    """The rig with moving cameras as in `given`, a list of `CAMERA=FILE`: the file has the poses of
+    the camera itself.
 
-    The calibration's poses of these cameras are ignored. InputError where a file cannot be used.
+    The calibrated poses of these cameras are ignored. InputError if a file cannot be used.
     """
     cameras, trajectories = {each.name: each for each in rig.cameras}, list(rig.trajectories)
     for each in given:
@@ -125,7 +131,7 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
 
 @np.errstate(over="ignore", invalid="ignore")
 def is_calibration(path: Path) -> bool:
-    """Whether a file or folder has one of the formats, though it may be damaged."""
+    """Whether a file or folder has one of the formats; it may be damaged."""
     try:
         content = load(path)
     except InputError:
@@ -137,7 +143,9 @@ def is_calibration(path: Path) -> bool:
 
 
 def _unknown(content: Content) -> str:
-    """A sentence on what was found instead of a calibration, and on the known formats."""
+    """A sentence about the actual content of a path that is no calibration, and about the known
+    formats.
+    """
     value = content.value
     if content.syntax == "folder":
         return (

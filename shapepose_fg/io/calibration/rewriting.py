@@ -1,7 +1,8 @@
-"""Replaces the numbers of cameras in the files of a calibration: XML, OpenCV's and ROS' YAML, COLMAP's text.
+"""Replaces the values of cameras in existing calibration files: XML, YAML of OpenCV and ROS,
+COLMAP's text.
 
-Each function returns the texts of the files by their paths; what does not fit is left unchanged, and the caller
-reads the result back.
+Each function returns the new texts of the files by path. Values that cannot be written are left
+unchanged; the caller reads the files back to check them.
 """
 
 import re
@@ -52,7 +53,7 @@ def _numbers(values: ArrayLike) -> str:
 
 
 def _set(element: ET.Element | None, names: str, values: ArrayLike) -> None:
-    """Attributes, a number each."""
+    """Set numeric attributes `names` of an XML element to `values`."""
     if element is not None:
         for name, value in zip(names.split(), np.ravel(values).tolist(), strict=True):
             element.set(name, repr(value))
@@ -90,7 +91,9 @@ def _vicon(content: Content, rig: Rig, metres: float) -> Files:
 
 
 def _matrices(text: str, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
-    """FileStorage's text; matrices are replaced for which `value(keys, count)` is one, keys from the outermost."""
+    """FileStorage's text with new matrices: `value(keys, count)` returns a new matrix or None; keys
+    are the outermost first.
+    """
     if text.lstrip().startswith("<"):
         return _matrices_of_xml(text, value)
     pieces, above, place = list[str](), list[tuple[int, str]](), 0
@@ -130,7 +133,7 @@ def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLik
 
 
 def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
-    """The `count` numbers of a camera that programs store under `name`; None for unknown names."""
+    """The `count` values of a camera that programs store under `name`; None for unknown names."""
     R, cTw, wTc = camera.cTw[:, :3], camera.cTw.copy(), camera.wTc.copy()
     cTw[:, 3] /= metres
     wTc[:3, 3] /= metres
@@ -141,8 +144,8 @@ def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLik
 
 
 def _opencv(content: Content, rig: Rig, metres: float) -> Files:
-    """FileStorage: matrices of all cameras, of one whose name or number ends their own (EasyMocap), or of the one
-    that the node or the file around them is called after.
+    """Rewrite a FileStorage: matrices of all cameras; of the camera whose name or number is the
+    suffix of the matrix's name (EasyMocap); or of the camera after which the node or file is named.
     """
     V, tags = len(rig), {str(n): camera for n, camera in enumerate(rig.cameras, 1)}
     tags |= (cameras := dict(zip(rig.names, rig.cameras, strict=True)))
@@ -155,7 +158,7 @@ def _opencv(content: Content, rig: Rig, metres: float) -> Files:
             return numbers_of(tagged[name].split()[0], tags[tag], metres, count)
         if whose in cameras or key not in of_all:
             return numbers_of(key, cameras[whose], metres, count) if whose in cameras else None
-        # Four coefficients of a fisheye, equally many of every other camera.
+        # Four coefficients per fisheye camera, and an equal number for each other camera.
         kind, four = of_all[key], [key == "distortions" and camera.lens == "fisheye" for camera in rig.cameras]
         each, rest = divmod(count - 4 * sum(four), max(V - sum(four), 1))
         counts = zip(rig.cameras, [4 if short else each for short in four], strict=True)
@@ -210,7 +213,7 @@ def _colmap(content: Content, rig: Rig, metres: float) -> Files:
     cameras, place, of = list(rig.cameras), 0, dict[str, Camera]()
     for number, line in enumerate(outer):
         words = line.split(maxsplit=9)
-        # Every image is followed by a line of points, which may be empty.
+        # Each line of an image is followed by a line of points, which may be empty.
         if line.startswith("#") or place % 2 == 1 or len(words) != 10:
             place += not line.startswith("#") and place % 2 == 1
             continue
@@ -239,4 +242,4 @@ REWRITTEN: dict[str, Callable[[Content, Rig, float], Files]] = {
     COLMAP.name: _colmap,
     ROS.name: _ros,
 }
-"""Functions that rewrite each format, by its name."""
+"""Rewriting functions, by name of the format."""

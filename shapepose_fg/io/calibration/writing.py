@@ -1,5 +1,5 @@
-"""Writes a calibration in the format that it was read in; what that format cannot hold goes into our own rig
-file.
+"""Writes a calibration in the format from which it was read, or, if this format lacks something, as
+this project's rig file.
 """
 
 import json
@@ -27,19 +27,20 @@ _SEVERAL = (OPENCV[0].name, COLMAP.name)
 """Formats that consist of several files."""
 _YAML = (".yml", ".yaml")
 _DIGITS, _DIGITS_PX = 1e-6, 1e-4
-"""Tolerances of what is read back: metres and numbers without unit, pixels."""
+"""Tolerances when the file is read back: for metres and numbers without unit, and for pixels."""
 _TABLE = re.compile(r"\s*\[\s*(?P<key>[^\]]+?)\s*\]\s*(#.*)?$")
 _ENTRY = re.compile(r"(?P<head>\s*(?P<name>matrix|rotation|translation|distortions)\s*=\s*)")
 
 
 def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -> tuple[str, Path]:
-    """Write `rig`, which was read from `source` and changed, to `target`; returns the format's name and
-    where it is.
+    """Write `rig`, which was read from `source` and then changed, to `target`; returns the format's
+    name and the written path.
 
-    Poses, intrinsics and distortions are replaced, the rest stays. Formats of several files become a folder:
-    `target` has no ending then. `unit` is what `read_rig` was told. What does not read back as `rig`, because a
-    format has no place for it, is written in an unusual way, or `rig` has only some of the cameras, is written as
-    our own rig file, with the ending .json. InputError where `check_target` raises it.
+    Poses, intrinsics and distortions are replaced; the rest of the file is unchanged. For formats
+    of several files, `target` is a folder, without file extension. `unit` is the argument given to
+    `read_rig`. The file is read back; if the result is not equal to `rig` (the format lacks a
+    field, the file is unusual, or `rig` has only some of its cameras), this project's rig file is
+    written instead, with the extension .json. Raises InputError as `check_target` does.
     """
     check_target(source, target)
     content, form, written = _found(source)
@@ -71,7 +72,9 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
 
 
 def check_target(source: Path, target: Path) -> None:
-    """InputError where `target` has a suffix that is neither that of `source`'s format nor .json, our own."""
+    """InputError if `target` has neither the suffix of `source`'s format nor .json (this project's
+    rig file).
+    """
     _, form, _ = _found(source)
     several = source.is_dir() or form.name in _SEVERAL
     ending, own = target.suffix.lower(), source.suffix.lower()
@@ -93,7 +96,7 @@ def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
 
 
 def _own(rig: Rig, target: Path) -> tuple[str, Path]:
-    """Write a rig file of our own, under the name of `target` where that has its ending or none."""
+    """Write this project's rig file to `target`, with its suffix replaced by .json if necessary."""
     file, number = target, 0
     while file.suffix.lower() != ".json" or (file != target and file.exists()):
         stem = target.name.removesuffix("".join(target.suffixes[-2:]))
@@ -110,7 +113,7 @@ def _write(files: dict[Path, str], target: Path, *, several: bool) -> None:
 
 
 def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
-    """Whether the cameras of a file are those of a rig, within the precision of the file."""
+    """Whether the cameras of a file equal those of a rig, within the precision of the file."""
     if [each.name for each in written.cameras] != list(rig.names):
         return False
     for each, camera in zip(written.cameras, rig.cameras, strict=True):
@@ -126,7 +129,9 @@ def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
 
 
 def _entries(value: Any) -> list[dict[str, Any]]:
-    """The cameras in JSON, in the order in which they are read: a list or an object of them, or a list in one."""
+    """The cameras in a JSON value, in the order in which they are read: from a list, an object, or
+    a list in an object.
+    """
     if isinstance(value, dict):
         lists = [
             each for key, each in value.items() if isinstance(each, list) and (key == "cameras" or len(value) == 1)
@@ -136,9 +141,9 @@ def _entries(value: Any) -> list[dict[str, Any]]:
 
 
 def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:
-    """Replace the numbers of a camera in its entry, each in the shape that it has there."""
+    """Replace the values of a camera in its entry, preserving the shape of each value."""
     own = dict[str, ArrayLike]()
-    if "fx" in entry:  # VoxelPose, where T is the centre: R (X - T)
+    if "fx" in entry:  # VoxelPose: T is the camera's centre, R (X - T)
         own = dict(zip(("fx", "cx", "fy", "cy"), camera.K[[0, 0, 1, 1], [0, 2, 1, 2]], strict=True))
         d = np.r_[camera.distortion, np.zeros(14)]
         own |= {"k": d[[0, 1, 4]], "p": d[2:4], "T": camera.centre / metres}
@@ -149,11 +154,11 @@ def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:
 
 
 def _toml(source: Path, content: Content, rig: Rig, metres: float) -> str:
-    """The file with the numbers of each camera's table replaced, line by line."""
+    """The TOML text with the values of each camera's table replaced, line by line."""
     tables = wanted_tables(content.value)
     cameras, camera, lines, depth = dict(zip(tables, rig.cameras, strict=True)), None, [], 0
     for line in read_text(source).splitlines():
-        if depth > 0:  # the rest of a value that was replaced
+        if depth > 0:  # rest of a replaced value
             depth += line.count("[") - line.count("]")
             continue
         if (table := _TABLE.match(line)) is not None:

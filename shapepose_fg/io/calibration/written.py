@@ -1,4 +1,6 @@
-"""A calibration as the file states it: poses in the file's own unit, and missing information left open."""
+"""The content of a calibration file before conversion: poses in the unit of the file, missing
+values as None.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +26,8 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit, metres."""
 
 _EXACT = 1e-12
-"""Deviation below which a rotation is kept as written, so that a rig that is written and read stays the same."""
+"""Deviation from orthonormal below which a rotation is not changed, so that writing and reading a
+rig is lossless."""
 _MOST_COEFFICIENTS = 14
 
 
@@ -39,18 +42,18 @@ class WrittenCamera:
     wTc: Array
     """(4, 4) world-from-camera pose in the file's unit; x right, y down, z forward."""
     image_size: tuple[int, int] | None
-    """Width and height of the picture, pixels; None where the file does not state them."""
+    """Width and height of the picture, pixels; None if the file does not state them."""
     distortion: Sequence[float] = ()
-    """Coefficients in OpenCV's order; missing ones at the end are 0."""
+    """Coefficients in OpenCV's order; missing trailing ones are 0."""
     lens: Lens = "perspective"
     """Lens model of the coefficients."""
     readout_s: float = 0.0
-    """Time that the shutter takes from the first row of a picture to the last, seconds."""
+    """Readout time of a rolling shutter, from the first row of a picture to the last, seconds."""
     trajectory: str = ""
     """The name of the trajectory that carries the camera; `wTc` is then the pose on the carrier."""
 
     def finished(self, metres: float, image_size: tuple[int, int] | None, path: Path) -> Camera:
-        """The camera in metres; InputError where its numbers are those of no camera."""
+        """Convert to a camera in metres; InputError if its values are not valid for a camera."""
         wTc = self.wTc.copy()
         wTc[:3, 3] *= metres
         size = self.image_size or image_size or (0, 0)
@@ -67,52 +70,55 @@ class WrittenRig:
     cameras: Sequence[WrittenCamera]
     """The cameras in the order of the file."""
     unit: Unit | None
-    """Unit of the translations; None where the file and its format do not say."""
+    """Unit of the translations; None if neither the file nor its format defines it."""
     up: Axis | None
-    """Axis that points up; None where the file and its format do not state it."""
+    """Axis that points up; None if neither the file nor its format defines it."""
     cures: Mapping[str, str] = field(default_factory=dict)
-    """Cures for missing information, by field: "unit", "up" or "image_size"."""
+    """Advice for error messages about missing values, by field: "unit", "up" or "image_size"."""
     trajectories: Sequence[Trajectory] = ()
     """Trajectories of the carriers of cameras."""
     notes: Sequence[str] = ()
-    """Notes, a sentence each, on what was left out of the file or assumed."""
+    """Notes, a sentence each, on ignored parts of the file and on assumptions."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of calibrations."""
+    """A calibration format."""
 
     name: str
     """Name of the format, for messages."""
     read: Callable[[Content], WrittenRig | None]
-    """The cameras; None where the content is of another format, InputError where it is of this one and faulty."""
+    """Function that reads the cameras; None if the content has another format, InputError if it is
+    damaged."""
 
 
 @dataclass(frozen=True)
 class Node:
-    """Named values of a file. Anything wrong with one is an InputError with place, name and cure."""
+    """Named values of a file, with checked access. An invalid value raises InputError with place,
+    name and cure.
+    """
 
     values: Mapping[str, Any]
-    """Numbers, lists of them, arrays, and other things; None counts as missing."""
+    """Numbers, lists of numbers, arrays, and other values; None counts as missing."""
     place: str
-    """The file, and the camera in it."""
+    """File, and camera in it, for messages."""
     cures: Mapping[str, str] = field(default_factory=dict)
-    """Cures by name; under the empty name for all others."""
+    """Advice for error messages by name; under "" for all other names."""
 
     def refuse(self, name: str, problem: str) -> InputError:
-        """An error about one of the values."""
+        """An error about the value `name`."""
         cure = self.cures.get(name.partition("[")[0], self.cures.get("", "correct it in the file"))
         return InputError(f"{self.place}: {name} {problem}; {cure}")
 
     def named(self, names: str | Sequence[str]) -> str | None:
-        """The first of several names, separated by spaces, that has a value."""
+        """The first of several names, separated by spaces, that exists in the file."""
         every = names.split() if isinstance(names, str) else names
         return next((name for name in every if self.values.get(name) is not None), None)
 
     def numbers(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array | None:
-        """The numbers, flat, under the first existing one of `names`; None where none exists.
+        """The values under the first existing one of `names`, flattened; None if none exists.
 
-        They are finite, and as many as one of `counts`, or at most `most` of them.
+        InputError unless they are finite, and their number is one of `counts`, or at most `most`.
         """
         name = self.named(names)
         if name is None:
@@ -132,7 +138,7 @@ class Node:
         return found
 
     def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array:
-        """Return `numbers` that must be there; InputError where they are missing."""
+        """Like `numbers`, but InputError if they are missing."""
         found = self.numbers(names, *counts, most=most)
         if found is None:
             raise self.refuse(names.split()[0] if isinstance(names, str) else names[0], "is missing")
@@ -148,7 +154,9 @@ class Node:
         lens: Lens = "perspective",
         most: int = _MOST_COEFFICIENTS,
     ) -> WrittenCamera:
-        """A camera at `wTc`; its intrinsics by their names, `size` by that of a list of two numbers, or by two."""
+        """A camera with the pose `wTc`. Intrinsics are read by their names; `size` is the name of a
+        list of two values, or two names.
+        """
         sides = [self.numbers(each, 2 if len(size) == 1 else 1) for each in size]
         given = [round(side) for each in sides if each is not None for side in each]
         K_flat, coefficients = self.needed(K, 9), self.numbers(distortion, most=most)
@@ -157,24 +165,26 @@ class Node:
         return WrittenCamera(name, K_flat.reshape(3, 3), wTc, image_size, listed, lens)
 
     def pose(self, R: str, t: str, *, centre: bool = False) -> Array:
-        """World from camera, of a rotation (9 numbers, or axis times angle) and a translation, or `centre`."""
+        """World from camera, from a rotation (9 values, or a rotation vector) and a translation, or
+        the camera's `centre`.
+        """
         turn, shift = self.needed(R, 9) if centre else self.needed(R, 9, 3), self.needed(t, 3)
         return pose(turn, shift, self.named(R) or R, self.place, centre=centre)
 
     def pose_of_rows(self, name: str) -> Array:
-        """World from camera, of camera from world as 3 x 4 numbers."""
+        """World from camera, from a 3 x 4 camera-from-world matrix."""
         cTw = self.needed(name, 12).reshape(3, 4)
         return pose(cTw[:, :3], cTw[:, 3], name, self.place)
 
     def pose_of_matrix(self, name: str) -> Array:
-        """World from camera as written, 4 x 4 numbers."""
+        """World from camera, from a 4 x 4 world-from-camera matrix."""
         wTc = self.needed(name, 16).reshape(4, 4)
         if np.any(wTc[3] != (0, 0, 0, 1)):
             raise self.refuse(name, "must have the last row 0 0 0 1")
         return pose(wTc[:3, :3], wTc[:3, 3], name, self.place, world_from_camera=True)
 
     def _flat(self, name: str, value: Any) -> Iterator[float]:
-        """All numbers of a value; `name` says where it is."""
+        """All numbers in a value; `name` is used in messages."""
         if isinstance(value, list | np.ndarray):
             for index, each in enumerate(value.tolist() if isinstance(value, np.ndarray) else value):
                 yield from self._flat(f"{name}[{index}]", each)
@@ -191,9 +201,9 @@ def pose(
 ) -> Array:
     """The world-from-camera matrix (4, 4) of a rotation and a translation (3), or the camera's `centre`.
 
-    They are camera-from-world unless said otherwise. `R` is a matrix (nine numbers in any shape, row by row) or
-    a rotation vector (three, axis times angle). InputError where it is no rotation: `key` is its name in the
-    file, `place` the file and the camera.
+    They are camera-from-world, unless `world_from_camera` is set. `R` is a matrix (nine values in
+    any shape, row by row) or a rotation vector (three values, axis-angle). InputError if it is no
+    rotation; `key` is its name in the file, `place` the file and the camera.
     """
     R, t = np.asarray(R, dtype=np.float64).ravel(), np.asarray(t, dtype=np.float64).ravel()
     R = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64) if R.size == 3 else R.reshape(3, 3)
@@ -212,7 +222,7 @@ def pose(
 
 
 def rotation_of(quaternion: ArrayLike, key: str, place: str) -> Array:
-    """The rotation matrix (3, 3) of a quaternion x y z w; InputError where it is not of length 1."""
+    """The rotation matrix (3, 3) of a quaternion x y z w; InputError if its norm is not 1."""
     length = float(np.sqrt(np.square(quaternion).sum()))
     if not abs(length - 1) <= ROTATION_TOLERANCE:
         raise InputError(f"{place}: the quaternion {key} must have length 1, got {length:.4g}; write it again")

@@ -25,25 +25,28 @@ from shapepose_fg.io.validation import is_number
 _RESOLUTION = "video_resolution"
 _QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
 QTM_CAMERAS, NEXUS_CAMERAS = ("cameras/camera", "model"), ("Camera", "TYPE")
-"""Paths of cameras, and the attribute by which video cameras are recognised."""
+"""XML paths of cameras, and the attribute that identifies video cameras."""
 SUBPIXEL = 64.0
-"""QTM counts focal lengths and centres in 64ths of a pixel."""
+"""Units per pixel of QTM's focal lengths and principal points."""
 _FULL = (1080, 1440, 2160)
-"""Numbers of lines of full sensors that QTM names; no smaller sensor makes videos."""
+"""Numbers of lines of full sensors in QTM's resolution names; no video camera has a smaller sensor."""
 _CROPPED = 8
-"""Largest difference between the lines of a cropped picture and those of its resolution's name: 1080p has 1088."""
+"""Largest difference between the number of lines of a picture and that in its resolution's name:
+1080p has 1088 lines."""
 _LINES = re.compile(r"(\d{3,4})[pi]", re.ASCII)
 _VIDEO = ("video", "hybrid", "none")
-"""Words in the models of video cameras: Miqus Video (Plus), Miqus Hybrid; none is unknown."""
+"""Words in the models of video cameras: Miqus Video (Plus), Miqus Hybrid; "none" means unknown."""
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-"""QTM's cameras have y up and look along -z."""
+"""Conversion from QTM's camera axes (y up, looking along -z) to OpenCV's."""
 DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
 
 
 def _cameras(
     content: Content, root: str, path: str, model: str, name: str, read: Callable[[ET.Element, str], WrittenCamera]
 ) -> WrittenRig | None:
-    """The video cameras where the file distinguishes them by `model` from marker cameras, else all of them."""
+    """Read the video cameras if `model` distinguishes them from marker cameras, otherwise all
+    cameras.
+    """
     if content.syntax != "XML" or content.value.tag != root or content.value.find(path.split("/")[0]) is None:
         return None
     cameras, used = [], chosen(content.value, path, model)
@@ -100,7 +103,7 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
 
     window = values("fov_video", "left top right bottom")
     turn = values("transform", "r11 r12 r13 r21 r22 r23 r31 r32 r33").reshape(3, 3)
-    # R = diag(1, -1, -1) M, and the centre is x y z.
+    # R = diag(1, -1, -1) M; the centre is x y z.
     R = TO_OPENCV @ turn
     wTc = pose(R, values("transform", "x y z"), "transform", place, centre=True)
     fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / SUBPIXEL
@@ -112,10 +115,11 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
 
 
 def scale_of(camera: ET.Element) -> float:
-    """Pixels of a camera's pictures per pixel of its sensor, in which all numbers of the file are.
+    """Scale of a camera's pictures: pixels of the picture per pixel of the sensor. All values in
+    the file are in sensor pixels.
 
-    Pictures of fewer lines than the sensor's are resized, as Pose2Sim's read_qca has it, except those of a window
-    of so many lines. 1 where the file names no resolution.
+    Pictures with fewer lines than the sensor are resized (as in Pose2Sim's read_qca), unless the
+    region of interest has this number of lines. 1 if the file has no resolution.
     """
     named = _LINES.fullmatch(camera.get(_RESOLUTION, ""))
     if named is None:
@@ -128,7 +132,7 @@ def scale_of(camera: ET.Element) -> float:
 
 
 def _lines(camera: ET.Element, tag: str) -> float | None:
-    """The shorter side of a window of the sensor, pixels; None where the file does not say it."""
+    """Shorter side of the sensor's region of interest, pixels; None if it is not in the file."""
     found = camera.find(tag)
     sides = [] if found is None else [found.get(side, "") for side in ("left", "right", "top", "bottom")]
     if len(sides) == 0 or not all(map(is_number, sides)):
@@ -138,7 +142,9 @@ def _lines(camera: ET.Element, tag: str) -> float | None:
 
 
 def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
-    """By the first key frame: ORIENTATION turns the world's axes into the camera's, POSITION is the centre."""
+    """Camera of the first key frame: ORIENTATION rotates world axes to camera axes, POSITION is the
+    centre.
+    """
     key_frame = camera.find("KeyFrames/KeyFrame")
     if key_frame is None:
         raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate or delete it")
@@ -153,8 +159,9 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     R = rotation_of(frame.needed("ORIENTATION", 4), "ORIENTATION", place)
     wTc = pose(R, frame.needed("POSITION", 3), "ORIENTATION", place, centre=True)
     distortion = list[float]()
-    # VICON_RADIAL2 is a name, a centre and three radial coefficients, those of OpenCV; the older VICON_RADIAL
-    # counts in pixels and runs the other way, so that it is read only where it is zero.
+    # VICON_RADIAL2 has a name, a centre and three radial coefficients, those of OpenCV. The older
+    # VICON_RADIAL is in pixels and maps in the other direction, so it is accepted only if it is
+    # zero.
     name, _, radial = key_frame.get("VICON_RADIAL2", "").strip().partition(" ")
     if name:
         numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed("VICON_RADIAL2", 5)

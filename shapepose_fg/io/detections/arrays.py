@@ -1,4 +1,6 @@
-"""Detections in arrays: FreeMoCap's NumPy file of all cameras, HDF5 of SLEAP and DeepLabCut; never a pickle."""
+"""Detections in arrays: FreeMoCap's NumPy file of all cameras, HDF5 of SLEAP and DeepLabCut;
+pickles are never read.
+"""
 
 import pickletools
 from collections.abc import Iterator
@@ -19,15 +21,16 @@ from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 _FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF5", "DeepLabCut's HDF5"
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
-"""Maximum number of values in a file: an hour of four cameras with MediaPipe's 553 points at 30 Hz has as many."""
+"""Maximum number of values in a file: as many as one hour of four cameras with MediaPipe's 553
+points at 30 Hz."""
 _SMALL_BYTES = 2**27
-"""Size up to which an array of a compressed file counts as small, bytes."""
+"""Total size of a file's arrays, bytes, up to which the compression ratio is not limited."""
 _MOST_CAMERAS = 1000
 _MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
 _TABLE = "df_with_missing/table"
-"""Path of the table of DeepLabCut and AniPose."""
+"""Path of the table in files of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
-"""HDF5's reference to a text of variable length: its length, and its place."""
+"""HDF5's reference to a text of variable length: its length and its address."""
 _HDF5 = "an HDF5 file, of which only SLEAP's analysis files and DeepLabCut's tables are supported; give the CSV"
 _FREEMOCAP_3D = (
     "FreeMoCap's table of 3D points, but its 2D points are needed; give the recording's folder, or"
@@ -51,7 +54,9 @@ _OTHERS = {
 
 
 def what_it_is(path: Path) -> str | None:
-    """A sentence on what an unsupported file is, and how to convert it; None where its suffix is unknown."""
+    """A sentence that identifies an unsupported file and names a way to convert it; None if its
+    suffix is unknown.
+    """
     known = next((what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None)
     if known is None:
         return None
@@ -62,8 +67,9 @@ def what_it_is(path: Path) -> str | None:
 def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
     """Detections of one person in camera number `camera` of `cameras`, in the order of the calibration.
 
-    The file is (cameras, frames, points, 2 or 3): pixels, NaN where nobody is seen; a third number is a score
-    where it lies between 0 and 1, else MediaPipe's depth, which is not used. InputError naming file and cure.
+    The file is (cameras, frames, points, 2 or 3): pixels, NaN for points that were not detected. A
+    third number is a score if all are between 0 and 1, otherwise MediaPipe's depth, which is
+    ignored. InputError naming file and cure.
     """
     with open_regular(path) as stream:
         shape, dtype, fortran, offset = _header(path, stream)
@@ -96,16 +102,18 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
 
 
 def cameras_of_freemocap(path: Path) -> list[str]:
-    """Names for the cameras of FreeMoCap's file, by their order. InputError as `read_freemocap`."""
+    """Names for the cameras of FreeMoCap's file, numbered in its order. Raises InputError as
+    `read_freemocap` does.
+    """
     with open_regular(path) as stream:
         return [f"cam_{n}" for n in range(min(_header(path, stream)[0][0], _MOST_CAMERAS))]
 
 
 def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:
-    """Shape, type and order of the array in an .npy file, and where its numbers begin."""
+    """Shape, type and memory order of the array in an .npy file, and the offset of its values."""
     try:
         shape, fortran, dtype = read_npy_header(stream)
-    except Exception:  # NumPy parses the header as Python's own text, with all errors of that
+    except Exception:  # NumPy evaluates the header as a Python literal, which raises many kinds of errors
         raise InputError(f"{path}: this is not a NumPy array, but {what_it_is(path)}") from None
     if dtype.hasobject:
         raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
@@ -115,7 +123,7 @@ def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bo
 
 
 def read_hdf5(path: Path) -> CameraPeople:
-    """The people of one camera, in SLEAP's analysis file or DeepLabCut's table.
+    """The people of one camera, from SLEAP's analysis file or DeepLabCut's table.
 
     InputError naming file and cure.
     """
@@ -134,7 +142,9 @@ def read_hdf5(path: Path) -> CameraPeople:
 
 
 def _deeplabcut(path: Path, table: Any) -> CameraPeople:
-    """One person, or each individual, in a table of pandas: a row a frame, columns in one block or several."""
+    """One person, or each individual, from a pandas table: one row per frame; columns are in one or
+    several blocks.
+    """
     names = [name for name in table.dtype.names or () if name.startswith("values_block_")]
     columns = [row for name in names for row in _list_of_rows(table.attrs, f"{name}_kind")]
     known = table.ndim == 1 and not table.dtype.hasobject and "index" in (table.dtype.names or ())
@@ -162,10 +172,10 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
 
 
 def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
-    """A list of rows of texts, which pandas stores as a pickle: it is parsed as text, and nothing in it is
-    executed.
+    """A list of rows of texts, which pandas stores as a pickle: the pickle is parsed as text, and
+    nothing is executed.
 
-    ValueError where it is anything else.
+    ValueError for any other content.
     """
     kind = attributes.get_id(name)
     if kind.dtype.kind != "S" or kind.shape != () or kind.dtype.itemsize > SMALL:
@@ -190,7 +200,7 @@ def _list_of_rows(attributes: Any, name: str) -> list[list[str]]:
 
 
 def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
-    """Each track is one person, its nodes are named."""
+    """Read SLEAP's analysis file: each track is one person, and nodes have names."""
     tracks = _dataset(h5py, file, "tracks")
     names = _dataset(h5py, file, "node_names")
     if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
@@ -214,7 +224,9 @@ def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
 
 
 def _dataset(h5py: Any, file: Any, name: str) -> Any:
-    """A dataset of the file itself: None where there is none, or its numbers are in another file."""
+    """A dataset stored in the file itself; None if it does not exist, or if its data are in another
+    file.
+    """
     found = file
     for part in name.split("/"):
         if not isinstance(found, h5py.Group) or not isinstance(found.get(part, getlink=True), h5py.HardLink):
@@ -226,7 +238,9 @@ def _dataset(h5py: Any, file: Any, name: str) -> Any:
 
 
 def _names(path: Path, names: Any) -> tuple[str, ...]:
-    """The texts of a dataset (N,). Those of any length are read here: libhdf5 trusts damaged lengths."""
+    """The texts of a dataset (N,). Texts of variable length are read by this module, because
+    libhdf5 does not check damaged lengths.
+    """
     if names.dtype.kind == "S" and names.dtype.itemsize <= _LONGEST_NAME:
         return tuple(each.decode("utf-8") for each in names[:])
     begin = names.id.get_offset() if names.dtype.kind == "O" and names.chunks is None else None
@@ -239,7 +253,7 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
 
 
 def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes:
-    """A text from one of HDF5's global heaps; ValueError where it is not there."""
+    """A text from one of HDF5's global heaps; ValueError if it does not exist."""
     stream.seek(address)
     head = stream.read(16)
     size = int.from_bytes(head[8:], "little")
@@ -255,8 +269,8 @@ def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes
 
 
 def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...] | None) -> bool:
-    """Whether `tracks` are (frames, tracks, nodes, 2), sleap-io's standard, and not as MATLAB reads them:
-    (tracks, 2, nodes, frames). `occupancy` are (frames, tracks) in both.
+    """Whether `tracks` are (frames, tracks, nodes, 2), the default of sleap-io, instead of MATLAB's
+    order (tracks, 2, nodes, frames). `occupancy` is (frames, tracks) in both.
     """
     standard, matlab = tracks[2:] == (nodes, 2), tracks[1:3] == (2, nodes)
     if standard and matlab and occupancy is not None:
@@ -265,12 +279,12 @@ def _frames_first(tracks: tuple[int, ...], nodes: int, occupancy: tuple[int, ...
 
 
 def _numbers(path: Path, dataset: Any) -> Array:
-    """All of a dataset."""
+    """All values of a dataset."""
     _check_size(path, dataset.size if dataset.dtype.kind in "fiu" else np.inf, dataset.shape)
     return np.asarray(dataset[:], dtype=np.float64)
 
 
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
-    """InputError where so many numbers are more than the file can hold."""
+    """InputError if the file is too small for this number of values."""
     if 8 * count > max(_SMALL_BYTES, MOST_PACKED * path.stat().st_size):
         raise InputError(f"{path}: its arrays {shape} are too large; export a part of the recording")

@@ -22,27 +22,30 @@ from shapepose_fg.io.validation import is_number
 from shapepose_fg.proposal.assignment import match_best_first
 
 _SPACE = " \n\t"
-"""Characters at which pieces end, so that no number, letter or end of line is cut."""
+"""Characters at which pieces of text end, so that no number, multi-byte character or line end is
+split."""
 SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
-"""Meanings of the format's skeleton numbers."""
+"""Names of the format's skeleton types, by number."""
 
 
 @dataclass(frozen=True)
 class TextSkeleton:
-    """The joints and limbs of a file: those of the detector; `skeleton` may have more."""
+    """The joints and limbs that are listed in a file; `skeleton` may have further (computed)
+    joints.
+    """
 
     number: int
     """Number of the skeleton in the file's first line."""
     joints: tuple[str, ...]
-    """The joints whose candidates are listed, in order; the first of `skeleton`'s."""
+    """The joints with candidates in the file, in order; these are the first joints of `skeleton`."""
     limbs: tuple[tuple[int, int], ...]
-    """The limbs whose affinities are listed, in order."""
+    """The limbs with affinities in the file, in order."""
     skeleton: Skeleton
-    """The skeleton that is read from it."""
+    """The skeleton of the detections that are read."""
 
     @property
     def limb_of(self) -> Index:
-        """(J, J) the number of the limb from one joint to another, -1 where there is none."""
+        """(J, J) index of the limb from one joint to another, -1 if there is none."""
         table = np.full((len(self.joints), len(self.joints)), -1, dtype=np.intp)
         table[tuple(np.array(self.limbs).T)] = np.arange(len(self.limbs))
         return table
@@ -62,11 +65,13 @@ TEXT_SKELETONS = {
         ),
     )
 }
-"""Supported skeletons, by the name of ours."""
+"""Supported skeletons, by their names in this package."""
 
 
 def _whole_words(path: Path) -> Iterator[str]:
-    """Text of the file at `path` in pieces that end at white space; InputError as of `files.text_pieces`."""
+    """Text of the file at `path` in pieces that end at white space; raises InputError as
+    `files.text_pieces` does.
+    """
     left = ""
     for piece in text_pieces(path):
         left += piece
@@ -81,25 +86,25 @@ def _whole_words(path: Path) -> Iterator[str]:
 
 
 class NumberStream:
-    """The numbers of a file in order, of which those since the last `forget` are in memory."""
+    """The numbers of a file in order; only those since the last `forget` are in memory."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.first = 0
-        """Number of dropped numbers."""
+        """Number of values that were dropped from memory."""
         self.values: Array = np.zeros(0)
-        """The numbers in memory."""
+        """The values in memory."""
         self._pieces = _whole_words(path)
         self._most = path.stat().st_size // 2 + 1
 
     @property
     def known(self) -> int:
-        """Number of the file's numbers that have been read."""
+        """Number of values that have been read so far."""
         return self.first + len(self.values)
 
     def reaches(self, count: int) -> bool:
-        """Whether the file has this many numbers; they are then in memory."""
-        if count > self._most:  # no room in the file: it is not read to its end for that
+        """Whether the file has at least `count` values; they are then in memory."""
+        if count > self._most:  # the file is too small: it need not be read to its end
             return False
         parts, known = [self.values], self.known
         while known < count and (text := next(self._pieces, None)) is not None:
@@ -110,15 +115,17 @@ class NumberStream:
         return known >= count
 
     def forget(self, count: int) -> None:
-        """Drop the first `count` numbers of the file."""
+        """Drop the first `count` values of the file from memory."""
         self.values, self.first = self.values[count - self.first :].copy(), count
 
     def refuse(self, index: int | None, problem: str, cure: str) -> InputError:
-        """An error about number `index`; None is what should be behind the last."""
+        """An error about value number `index`; None stands for a value missing at the end."""
         return InputError(f"{self.path}: line {self._line(index)}: {problem}; {cure}")
 
     def _numbers(self, text: str, first: int) -> Array:
-        """The numbers of a piece, finite; `first` are before it."""
+        """The values of a piece of text, which must be finite; `first` is the number of values
+        before it.
+        """
         tokens = text.split()
         try:
             values = np.array(tokens, dtype=np.float64)
@@ -131,7 +138,7 @@ class NumberStream:
         return values
 
     def _line(self, index: int | None) -> int:
-        """The line, from 1, on which a number stands; None, and what is behind the last: the last line."""
+        """The line, counted from 1, of a value; the last line for None or a value behind the last."""
         lines, numbers, last = 0, 0, 1
         for text in _whole_words(self.path):
             counts = [len(line.split()) for line in text.splitlines()]
@@ -140,16 +147,17 @@ class NumberStream:
                 return lines + int(np.searchsorted(ends, index, side="right")) + 1
             numbers += sum(counts)
             last = lines + max(len(counts), 1)
-            # A line that goes on in the next piece is not over.
+            # A line that continues in the next piece is not counted as complete.
             lines += len((text + "|").splitlines()) - 1
         return last
 
 
 def read_association_text(path: Path, camera: Camera) -> ViewStream:
-    """The candidates of `camera` in the file at `path`, and their skeleton; middle joints are computed.
+    """Read the candidates of `camera` and their skeleton from the file at `path`; midpoints are
+    computed.
 
-    Only the beginning of the file is read before the stream's blocks are. InputError naming file, line, frame and
-    cure.
+    Only the header is read at once; the rest is read with the stream's blocks. InputError naming
+    file, line, frame and cure.
     """
     numbers = NumberStream(path)
     kind, frame_count = _header(numbers)
@@ -176,10 +184,10 @@ def _blocks(
 def _candidates(
     numbers: NumberStream, kind: TextSkeleton, counts: Index, starts: Index, start: int, camera: Camera
 ) -> ViewCandidates:
-    """The candidates of the frames from `start` on; `starts` are places in `numbers.values`."""
+    """The candidates of the frames from `start` on; `starts` are indices into `numbers.values`."""
     block, within = _expand(counts.ravel())
     frame, joint = np.divmod(block, counts.shape[1])
-    rows, values = starts[:, :-1].ravel()[block] + within, numbers.values  # of x
+    rows, values = starts[:, :-1].ravel()[block] + within, numbers.values  # rows of x
     n = counts[frame, joint]
     fractions, scores = np.column_stack([values[rows], values[rows + n]]), values[rows + 2 * n]
     bad = (scores < 0) | (scores > OVERSHOOT)
@@ -204,7 +212,7 @@ def _candidates(
 
 
 def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
-    """The skeleton, if it is one that is read, and the number of frames."""
+    """The skeleton, which must be supported, and the number of frames."""
     if not numbers.reaches(2):
         raise numbers.refuse(0, "the first line must hold skeleton type and number of frames", "write both")
     number, frame_count = numbers.values[:2]
@@ -224,12 +232,12 @@ def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
 def _layout(
     numbers: NumberStream, kind: TextSkeleton, frames: range, frame_count: int, position: int
 ) -> tuple[Index, Index, int]:
-    """The number of candidates of each joint in each frame, and where the numbers of each block start.
+    """The number of candidates of each joint in each frame, and the positions of their values.
 
-    Returns `counts` (T, J), `starts` (T, J + 1), the first x of a joint, and in the last column the first affinity
-    of the frame; and where the next frame begins. `position` is where the first does. Each count is known only
-    when the one before has been skipped, so that this is a loop over blocks; everything inside the blocks is done
-    in arrays.
+    Returns `counts` (T, J); `starts` (T, J + 1), the positions of the first x of each joint and, in
+    the last column, of the first affinity of the frame; and the position of the next frame.
+    `position` is that of the first frame. Each count is known only after the block before it has
+    been skipped, hence a loop over blocks; within blocks the work is vectorised.
     """
 
     def reach(count: int, what: str) -> None:
@@ -269,7 +277,7 @@ def _layout(
 
 
 def _pairs(values: Array, kind: TextSkeleton, counts: Index, starts: Index) -> tuple[Index, Array]:
-    """The pairs of candidates (E, 2) with an affinity above 0, and that affinity (E,)."""
+    """The pairs of candidates (E, 2) with a positive affinity, and these affinities (E,)."""
     first, second = np.array(kind.limbs).T
     sizes = counts[:, first] * counts[:, second]  # (T, L)
     block_start = starts[:, -1:] + np.cumsum(sizes, axis=1) - sizes
@@ -285,18 +293,22 @@ def _pairs(values: Array, kind: TextSkeleton, counts: Index, starts: Index) -> t
 
 
 def _expand(sizes: Index) -> tuple[Index, Index]:
-    """For every element of blocks of these sizes: its block, and its place within the block."""
+    """For every element of blocks with the given sizes: the number of its block, and its index in
+    the block.
+    """
     block = np.repeat(np.arange(len(sizes)), sizes)
     return block, np.arange(len(block)) - (np.cumsum(sizes) - sizes)[block]
 
 
 def with_middles(view: ViewCandidates, skeleton: Skeleton) -> ViewCandidates:
-    """`view` of a file's joints as candidates of the whole skeleton, with its middle joints.
+    """Convert `view` from the joints of a file to the whole `skeleton`, with computed midpoints.
 
-    A middle belongs to two candidates (hips) that share a neighbour (the neck) by affinity. Each candidate makes
-    one middle at most: pairs are taken in falling order of the smaller of their two affinities to the neighbour. A
-    middle has the lower confidence of its two, affinity 1 to them, and to every neighbour that both are linked to
-    the mean of their affinities. Pairs that no limb of the skeleton joins are left out.
+    A midpoint is computed for two candidates (hips) that are linked to a common neighbour (the
+    neck) by affinity. Each candidate is used for one midpoint at most; pairs are processed in
+    decreasing order of the smaller of their two affinities to the neighbour. A midpoint has the
+    lower confidence of its two candidates, affinity 1 to both, and to every neighbour that is
+    linked to both, the mean of their affinities. Pairs that are not a limb of the skeleton are left
+    out.
     """
     for middle, first, second in skeleton.middles:
         view = _with_middle(view, middle, first, second)
@@ -310,11 +322,11 @@ def with_middles(view: ViewCandidates, skeleton: Skeleton) -> ViewCandidates:
 
 
 def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> ViewCandidates:
-    """`view` with candidates of the joint `middle` between `first` and `second` at its end."""
+    """`view` with candidates of the joint `middle`, the midpoint of `first` and `second`, appended."""
     frame, seen = view.frame, view.seen
     one, other = seen.joint[seen.pairs].T
     to_first, to_second = (np.flatnonzero(np.asarray(other == end) & (one != middle)) for end in (first, second))
-    # A neighbour's links to one end, times its links to the other.
+    # Links of a neighbour to one end, combined with its links to the other end.
     left, right = _equal_pairs(seen.pairs[to_first, 0], seen.pairs[to_second, 0])
     left, right = to_first[left], to_second[right]
     neighbour, a, b = seen.pairs[left, 0], seen.pairs[left, 1], seen.pairs[right, 1]
@@ -323,7 +335,7 @@ def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> 
     picked = picked[np.argsort(a[picked], kind="stable")]
     a_made, b_made = a[picked], b[picked]
     made = len(frame) + np.arange(len(picked))
-    # Who else is linked to both ends of a middle.
+    # Other candidates that are linked to both ends of a midpoint.
     made_at = np.full(len(frame), -1, dtype=np.intp)
     made_at[a_made] = np.arange(len(picked))
     linked = np.flatnonzero(np.append(b_made, -1)[made_at[a]] == b)
@@ -341,7 +353,7 @@ def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> 
 
 
 def _equal_pairs(left: Index, right: Index) -> tuple[Index, Index]:
-    """All places i in `left` and k in `right` with equal values, as two arrays."""
+    """All pairs of indices i into `left` and k into `right` with equal values, as two arrays."""
     order = np.argsort(right, kind="stable")
     low, high = (np.searchsorted(right[order], left, side=side) for side in ("left", "right"))
     i, within = _expand(high - low)

@@ -1,4 +1,6 @@
-"""People in CSV: DeepLabCut's and AniPose's of one camera, with three or four header rows; Caliscope's of all."""
+"""Reads people from CSV files: of one camera by DeepLabCut and AniPose, with three or four header
+rows; of all cameras by Caliscope.
+"""
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,13 +21,13 @@ _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
 _MOST_COLUMNS = 10_000
 BLAZEPOSE = SKELETONS["BLAZEPOSE_33"].keypoint_count
-"""Number of MediaPipe's points of the body; those of hands and face come after them."""
+"""Number of MediaPipe's points of the body; those of hands and face follow."""
 _LINES = 4096
 """Number of lines that are processed together."""
 
 
 def head_of(path: Path) -> list[str]:
-    """The first line's fields; none where the file is no text."""
+    """The fields of the first line; none if the file is not text."""
     with open_regular(path) as stream:
         line = stream.read(4096).split(b"\n", 1)[0]
     try:
@@ -35,17 +37,19 @@ def head_of(path: Path) -> list[str]:
 
 
 def is_deeplabcut(path: Path) -> bool:
-    """Whether a CSV file begins as DeepLabCut's do."""
+    """Whether a CSV file begins with DeepLabCut's header."""
     return head_of(path)[:1] == ["scorer"]
 
 
 def is_caliscope(path: Path) -> bool:
-    """Whether a CSV file has the columns of Caliscope's points of all cameras."""
+    """Whether a CSV file has the columns of Caliscope's 2D points of all cameras."""
     return {"sync_index", "img_loc_x", "img_loc_y"} <= set(head_of(path))
 
 
 def read_deeplabcut(path: Path) -> CameraPeople:
-    """The people of one camera: one, or each individual; body parts are named. InputError naming line and cure."""
+    """The people of one camera: a single one, or each individual; body parts have names. InputError
+    naming line and cure.
+    """
     rows = _rows(path)
     heads = dict[str, list[str]]()
     for _, row in islice(rows, 4):
@@ -76,15 +80,16 @@ def read_deeplabcut(path: Path) -> CameraPeople:
 
 
 def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tuple[str, ...], Index]:
-    """DeepLabCut's body parts, and (P, J, 3) the columns of x, y and likelihood of each individual, 0 for none.
+    """DeepLabCut's body parts, and (P, J, 3) column numbers of x, y and likelihood of each
+    individual; 0 if missing.
 
-    `columns` are the individual, part and axis of columns 1, 2, ...
+    `columns` has (individual, part, axis) of columns 1, 2, ...
     """
     people = dict[str, dict[str, dict[str, int]]]()
     for column, (one, part, axis) in enumerate(columns, start=1):
         people.setdefault(one, {}).setdefault(part, {})[axis] = column
     joints = tuple(next(iter(people.values()))) if people else ()
-    # Parts that all animals share, such as corners of the cage, are an individual of other parts.
+    # Parts shared by all animals, such as corners of the cage, form an individual with other parts.
     picked = [
         [[axes.get(name, 0) for name in ("x", "y", "likelihood")] for axes in own.values()]
         for own in people.values()
@@ -96,18 +101,20 @@ def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tup
 
 
 def taken(values: Array, columns: Index) -> Array:
-    """(T, P, J, 3) keypoints of each person in a table `values` (T, C), by the `columns` of `body_parts`."""
-    return np.where(columns > 0, values[:, columns], 1.0)  # no likelihood: as sure as any
+    """(T, P, J, 3) keypoints of each person from a table `values` (T, C), by the `columns` of
+    `body_parts`.
+    """
+    return np.where(columns > 0, values[:, columns], 1.0)  # without a likelihood the score is 1
 
 
 def cameras_of_caliscope(path: Path) -> list[str]:
-    """Names for the cameras of Caliscope's file. InputError as `read_caliscope`."""
+    """Names for the cameras of Caliscope's file. Raises InputError as `read_caliscope` does."""
     return [f"cam_{port}" for port in np.unique(_points(path)[:, 1].astype(np.intp)).tolist()]
 
 
 def read_caliscope(path: Path, camera: int, cameras: Sequence[str]) -> CameraPeople:
-    """Detections of one person in camera number `camera` of `cameras`, with MediaPipe's points; frames are
-    `sync_index`.
+    """Detections of one person in camera number `camera` of `cameras`, with MediaPipe's points;
+    frames are numbered by `sync_index`.
 
     InputError naming line and cure.
     """
@@ -155,7 +162,7 @@ def _points(path: Path) -> Array:
 
 
 def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> int:
-    """The number that the file has for a camera."""
+    """The number of a camera in the file."""
     chosen = match_names(cameras, [str(port) for port in ports])
     if chosen is not None:
         return ports[chosen[camera]]
@@ -169,7 +176,7 @@ def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> 
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Lines that are not empty, and their numbers; InputError on one that is too long or no CSV."""
+    """Non-empty lines and their numbers; InputError for a line that is too long or invalid CSV."""
 
     def lines() -> Iterator[str]:
         rest = ""
@@ -193,7 +200,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _frame(path: Path, line: int, word: str) -> int:
-    """The frame's number: the first field, or the last number in a picture's name."""
+    """The frame number: the first field, or the last number in a picture's name."""
     number = last_number(word.strip().rsplit(".", 1)[0])
     if number is None or number == MOST_FRAME:
         raise InputError(f"{path}: line {line} must begin with a frame number, got {word[:40]!r}; {_RERUN}")
@@ -201,7 +208,7 @@ def _frame(path: Path, line: int, word: str) -> int:
 
 
 def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
-    """The numbers of a line, NaN where a field is empty; what stands in the first field does not count."""
+    """The values of a line, NaN for empty fields; the first field is ignored."""
     if len(row) != width:
         raise InputError(f"{path}: line {line} must hold {width} fields, got {len(row)}; {_RERUN}")
     found = []

@@ -1,9 +1,9 @@
-"""People in JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures, OpenPifPaf, Ultralytics, AlphaPose's
-sep-json), or one file per camera with all its frames (COCO's keypoint results, AlphaPose, MMPose of a video,
-OpenPifPaf of a video).
+"""Reads people from JSON: a file per frame (OpenPose, Pose2Sim, MMPose of pictures, OpenPifPaf,
+Ultralytics, AlphaPose's sep-json), or one file per camera with all its frames (COCO's keypoint
+results, AlphaPose, MMPose of a video, OpenPifPaf of a video).
 
-Pose2Sim (RTMLib's people written in OpenPose's way) leaves `_keypoints` out of the names, writes NaN for people
-that it dropped, and `{}` for people that a camera does not see.
+Pose2Sim (RTMLib's people in OpenPose's format) has no `_keypoints` in the file names, NaN for
+people that it dropped, and `{}` for people that a camera does not see.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -40,28 +40,31 @@ _RERUN = {
     _SEPARATE: "run AlphaPose again, without --format",
 }
 _LONGEST_GAP = 1000
-"""Largest ratio of missing to existing frames: more are numbers of something else."""
+"""Maximum ratio of missing to existing frames; a larger ratio means that the numbers are not frame
+numbers."""
 _LOOKED_AT = 100
-"""Maximum number of files without people that are read to recognise the program."""
+"""Maximum number of files without people that are read before the program is identified."""
 FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
-"""What follows the number in the names of files of frames."""
+"""Pattern of what follows the frame number in file names."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
-"""AlphaPose's file of all frames, and its folder for a file a frame, of --format open and cmu."""
+"""AlphaPose's file with all frames, and its folder with a file per frame (--format open and cmu)."""
 _LISTS = ("annotations", "instance_info")
-"""Keys of the list where the file is an object: those of COCO's data sets and of MMPose."""
+"""Keys of the list if the file is an object: COCO's data sets, and MMPose."""
 _AT_ONCE = 1024
-"""Number of items that are checked together: as Python's numbers they take several times the memory of an
-array."""
+"""Number of items that are validated together: as Python objects they need several times the memory
+of arrays."""
 
 
 class _Person(BaseModel, strict=True, extra="allow"):
-    """A person of OpenPose, or of AlphaPose's formats `open` and `cmu`; hands and face are passed over."""
+    """A person in OpenPose's format, or in AlphaPose's formats `open` and `cmu`; hands and face are
+    ignored.
+    """
 
     pose_keypoints_2d: list[float] | None = None
     joints: list[float] | None = None
 
     def flat(self, place: str, program: str) -> list[float]:
-        """x, y and score of each keypoint; nothing where the person has none."""
+        """x, y and score of each keypoint; empty if the person has none."""
         values = self.joints if self.pose_keypoints_2d is None else self.pose_keypoints_2d
         if values is None and self.model_extra:
             raise InputError(f"{place}.pose_keypoints_2d is missing; {_RERUN[program]}")
@@ -73,7 +76,7 @@ class _Frame(BaseModel, strict=True):
 
 
 class _Instance(BaseModel, strict=True):
-    """A person of MMPose."""
+    """A person in MMPose's format."""
 
     keypoints: list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
     keypoint_scores: list[FiniteFloat]
@@ -88,14 +91,14 @@ class _Instance(BaseModel, strict=True):
 
 
 class _VideoFrame(BaseModel, strict=True):
-    """A frame of MMPose."""
+    """A frame of a video in MMPose's format."""
 
     frame_id: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
     instances: list[_Instance]
 
 
 class _Flat(BaseModel, strict=True):
-    """A person of OpenPifPaf."""
+    """A person in OpenPifPaf's format."""
 
     keypoints: Annotated[list[float], Field(min_length=1)]
 
@@ -105,21 +108,21 @@ class _Flat(BaseModel, strict=True):
 
 
 class _Result(_Flat):
-    """A person of COCO's results."""
+    """A person in COCO's result format."""
 
     image_id: int | str
     category_id: int | str | None = None
 
 
 class _PifPafFrame(BaseModel, strict=True):
-    """A frame of OpenPifPaf's video."""
+    """A frame of a video in OpenPifPaf's format."""
 
     frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
     predictions: list[_Flat]
 
 
 class _Columns(BaseModel, strict=True):
-    """The keypoints of a person of Ultralytics."""
+    """The keypoints of a person in Ultralytics' format."""
 
     x: list[FiniteFloat]
     y: list[FiniteFloat]
@@ -127,12 +130,12 @@ class _Columns(BaseModel, strict=True):
 
 
 class _Object(BaseModel, strict=True):
-    """A person, or another thing, of Ultralytics."""
+    """A detected person, or other object, in Ultralytics' format."""
 
     keypoints: _Columns | None = None
 
     def flat(self, place: str, program: str) -> list[float]:
-        """x, y and score of each keypoint; those that are hardly seen are at 0 0."""
+        """x, y and score of each keypoint; keypoints with a low score are at 0 0."""
         own = self.keypoints
         if own is None:
             return []
@@ -148,12 +151,13 @@ _LIST_OF = {
     _YOLO: TypeAdapter(list[_Object]),
     _PICTURES: TypeAdapter(list[_Instance]),
 }
-"""The people of a frame, by the programs that write them as a list; others write an object, a `_Frame`."""
+"""Validators of a frame's people, for programs that write them as a list; others write an object
+(`_Frame`)."""
 _RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
 
 
 def _checked(values: list[float], place: str, program: str) -> list[float]:
-    """Flat keypoints; a joint that was not seen may be NaN."""
+    """Check flat keypoints; a joint that was not detected may be NaN."""
     if len(values) % 3 != 0:
         problem = f"must hold x, y and score of each keypoint, got {len(values)} numbers"
         raise InputError(f"{place} {problem}; {_RERUN[program]}")
@@ -163,7 +167,7 @@ def _checked(values: list[float], place: str, program: str) -> list[float]:
 
 
 def _people(content: Any, place: object, program: str) -> list[list[float]]:
-    """Flat keypoints of the people of a frame; people without keypoints are left out."""
+    """Flat keypoints of the people of a frame; people without keypoints are skipped."""
     if program in _LIST_OF:
         key, people = "", validated_list(_LIST_OF[program], content, place, _RERUN[program])
     else:
@@ -173,7 +177,9 @@ def _people(content: Any, place: object, program: str) -> list[list[float]]:
 
 
 def read_json_people(place: Path) -> CameraPeople:
-    """The people of one camera: of a JSON file with all frames, also a folder's only, or of a file per frame."""
+    """The people of one camera: from a JSON file with all frames (which may be the only one of a
+    folder), or from a file per frame.
+    """
     if not place.is_dir():
         return read_one_file(place)
     if (place / _SEP_JSON).is_dir() and len(numbered(place, FRAME_FILE)) == 0:
@@ -191,7 +197,7 @@ def read_json_people(place: Path) -> CameraPeople:
 
 
 def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
-    """The joints that MMPose's `meta_info` names: one by one, or as a data set; None where it names none."""
+    """The joints in MMPose's `meta_info`: names, or the name of a data set; None if it has neither."""
     if not isinstance(meta, dict):
         return None
     names, count = meta.get("keypoint_id2name"), meta.get("num_keypoints")
@@ -205,13 +211,15 @@ def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
 
 
 def _texts(names: Any) -> tuple[str, ...]:
-    """A list of texts as a tuple; empty where it is anything else."""
+    """A list of texts as a tuple; empty for any other value."""
     listed = isinstance(names, list) and all(isinstance(name, str) for name in names)
     return tuple(names) if listed else ()
 
 
 def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple[str, ...] | None:
-    """The joints that COCO's `categories` name for those in use; None where they name none, or different ones."""
+    """The joint names of the `used` categories in COCO's `categories`; None if there are none, or
+    if they differ.
+    """
     found = set[tuple[str, ...]]()
     for each in categories if isinstance(categories, list) else []:
         named = _texts(each.get("keypoints")) if isinstance(each, dict) else ()
@@ -224,9 +232,9 @@ def _joints_of_categories(categories: Any, used: set[int | str | None]) -> tuple
 
 
 def read_frame_files(folder: Path) -> CameraPeople:
-    """The frames that one camera saw; InputError naming file, key and cure.
+    """Read a file per frame of one camera; InputError naming file, key and cure.
 
-    A frame's number is in its file's name. No people are seen in frames whose files are missing in between
+    Frame numbers are in the file names. Missing files in between are frames without people
     (`gaps`).
     """
     found = numbered(folder, FRAME_FILE)
@@ -254,7 +262,9 @@ def read_frame_files(folder: Path) -> CameraPeople:
 
 
 def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | None]:
-    """The program that wrote files of frames, by the first with people, and the joints that it names."""
+    """The program that wrote a file per frame, identified by the first file with people, and the
+    joint names in it.
+    """
     program, joints = _POSE2SIM, None
     for n, file in enumerate(files[:_LOOKED_AT]):
         content = read_json(file, most=MIDDLE)
@@ -298,12 +308,12 @@ def _lists(folder: Path) -> list[Path]:
 
 
 def _known(item: Any) -> bool:
-    """Whether this is an item of one of the programs' lists."""
+    """Whether this is an item of a list in one of the programs' formats."""
     return isinstance(item, dict) and ("image_id" in item or "instances" in item)
 
 
 def read_one_file(path: Path) -> CameraPeople:
-    """Read all frames that one camera saw; InputError naming file, key and cure."""
+    """Read a file with all frames of one camera; InputError naming file, key and cure."""
     if (lines := _pifpaf_video(path)) is not None:
         return lines
     items = JsonItems(path, _LISTS)
@@ -328,14 +338,14 @@ def read_one_file(path: Path) -> CameraPeople:
 
 
 class _Collected:
-    """People of one file as they are read, in arrays."""
+    """Collects the people of one file in arrays while they are read."""
 
     def __init__(self, path: Path, program: str) -> None:
         self.path, self.program = path, program
         self._keypoints, self._counts = list[Array](), set[int]()
 
     def valid(self, kind: TypeAdapter[list[Any]], items: Iterable[Any]) -> Iterator[tuple[int, list[Any]]]:
-        """The items, some at a time, and the index of the first of them."""
+        """The validated items in batches, with the index of each batch's first item."""
         items, start = iter(items), 0
         while len(some := list(islice(items, _AT_ONCE))) > 0:
             yield start, validated_list(kind, some, self.path, _RERUN[self.program], start)
@@ -350,13 +360,15 @@ class _Collected:
     def camera(
         self, frames: list[int], listed: tuple[int, int], joints: str | tuple[str, ...] | None
     ) -> CameraPeople:
-        """All people, in these `frames` (N); `listed` are the first and last that the file knows."""
+        """All people, with their `frames` (N); `listed` are the first and last frame number in the
+        file.
+        """
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
         how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun, "joints": joints}
         return CameraPeople(self.path, self.program, blocks, *listed, **how)
 
     def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
-        """People in the order of their frames (N,), some frames at a time."""
+        """People sorted by frame, with `frames` (N,), in blocks of frames."""
         if len(frames) == 0:
             return
         order, parts = np.argsort(frames, kind="stable"), self._keypoints
@@ -371,7 +383,7 @@ class _Collected:
 
 
 def _pifpaf_video(path: Path) -> CameraPeople | None:
-    """OpenPifPaf's file of a video, a line of JSON a frame; None where it is another file."""
+    """Read OpenPifPaf's file of a video, a line of JSON per frame; None for other files."""
     with open_regular(path) as stream:
         begin = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").replace(b" ", b"")
     if not begin.startswith(b'{"frame":'):
@@ -392,7 +404,9 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
 
 
 def _by_picture(path: Path) -> CameraPeople | None:
-    """AlphaPose's file of --format open and cmu, people by the name of their picture; None where it is another."""
+    """Read AlphaPose's file of --format open and cmu: people by name of the picture; None for other
+    files.
+    """
     content = read_json(path, most=BIG)
     kinds = {key for each in content.values() for key in (each if isinstance(each, dict) else ())}
     if len(content) == 0 or not kinds & {"people", "bodies"}:
@@ -407,9 +421,10 @@ def _by_picture(path: Path) -> CameraPeople | None:
 
 
 def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
-    """A list of people, each with the picture that it is of. Pictures without people are not in it.
+    """Read a list of people, each with the picture to which it belongs. Pictures without people are
+    not listed.
 
-    `others` has the pictures' names when all items have been read.
+    `others` has the names of the pictures after all items have been read.
     """
     path, program, images = people.path, people.program, list[int | str]()
     categories = set[int | str | None]()
@@ -438,7 +453,7 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
 
 
 def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
-    """The files of the pictures of a COCO data set by their ids, also of those without people."""
+    """File names of the pictures of a COCO data set by id, including pictures without people."""
     names, images = {}, others.get("images")
     for index, image in enumerate(images if isinstance(images, list) else []):
         one = image.get("id") if isinstance(image, dict) else None
@@ -449,7 +464,9 @@ def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | st
 
 
 def _number(image: int | str, name: str | None, place: str, program: str) -> int:
-    """The frame of a picture: the last number in its name, or its id where that is a number and it has no name."""
+    """Frame number of a picture: the last number in its name; without a name, its id, if that is a
+    number.
+    """
     if name is None and isinstance(image, int):
         if 0 <= image < MOST_FRAME:
             return image
@@ -461,7 +478,9 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
 
 
 def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
-    """A list of frames, each with its people; `others` has `meta_info` when all have been read."""
+    """Read a list of frames, each with its people; `others` has `meta_info` after all items have
+    been read.
+    """
     frames, first, last = list[int](), MOST_FRAME, -1
     for start, found in people.valid(_FRAMES, items):
         rows = list[list[float]]()

@@ -1,4 +1,6 @@
-"""The joints of keypoints: as the user states, as the files state, or by the number of keypoints."""
+"""Determines the joint of each keypoint: from the user, from names in the files, or from the number
+of keypoints.
+"""
 
 from collections.abc import Sequence
 
@@ -13,11 +15,12 @@ from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, Kept
 
 _CURE = "name the detector's layout with --skeleton"
 _MOST_PEOPLE = 200
-"""Maximum number of a camera's people that are compared with a body."""
+"""Maximum number of a camera's people that are compared with the proportions of a body."""
 _SPREAD, _SIGMAS = 0.5, 2.5
-"""Assumed standard deviation of a person's fit besides the observed one, nats per pair of joints, because few
-similar people prove little; and standard deviations that a decision needs. Layouts differ by 0.7 to 1.7, some
-with two other joints by 0.07."""
+"""`_SPREAD`: assumed standard deviation of a person's fit, in addition to the observed one, nats
+per pair of joints; it is needed because a few similar people are weak evidence. `_SIGMAS`: standard
+deviations that a decision requires. Layouts differ by 0.7 to 1.7 nats; some that differ in only two
+joints, by 0.07."""
 
 
 def skeleton_of_people(
@@ -25,8 +28,8 @@ def skeleton_of_people(
 ) -> tuple[Skeleton, list[str]]:
     """The skeleton of the people of all cameras, and notes on how it was found.
 
-    The user's `wanted` has precedence over names in the files, these over what a project's settings `declared`,
-    and this over the number of keypoints. InputError where cameras or names contradict each other.
+    In order of precedence: the user's `wanted`, names in the files, the project's settings
+    `declared`, the number of keypoints. InputError if cameras or names contradict each other.
     """
     counted = _one_count(people)
     if counted is None:
@@ -66,10 +69,10 @@ def skeleton_of_people(
 
 
 def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tuple[Skeleton, str]:
-    """Return the layout that people fit best among those with as many keypoints, and why.
+    """The layout that people fit best among those with this number of keypoints, and the reason.
 
-    It is the most usual one, which is the first, where no other fits surely better. InputError where cameras
-    surely fit different ones.
+    The most common layout, the first, is used unless another fits significantly better. InputError
+    if cameras significantly fit different layouts.
     """
     from shapepose_fg.body.joint_order import LIKE_A_BODY
 
@@ -95,11 +98,11 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
             each.name for each, fit in zip(layouts, fits_of_all, strict=True) if not _surely(fits_of_all[0] - fit)
         ]
         return usual, f", the most common layout; people do not distinguish it from {', '.join(rivals[1:])}"
-    return layouts[best], "because people look like it" + (f", not as {usual.name}" if best > 0 else "")
+    return layouts[best], ", because people look like it" + (f", not as {usual.name}" if best > 0 else "")
 
 
 def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
-    """(L, N) fit of people (N, K, 2) to each layout, without people with too few joints."""
+    """(L, N) fit of people (N, K, 2) to each layout; people with too few joints are left out."""
     from shapepose_fg.body.joint_order import fit_of_order
 
     fits = np.array([fit_of_order(people, keypoint_names(each)) for each in layouts])
@@ -107,8 +110,9 @@ def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
 
 
 def _sure(fits: Array) -> int | None:
-    """The layout that people fit best (L, N), if significantly better than the most usual, the first; or that
-    one if it fits significantly better than all others; else None.
+    """Index of the best-fitting layout for `fits` (L, N), if it is significantly better than the
+    most common one (the first); 0 if the first is significantly better than all others; otherwise
+    None.
     """
     from shapepose_fg.body.joint_order import LIKE_A_BODY
 
@@ -120,7 +124,9 @@ def _sure(fits: Array) -> int | None:
 
 
 def _surely(more: Array) -> bool:
-    """Whether people fit one layout significantly better than another, given their differences `more` (N,)."""
+    """Whether people fit one layout significantly better than another; `more` (N,) are the
+    differences of their fits.
+    """
     return len(more) > 0 and bool(more.mean() > _SIGMAS * np.sqrt((more.var() + _SPREAD**2) / len(more)))
 
 
@@ -142,10 +148,11 @@ def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
 def _named_in_files(
     people: Sequence[KeptPeople], count: int
 ) -> tuple[tuple[Skeleton, str, list[str]] | None, list[str]]:
-    """The skeleton that the files name, its source, and names that are ignored; None where none names any; and
-    notes on unknown names.
+    """The skeleton that the files name, its source, and ignored names (None if no file has names);
+    and notes on unknown names.
 
-    InputError where files of two cameras name different joints, or names that cannot be those of the keypoints.
+    InputError if files of two cameras name different joints, or if the names do not match the
+    keypoints.
     """
     found: tuple[Skeleton, str, list[str], CameraPeople] | None = None
     notes = dict[str, None]()
@@ -166,7 +173,9 @@ def _named_in_files(
 
 
 def _declared(declared: DeclaredJoints, count: int) -> tuple[tuple[Skeleton, list[str]] | None, str]:
-    """`_called` for a project's settings, which need not name all keypoints, and may be of others."""
+    """`_called` for a project's settings, which may name only some of the keypoints, or belong to
+    other detections.
+    """
     joints = declared.joints
     if not isinstance(joints, str):
         if len(joints) > count:
@@ -178,10 +187,10 @@ def _declared(declared: DeclaredJoints, count: int) -> tuple[tuple[Skeleton, lis
 def _called(
     joints: str | tuple[str, ...], count: int, source: str
 ) -> tuple[tuple[Skeleton, list[str]] | None, str]:
-    """The skeleton that a source names for `count` keypoints, with the names that are ignored, and a sentence
-    about it; None where it names none that is known, or none of so many keypoints.
+    """The skeleton that a source names for `count` keypoints, with ignored names, and a sentence
+    about it; None if the layout is unknown or has another number of keypoints.
 
-    InputError where it names each joint, and not so many, or not those that a person needs.
+    InputError if each joint is named, but not `count` of them, or if required joints are missing.
     """
     if isinstance(joints, str):
         layouts = layouts_called(joints)
@@ -208,5 +217,5 @@ def _called(
 
 
 def _shown(name: str) -> str:
-    """A name of another program, for a line of text."""
+    """A name from another file, made safe for a line of text."""
     return name[:40] if name.isprintable() and name else repr(name[:40])

@@ -1,4 +1,4 @@
-"""Detections of one camera in one picture as a line of JSON: OpenPose's frame, with camera and time."""
+"""Reads the detections of one picture from a line of JSON: OpenPose's format, with camera and time."""
 
 from typing import Annotated, Any
 
@@ -37,10 +37,11 @@ class _Line(BaseModel, strict=True, extra="allow"):
 
 
 def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple[Any, ...] | None:
-    """The arguments of `OnlineReconstructor.push_view`: camera, undistorted detections, time in seconds, and pose
-    with covariance, None where the line has none. Joints far outside the picture are left out.
+    """The arguments of `OnlineReconstructor.push_view`: camera, undistorted detections, time in
+    seconds, and pose with covariance, None if the line has none. Joints far outside the picture are
+    left out.
 
-    None where the camera is one of `Rig.unwanted`. InputError naming the `place` of an invalid line.
+    None if the camera is one of `Rig.unwanted`. InputError, naming `place`, for an invalid line.
     """
     line = validated(_Line, parse_json(text.strip(), place), place, _CURE)
     if line.camera in rig.unwanted:
@@ -57,8 +58,8 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
 def view_of(
     camera: str, time_s: float, flat: list[list[float]], place: str, rig: Rig, skeleton: Skeleton
 ) -> tuple[str, Detections, float]:
-    """Return a camera's name, its detections and their time, from keypoints in a flat list of x, y, score, pixels
-    of the picture.
+    """Camera name, detections and time for keypoints in flat lists of x, y, score (pixels of the
+    picture), one list per person.
     """
     if camera not in rig.names:
         raise InputError(f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}")

@@ -1,5 +1,5 @@
-"""People of one camera as detectors write them: stored, with scores scaled to 0 to 1, and divided into
-candidates.
+"""People of one camera in the form that detectors write: stored, scores scaled to 0 to 1, and
+converted to candidates.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,49 +16,53 @@ from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
 
 OVERSHOOT = 1.1
-"""Largest score that is cut at 1 without a note: enlarged heat maps overshoot a little."""
+"""Largest score that is clipped to 1 without a note: upsampled heat maps overshoot slightly."""
 _RARE = 0.01
-"""Share of scores above the one that all are divided by: the maximum would depend on one outlier."""
+"""Share of scores above the quantile by which all scores are divided; the maximum would depend on a
+single outlier."""
 _MOST_LOOKED_AT = 4_000_000
-"""Number of scores above which only every second, third ... of them is used to find how they are scaled."""
+"""Number of scores above which only every second, third ... of them is used to find their scale."""
 _BLOCKS_LOOKED_AT = 10
-"""Number of blocks of a camera's people that are compared with a body."""
+"""Number of blocks of a camera's people that are compared with the proportions of a body."""
 _OCCLUDED = 0.5
-"""Score of a keypoint that an annotator marked as hidden: COCO's visibility 1 of 2."""
+"""Score of a keypoint that is annotated as occluded (COCO's visibility 1)."""
 
 
 @dataclass(frozen=True)
 class PeopleBlock:
-    """People of some frames, keypoint by keypoint, in the detector's own order."""
+    """People of consecutive frames, with their keypoints in the detector's order."""
 
     frame: Index
-    """(N,) number of each person's frame in the files; not falling."""
+    """(N,) frame number of each person in the files; non-decreasing."""
     keypoints: Array
-    """(N, K, 3) x, y in pixels, score; a score of 0 (or less, or not a number) is a joint that was not seen."""
+    """(N, K, 3) x, y in pixels, score; a score of 0 or less, or NaN, means that the joint was not
+    detected."""
 
     @classmethod
     def of(cls, frames: list[int], people: list[list[float]]) -> "PeopleBlock":
-        """Block of flat keypoints, equally many for each person."""
+        """Make a block from flat lists of keypoints, of equal length for each person."""
         count = len(people[0]) // 3 if len(people) > 0 else 0
         keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
         return cls(np.array(frames, dtype=np.intp), keypoints)
 
     @classmethod
     def dense(cls, frame: Index, points: Array) -> "PeopleBlock":
-        """Block of `points` (F, P, K, 3) of P people in the frames `frame` (F,), rising; NaN is not seen."""
+        """Make a block from `points` (F, P, K, 3) of P people in the frames `frame` (F,),
+        increasing; NaN means not detected.
+        """
         seen = np.asarray(np.isfinite(points).all(axis=3))
         row, person = np.nonzero(seen.any(axis=2))
         return cls(frame[row], np.where(seen[..., None], points, 0.0)[row, person])
 
     @property
     def scores(self) -> Array:
-        """(S,) scores of the keypoints that were seen."""
+        """(S,) scores of the detected keypoints."""
         every = self.keypoints[..., 2].ravel()
         return every[np.isfinite(every) & (every > 0)]
 
 
 def check_one_model(known: set[int], people: Sequence[list[float]], source: Path, program: str) -> None:
-    """Add numbers of keypoints to `known`; InputError where there are several."""
+    """Add the numbers of keypoints per person to `known`; InputError if there are several."""
     known |= {len(person) // 3 for person in people}
     if len(known) > 1:
         counts = " and ".join(map(str, sorted(known)))
@@ -69,7 +73,9 @@ def check_one_model(known: set[int], people: Sequence[list[float]], source: Path
 def frame_blocks(
     folder: Path, program: str, files: Sequence[tuple[int, Path]], read: Callable[[Path], list[list[float]]]
 ) -> Iterator[PeopleBlock]:
-    """The people of numbered files of frames, block by block; `read` gives flat keypoints of a file's people."""
+    """The people of numbered files of frames, block by block; `read` returns flat keypoints of the
+    people in a file.
+    """
     counts = set[int]()
     for start in range(0, len(files), BLOCK_FRAMES):
         frames, people = list[int](), list[list[float]]()
@@ -83,14 +89,14 @@ def frame_blocks(
 
 @dataclass(frozen=True)
 class CameraPeople:
-    """The people that one camera saw in a recording."""
+    """The people that one camera detected in a recording."""
 
     source: Path
-    """The file or folder that they come from, for messages."""
+    """The file or folder, for messages."""
     program: str
-    """Program whose format was recognised, for messages."""
+    """Program that wrote the files, for messages."""
     blocks: Iterator[PeopleBlock]
-    """The people in the order of their frames, in blocks of frames that are read one by one."""
+    """The people, sorted by frame, in blocks of frames that are read one by one."""
     first: int
     """Number of the first frame."""
     last: int
@@ -99,14 +105,16 @@ class CameraPeople:
     """Whether the files list every frame, also those without people. If not, frames may be missing at both
     ends, and the other cameras define the length of the recording."""
     lists_people: bool = False
-    """Whether only frames with people are listed: the first of them need not be the recording's first."""
+    """Whether only frames with people are listed; the recording may then begin before the first of
+    them."""
     gaps: tuple[tuple[int, int], ...] = ()
-    """First and last number of frames in between that are missing from the files: no people are seen in them."""
+    """First and last number of ranges of frames that are missing in the files; these frames have no
+    people."""
     rerun: str = "write the detections again"
-    """Instruction for running the program on the calibrated pictures."""
+    """Advice for error messages: how to run the program on the calibrated pictures."""
     joints: str | tuple[str, ...] | None = None
-    """Names of the keypoints in the files, in their order and in the program's words; or the program's name of
-    the whole layout ("coco", "BODY_25B"); None where the files have neither."""
+    """Names of the keypoints in the files, in order, as spelled by the program; or the program's
+    name of the layout ("coco", "BODY_25B"); None if the files have neither."""
 
 
 @dataclass(frozen=True)
@@ -114,21 +122,21 @@ class DeclaredJoints:
     """Joints from the settings of a project; names in the detections' own files have precedence."""
 
     joints: str | tuple[str, ...]
-    """As in `CameraPeople.joints`."""
+    """Names of the joints or of the layout, as in `CameraPeople.joints`."""
     source: str
-    """Place of the statement, for messages: "Config.toml: pose.pose_model"."""
+    """Where it was declared, for messages: "Config.toml: pose.pose_model"."""
 
 
 class KeptPeople:
-    """All people of one camera, stored, with statistics of all of them."""
+    """All people of one camera in storage, with statistics."""
 
     def __init__(self, camera: CameraPeople, kept: KeptArrays, name: str) -> None:
-        """Read them, and store them in `kept` under names that begin with `name`."""
+        """Read all people, and store them in `kept` under names that begin with `name`."""
         self.camera, self._kept, self._names = camera, kept, list[str]()
         self.keypoint_count: int | None = None
-        """K, None without people."""
+        """K, number of keypoints per person; None without people."""
         self.farthest: float | None = None
-        """The largest coordinate of a keypoint that was seen, pixels; None where there is none."""
+        """The largest coordinate of a detected keypoint, pixels; None if there is none."""
         self.score_count, self.top_score, self.visibilities = 0, 0.0, True
         """Number of scores, the highest one, and whether all of them are 1 or 2."""
         for block in camera.blocks:
@@ -146,7 +154,9 @@ class KeptPeople:
                 self.farthest = max(self.farthest or 0.0, float(np.nanmax(xy)))
 
     def some(self, most: int) -> Array:
-        """(N, K, 2) positions of at most `most` people, spread over the recording; NaN where not seen."""
+        """(N, K, 2) positions of at most `most` people, evenly spread over the recording; NaN if
+        not detected.
+        """
         count = self.keypoint_count or 0
         names = self._names[:: -(-len(self._names) // _BLOCKS_LOOKED_AT) if self._names else 1]
         parts = [np.asarray(self._kept.array(name, "keypoints")) for name in names]
@@ -155,7 +165,9 @@ class KeptPeople:
         return np.where(every[..., 2:] > 0, every[..., :2], np.nan)
 
     def blocks(self, *, last_time: bool = False) -> Iterator[PeopleBlock]:
-        """The people in the order of their frames; with `last_time` they are dropped as they are read."""
+        """The people, sorted by frame; with `last_time`, blocks are dropped from storage as they
+        are read.
+        """
         for name in self._names:
             block = PeopleBlock(*(self._kept.array(name, key) for key in ("frame", "keypoints")))
             if last_time:
@@ -168,11 +180,14 @@ Scores = Callable[[Array], Array]
 
 
 def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
-    """The mapping of all cameras' scores to probabilities, and a note on it; None where they are probabilities.
+    """The mapping of all cameras' scores to 0 to 1, and a note on it; no note if they are already
+    between 0 and 1.
 
-    - COCO's visibilities (only 0, 1 and 2, and a 2 among them): 2 is 1, and 1, hidden, is 0.5.
-    - Scores that exceed 1.1: divided by the score that 1 in 100 exceeds, if that is above 1, then cut at 1.
-      RTMPose's are heights of two curves and lie mostly under 1; others' are a few units, or per cent.
+    - COCO's visibility flags (only 0, 1 and 2, at least one 2): 2 becomes 1, and 1 (occluded)
+      becomes 0.5.
+    - Scores that exceed 1.1: divided by their 99 % quantile, if that is above 1, then clipped at 1.
+      RTMPose's scores are peaks of two 1D distributions and mostly below 1; scores of other
+      networks reach a few units, or are per cent.
     """
     top = max(each.top_score for each in people)
     if top == 2 and all(each.visibilities for each in people):
@@ -189,15 +204,16 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
 
 
 def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: int, last: int) -> ViewStream:
-    """The joints of people as candidates, with affinity 1 between those of one person that a limb joins.
+    """The joints of people as candidates, with affinity 1 along the limbs of each person.
 
-    Grouped and ungrouped detections are thus processed alike. Frames run from number `first` to `last`. Joints
-    that the skeleton adds are the middles of two that were seen, with the lower of their scores.
+    So grouped and ungrouped detections are processed in the same way. Frames are those with numbers
+    `first` to `last`. Joints that the skeleton adds are midpoints of two detected joints, with the
+    lower of their scores.
     """
     count = last - first + 1
 
     def blocks() -> Iterator[ViewCandidates]:
-        """Blocks of `BLOCK_FRAMES` frames, from people in blocks of any length."""
+        """Blocks of `BLOCK_FRAMES` frames, from blocks of people of any length."""
         waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
         given = people.blocks(last_time=True)
         for start in range(0, count, BLOCK_FRAMES):
@@ -215,14 +231,14 @@ def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: i
 
 
 def joints_of_people(frame: Index, keypoints: Array, rule: Scores, skeleton: Skeleton) -> ViewCandidates:
-    """The joints of N people of some `frame` (N,), of `keypoints` (N, K, 3), as candidates of one view."""
+    """Candidates of one view: the joints of N people with `frame` (N,) and `keypoints` (N, K, 3)."""
     joints = _joints(keypoints, rule, skeleton)
     person, joint = np.nonzero(joints[..., 2] > 0)
     order = np.lexsort((person, joint, frame[person]))
     person, joint = person[order], joint[order]
     row = np.full(joints.shape[:2], -1, dtype=np.intp)
     row[person, joint] = np.arange(len(person))
-    # People are in the order of their frames: so are pairs.
+    # People are sorted by frame, so pairs are, too.
     pairs = row[:, np.array(skeleton.limbs)].reshape(-1, 2)
     pairs = pairs[np.all(pairs >= 0, axis=1)]
     xy, score = joints[person, joint, :2], joints[person, joint, 2]
@@ -230,7 +246,7 @@ def joints_of_people(frame: Index, keypoints: Array, rule: Scores, skeleton: Ske
 
 
 def _joints(keypoints: Array, rule: Scores, skeleton: Skeleton) -> Array:
-    """(N, J, 3) the skeleton's joints with scores from 0 to 1, 0 0 0 where not seen."""
+    """(N, J, 3) x, y and score (0 to 1) of the skeleton's joints; 0 0 0 if not detected."""
     target = np.arange(len(skeleton)) if skeleton.keypoints is None else np.array(skeleton.keypoints)
     joints = np.zeros((len(keypoints), len(skeleton), 3))
     joints[:, target[target >= 0]] = keypoints[:, target >= 0]

@@ -1,4 +1,5 @@
-"""Reads 2D detections of every camera from a folder: finds files, recognises the format, makes one table of all.
+"""Reads 2D detections of every camera from a folder: finds the files, recognises the format, and
+makes one table.
 
 A format of your own is an entry in `FORMATS` and a function that reads it.
 """
@@ -32,23 +33,25 @@ from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 _MOST_FRAMES = 2_000_000
-"""Maximum number of frames of a recording: larger numbers are ids of pictures."""
+"""Maximum number of frames of a recording: larger numbers are not frame numbers but ids of
+pictures."""
 _MOST_EMPTY = 200_000
-"""Maximum number of frames without people at the beginning: beyond it, numbers count from the first one, with a
-note."""
+"""Maximum number of frames without people at the beginning. If there are more, frames are counted
+from the first one with people, with a note."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of detections: a file or folder per camera."""
+    """A format of detections, with one file or folder per camera."""
 
     name: str
-    """For messages and documents."""
+    """Name of the format, for messages and documentation."""
     names: tuple[str, ...]
-    """Names of a camera's file, or without a suffix its folder; {} is the camera."""
+    """Name patterns of a camera's file, or (without a suffix) of its folder; {} stands for the
+    camera's name."""
     read: Callable[[Path, Camera], CameraPeople | ViewStream]
-    """Function that reads a camera: people, or candidates with affinities; InputError naming file, place and
-    cure."""
+    """Function that reads one camera: people, or candidates with affinities; InputError naming
+    file, place and cure."""
 
 
 JSON = Format(
@@ -62,11 +65,13 @@ HDF5 = Format(
 )
 TEXT = Format("4D Association's text", ("{}.txt",), read_association_text)
 FORMATS = [TEXT, JSON, CSV, HDF5]
-"""Known formats; the first one by whose names some camera has a file or folder reads those of all cameras."""
+"""Known formats. The first one with a matching file or folder for some camera is used for all
+cameras."""
 _FOLDERS = ("detection", "output_data/raw_data", "raw_data")
-"""Folders of detections in the recordings of 4D Association and FreeMoCap."""
+"""Subfolders with detections in the recordings of 4D Association and FreeMoCap."""
 _PROGRAM_S = re.compile(r"^(alphapose-)?results_|_results$|_json$|\.analysis$|DLC[_A-Za-z].*")
-"""What programs add to the name of a camera or a video: the part after DLC has numbers of its own."""
+"""Pattern of affixes that programs add to the name of a camera or video; the part after DLC
+contains other numbers."""
 _FREEMOCAP_FILES = re.compile(r"2dData_numCams_numFrames_numTrackedPoints_pixelXY\.npy$|^mediaPipeData_2d\.npy$")
 
 
@@ -79,12 +84,13 @@ def read_detections(
 ) -> DetectionTable:
     """Read the detections of every camera of `rig` from the folder `path`, undistorted.
 
-    The formats are `FORMATS`, recognised by the files (docs/conventions.md). Cameras that the rig does not have
-    are skipped. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a TOML file that describes it;
-    without it names of joints in the files determine it, or what a project declares, else the number of keypoints.
-    `notes` of the table say how the files were interpreted. `kept` holds the recording, in memory by default: with
-    an empty `InFolder` it may be larger than that. With `own_frames` cameras may have different numbers of frames.
-    Raises InputError, one sentence that names file, place and cure.
+    The formats are `FORMATS`, recognised by the files (docs/conventions.md). Files of cameras that
+    are not in the rig are ignored. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a
+    TOML file that describes it; by default it is determined by joint names in the files, by a
+    project's declaration, or by the number of keypoints. `notes` of the table list how the files
+    were interpreted. The recording is stored in `kept`, by default in memory; with an empty
+    `InFolder` it may be larger than memory. With `own_frames`, cameras may have different numbers
+    of frames. Raises InputError, one sentence that names file, place and cure.
     """
     kept = InMemory() if kept is None else kept
     form, places, notes = find_places(Path(path), rig)
@@ -114,8 +120,8 @@ def read_detections(
 
 
 def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
-    """The format, every camera's file or folder in the folder `path`, in the rig's order, and notes on inferred
-    names.
+    """The format, the file or folder of each camera (in the rig's order) in the folder `path`, and
+    notes on inferred names.
 
     InputError naming the camera that is missing.
     """
@@ -140,7 +146,7 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}" are missing,'
                 f" {folder} contains {holds}; add them, or leave the camera out with --without {missing}"
             )
-    # `walk_Miqus_1_23087_json` of camera `23087`, `cam01_json` of camera `int_cam1`.
+    # Such as `walk_Miqus_1_23087_json` for camera `23087`, or `cam01_json` for camera `int_cam1`.
     for form, offered, names in _offered(entries):
         if (told := told_by_parts(folder, rig.names, offered, names)) is not None:
             return form, *told
@@ -162,9 +168,9 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
 
 
 def camera_names(path: Path) -> list[str]:
-    """Names of cameras by the files and folders at a place that `read_detections` reads.
+    """Names of cameras, from the files and folders at a path that `read_detections` can read.
 
-    InputError where there are none.
+    InputError if there are none.
     """
     if path.is_file():
         folder, entries = path.parent, [path]
@@ -190,13 +196,15 @@ def camera_names(path: Path) -> list[str]:
 
 
 def _entries(path: Path) -> tuple[Path, list[Path]]:
-    """The folder of the detections, which may be inside of `path`, and its entries."""
+    """The folder of the detections, which may be a subfolder of `path`, and its entries."""
     folder = next((each for name in _FOLDERS if (each := path / name).is_dir()), path)
     return folder, sorted(each for each in folder.iterdir() if not each.name.startswith("."))
 
 
 def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
-    """Possible files of cameras in a folder, by format, with the names of the cameras."""
+    """For each format, the files of a folder that may belong to cameras, and the names of these
+    cameras.
+    """
     files = [each for each in entries if each.is_file()]
     folders = [each for each in entries if each.is_dir()]
     tables = [each for each in files if each.suffix == ".csv" and is_deeplabcut(each)]
@@ -215,7 +223,7 @@ def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
 
 
 def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
-    """The format of a file that holds all cameras; None for other files."""
+    """The format of a file with all cameras; None for other files."""
     if file.is_file() and _FREEMOCAP_FILES.search(file.name) is not None:
         return Format("", (), lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)))
     if file.is_file() and file.suffix == ".csv" and is_caliscope(file):
@@ -224,20 +232,20 @@ def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
 
 
 def _unfiltered(files: list[Path]) -> list[Path]:
-    """Files without DeepLabCut's `_filtered` ones where the unfiltered ones exist."""
+    """Files without DeepLabCut's `_filtered` versions, if unfiltered ones exist."""
     there = {each.name for each in files}
     return [each for each in files if each.name.replace("_filtered", "") not in there - {each.name}]
 
 
 def _read_folder(place: Path, camera: Camera) -> CameraPeople:
-    """The people in a camera's folder or file: YOLO's labels, or JSON."""
+    """Read the people in a camera's folder or file: YOLO's labels, or JSON."""
     if place.is_dir() and not any(place.glob("*.json")) and len(label_files(place)) > 0:
         return read_yolo(place, camera.image_size)
     return read_json_people(place)
 
 
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
-    """The file that is named after a camera, or a folder where the pattern has no suffix."""
+    """The file named after a camera; a folder if the pattern has no suffix."""
     for pattern in patterns:
         place = folder / pattern.format(name)
         if place.is_file() if Path(pattern).suffix else place.is_dir():
@@ -246,7 +254,7 @@ def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
 
 
 def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None) -> Skeleton:
-    """The skeleton of all candidates."""
+    """The common skeleton of all candidates."""
     first = streams[0]
     skeleton = first.skeleton or wanted or BODY_25
     for each in streams[1:]:
@@ -265,7 +273,8 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
 def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:
     """The people of every camera as candidates, notes on their scores and frames, and the table's `first`.
 
-    Where all files list people and not frames, their numbers are the frames': earlier frames are empty.
+    If all files list only frames with people, frame numbers are used as they are, and earlier
+    frames are empty.
     """
     cameras = [each.camera for each in people]
     first, last = _span(cameras)
@@ -283,7 +292,7 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
         notes.append(f"frame 0 has number {first} in the files")
     streams = []
     for each, camera in zip(people, cameras, strict=True):
-        # A camera that lists every one of its frames must list those of the others.
+        # A camera that lists every frame must list the frames of the other cameras.
         span = (camera.first, camera.last) if camera.every_frame else (first, last)
         streams.append(candidates_of(each, rule, skeleton, *span))
         if len(camera.gaps) > 0:

@@ -1,4 +1,4 @@
-"""Detections of one camera in blocks of frames, and a table of those of all cameras."""
+"""Detections of one camera in blocks of frames, and their combination to a table of all cameras."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,35 +17,35 @@ from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES, DetectionTable, keep_block
 
 MARGIN = 0.25
-"""Distance outside the picture at which a detector may place a joint, as a share of the picture's size."""
+"""Maximum distance of a joint outside the picture, as a share of the picture's size."""
 _STRAY = 0.05
-"""Largest share of a camera's joints far outside its picture: they are left out, and a note says so. More are
-detections of other pictures."""
+"""Maximum share of a camera's joints far outside its picture; these are left out, with a note. A
+larger share means that the detections belong to other pictures."""
 _BENT = 0.5
-"""Largest share of a camera's joints where its distortion cannot be undone, as in the corners of wide lenses. More
-mean that the coefficients are wrong."""
+"""Maximum share of a camera's joints at which its distortion cannot be inverted, as in the corners
+of wide lenses. A larger share means that the coefficients are wrong."""
 _LEAST_SCORE = 1e-6
-"""Score below which a joint was not detected; products of such scores are 0."""
+"""Score below which a joint counts as not detected; products of smaller scores underflow."""
 
 
 @dataclass(frozen=True)
 class ViewCandidates:
-    """All candidates that one camera saw in some frames, sorted by frame and then by joint."""
+    """All candidates of one camera in some frames, sorted by frame and then by joint."""
 
     frame: Index
-    """(D,) frame of each candidate, from 0."""
+    """(D,) frame of each candidate, counted from 0."""
     seen: Detections
-    """The candidates, of view 0, pixels as measured; pairs join two of one frame."""
+    """The candidates, with view 0 and distorted pixels as detected; pairs are within a frame."""
 
     @classmethod
     def of(
         cls, frame: Index, joint: Index, xy: Array, confidence: Array, pairs: Index, affinity: Array
     ) -> "ViewCandidates":
-        """Candidates from columns as in `Detections`."""
+        """Make candidates from columns as in `Detections`."""
         return cls(frame, Detections(np.zeros_like(joint), joint, xy, confidence, pairs, affinity))
 
     def only(self, keep: Mask) -> "ViewCandidates":
-        """The candidates of the mask `keep` (D,), and the pairs between them."""
+        """The candidates selected by the mask `keep` (D,), and the pairs between them."""
         return self if keep.all() else ViewCandidates(self.frame[keep], self.seen.only(keep))
 
 
@@ -55,18 +55,18 @@ _NOTHING = ViewCandidates.of(_NONE, _NONE, np.zeros((0, 2)), np.zeros(0), np.zer
 
 @dataclass(frozen=True)
 class ViewStream:
-    """All candidates that one camera saw in a recording, in blocks of `BLOCK_FRAMES` frames."""
+    """All candidates of one camera in a recording, in blocks of `BLOCK_FRAMES` frames."""
 
     source: Path
-    """The file or folder that they come from, for messages."""
+    """The file or folder, for messages."""
     frame_count: int
-    """T, the number of frames in the source, with and without people."""
+    """T, number of frames in the source, including those without people."""
     blocks: Iterator[ViewCandidates]
-    """The blocks in order, which are read one by one; the last may have fewer frames."""
+    """The blocks in order, read one by one; the last may have fewer frames."""
     first_number: int = 0
     """Number of the first frame in the source."""
     skeleton: Skeleton | None = None
-    """Skeleton of the candidates, where the source states it."""
+    """Skeleton of the candidates, if the source defines it."""
 
 
 def assemble(
@@ -74,9 +74,9 @@ def assemble(
 ) -> DetectionTable:
     """Combine the views of a recording, one `ViewStream` per camera of `rig`, undistorted; stored in `kept`.
 
-    Where they have different frames, the common ones are used, and a note says so; with `own_frames` all are, and
-    views are empty in missing ones. Raises InputError where there are none, or where the views do not fit their
-    pictures.
+    If they have different frames, the common ones are used, with a note; with `own_frames` all are
+    used, and missing ones are empty. InputError if there are none, or if the detections do not fit
+    the size of the pictures.
     """
     views, count, said = _aligned(views, own_frames)
     ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
@@ -94,7 +94,9 @@ def assemble(
 
 
 def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[ViewStream], int, list[str]]:
-    """The frames that all views have, or with `own_frames` any; their number, a note where some have others."""
+    """Restrict all views to their common frames, or with `own_frames` extend them to all frames;
+    returns the views, the number of frames, and a note if frames differ.
+    """
     starts, stops = zip(
         *((each.first_number, each.first_number + each.frame_count) for each in views), strict=True
     )
@@ -103,7 +105,7 @@ def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[Vi
         return views, stop - start, []
     spans, folder = _spans(views), views[0].source.parent
     if start >= stop:
-        for view in views:  # what is wrong with their files goes first
+        for view in views:  # errors in the files are reported first
             for _ in view.blocks:
                 pass
         cure = "give the same frames of each camera with the same numbers"
@@ -131,8 +133,8 @@ def _span_words(view: ViewStream) -> str:
 
 
 def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
-    """The `count` frames of a view that follow its first `lead`, or of `-lead` empty frames and its own where that
-    is negative. All blocks of the view are read.
+    """The `count` frames of a view after its first `lead` ones. If `lead` is negative, `-lead`
+    empty frames come first. All blocks of the view are read.
     """
 
     def blocks() -> Iterator[ViewCandidates]:
@@ -153,16 +155,18 @@ def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
 
 
 def _joined(parts: Sequence[ViewCandidates]) -> ViewCandidates:
-    """Candidates of one view after each other."""
+    """Concatenate candidates of one view."""
     frame = np.concatenate([part.frame for part in parts])
     return ViewCandidates(frame, Detections.joined([part.seen for part in parts]))
 
 
 def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detections, Index, Index]:
-    """The candidates of all views in some frames, and (T + 1,) where candidates and pairs of each frame begin."""
+    """The candidates of all views in some frames, and the offsets (T + 1,) of candidates and pairs
+    of each frame.
+    """
     parts = [replace(view.seen, view=np.full(len(view.frame), n)) for n, view in enumerate(views)]
     every, frame = Detections.joined(parts), np.concatenate([view.frame for view in views])
-    # Views come in order and each is sorted by frame: a stable sort leaves (frame, view, joint).
+    # Views are in order and each is sorted by frame: a stable sort yields (frame, view, joint).
     order = np.argsort(frame, kind="stable")
     frame, every = frame[order], every.rows(order)
     pair_frame = frame[every.pairs[:, 0]]
@@ -175,21 +179,22 @@ def _together(views: Sequence[ViewCandidates], frames: range) -> tuple[Detection
 
 
 def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> DetectionTable:
-    """The recording whose frame t is, for each view v, frame `picture` (T, V)[t, v] of the given one; -1 is none.
+    """Regroup a recording to synchronised frame sets: view v of frame t is its own frame `picture`
+    (T, V)[t, v]; -1 for none.
 
     Stored in `kept`.
     """
     count, views = picture.shape
     for n, begin in enumerate(range(0, count, BLOCK_FRAMES)):
         frames = range(begin, min(begin + BLOCK_FRAMES, count))
-        # One view after the other, each with its few blocks of the recording at hand.
+        # View by view, so that few blocks of the recording are in memory.
         seen = [_frames_of(recording, view, picture[frames, view], begin) for view in range(views)]
         keep_block(kept, n, *_together(seen, frames))
     return replace(recording, kept=kept, frame_count=count, first=0, picture=picture)
 
 
 def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int) -> ViewCandidates:
-    """Candidates of a view in some of its frames, as frames `begin` and on; -1 is none."""
+    """Candidates of a view in the frames `picture`, renumbered from `begin` on; -1 for none."""
     there = np.flatnonzero(picture >= 0)
     every = [recording[frame] for frame in picture[there].tolist()]
     parts = [each.only(each.view == view) for each in every]
@@ -198,21 +203,21 @@ def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int)
 
 
 class _LeftOut:
-    """Candidates of a camera that were left out for one reason."""
+    """Counts the candidates of a camera that are left out for one reason."""
 
     def __init__(self, cure: str, most: float) -> None:
         self._cure, self._most = cure, most
         self._count, self._of, self._first = 0, 0, ""
 
     def add(self, out: Mask, words: Callable[[int], str]) -> None:
-        """Count the candidates (D,) of a block that are left out; `words` describes one of them."""
+        """Count the candidates `out` (D,) of a block; `words` describes one of them."""
         if self._count == 0 and out.any():
             self._first = words(int(np.argmax(out)))
         self._count += int(out.sum())
         self._of += len(out)
 
     def note(self) -> list[str]:
-        """A sentence, if there were some; InputError where there are too many for chance."""
+        """A sentence, if any were left out; InputError if there are too many."""
         joints = "joint" if self._count == 1 else "joints"
         share = f"{self._count} {joints} of {self._of} ({self._count / max(self._of, 1):.1%})"
         if self._count > self._most * self._of:
@@ -221,7 +226,7 @@ class _LeftOut:
 
 
 class _Undistorted:
-    """One camera's candidates with the pixels of a camera without distortion, and those that were left out."""
+    """Undistorts the candidates of one camera, and counts those that are left out."""
 
     def __init__(self, source: Path | str, camera: Camera) -> None:
         self.source, self.camera = source, camera
@@ -231,7 +236,7 @@ class _Undistorted:
         )
 
     def undistorted(self, view: ViewCandidates) -> ViewCandidates:
-        """A block."""
+        """Undistort a block."""
         camera, (width, height), xy = self.camera, self.camera.image_size, view.seen.xy
         size = np.array([width, height], dtype=np.float64)
         outside = np.any((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size), axis=1)
@@ -245,11 +250,13 @@ class _Undistorted:
         return replace(certain, seen=replace(certain.seen, xy=straight)).only(~undone)
 
     def _words(self, view: ViewCandidates, why: str, row: int) -> str:
-        """Which candidate of a block is left out, and why."""
+        """Text that identifies one left-out candidate of a block, with the reason."""
         x, y = view.seen.xy[row]
         return f"{self.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), {why}"
 
 
 def undistorted(view: ViewCandidates, source: Path | str, camera: Camera) -> ViewCandidates:
-    """Undistorted detections of one camera; joints without an undistorted place are left out."""
+    """Undistorted detections of one camera; joints whose distortion cannot be inverted are left
+    out.
+    """
     return _Undistorted(source, camera).undistorted(view)

@@ -1,4 +1,6 @@
-"""People in YOLO's labels: a text file a frame, a line a person, everything as parts of the picture's size."""
+"""People in YOLO's labels: a text file per frame, a line per person, coordinates relative to the
+picture's size.
+"""
 
 from pathlib import Path
 
@@ -13,16 +15,18 @@ from shapepose_fg.io.validation import is_number
 _YOLO = "YOLO's labels"
 _RERUN = "run yolo pose again with save_txt=True"
 _BOX = 5
-"""Number of values in front of the keypoints: class, and middle, width and height of the box."""
+"""Number of values before the keypoints: class, and centre, width and height of the box."""
 
 
 def label_files(folder: Path) -> list[tuple[int, Path]]:
-    """The files of frames in a folder, or in its folder labels, with their numbers; none where there is none."""
+    """The label files of a folder, or of its subfolder labels, with their frame numbers; empty if
+    there are none.
+    """
     return numbered(folder, r"\.txt") or numbered(folder / "labels", r"\.txt")
 
 
 def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
-    """The people of one camera whose pictures have `image_size` (width, height).
+    """Read the people of one camera; `image_size` is (width, height) of its pictures.
 
     Frames without people have no file. InputError naming file, line and cure.
     """
@@ -37,7 +41,9 @@ def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
 
 
 def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]) -> list[float]:
-    """x, y and score of each keypoint; the box's confidence and a track's number may follow."""
+    """x, y and score of each keypoint; the box's confidence and a track number may follow in the
+    line.
+    """
     if not all(is_number(word) for word in words):
         raise InputError(f"{file}: line {line} must hold numbers; {_RERUN}")
     numbers = np.array(words[_BOX:], dtype=np.float64)
@@ -53,6 +59,6 @@ def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]
             f"{file}: line {line} must hold x and y of keypoints as fractions of the picture size, and scores;"
             f" {_RERUN}"
         )
-    points[(points[:, :2] == 0).all(axis=1), 2] = 0  # points that are hardly seen are in the corner 0 0
+    points[(points[:, :2] == 0).all(axis=1), 2] = 0  # keypoints with a low score are at 0 0
     points[:, :2] *= image_size
     return points.ravel().tolist()

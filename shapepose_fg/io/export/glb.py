@@ -1,4 +1,4 @@
-"""GLB, binary glTF 2.0: every person's skinned mesh with its motion; y up, metres, seconds."""
+"""GLB, binary glTF 2.0: the animated skinned mesh of every person; y up, metres, seconds."""
 
 import json
 import struct
@@ -16,15 +16,16 @@ from shapepose_fg.io.export.skinned import BONES, Motion, everybody
 from shapepose_fg.io.export.take import y_up
 
 _SET = 4
-"""Number of bones in a set of influences. Every program reads the first set, Blender all of them."""
+"""Number of bone influences of a vertex in one set. Every program reads the first set, Blender all
+sets."""
 _ARRAY, _ELEMENTS = 34962, 34963
-"""glTF's targets of arrays: attributes of vertices, and indices of triangles."""
+"""glTF's buffer targets: vertex attributes, and triangle indices."""
 _COMPONENTS = {"uint8": 5121, "uint32": 5125, "float32": 5126}
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
 def write_glb(job: Job) -> Written:
-    """`people.glb`."""
+    """Write `people.glb`."""
     written, turn = Written(), y_up(job.take.up)
     take, origin = written.near_origin(job.take, turn, "glb", "extras.origin_m of its scene")
     motions = dict(everybody(job, take, "glb", turn, written))
@@ -39,11 +40,13 @@ def write_glb(job: Job) -> Written:
 def glb_bytes(
     motions: dict[int, Motion], arrays: SmplArrays, times_s: Array, origin_m: Array | None = None
 ) -> bytes:
-    """A GLB file of people by their numbers, in frames taken at `times_s` (T,); the file's time 0 is the first.
+    """A GLB file of people by number, in frames at `times_s` (T,), seconds; time 0 of the file is
+    the first frame.
 
-    A person is a node with a tree of 24 joints and a skinned mesh below it. Where a person is not there, its node
-    is scaled to zero, glTF's way to hide things. Rotations are interpolated along the sphere, the pelvis on a
-    line. `origin_m` (3,) is where the file's origin is in the world, in the file's axes.
+    A person is a node with a tree of 24 joints and a skinned mesh below it. While a person is
+    absent, the node is scaled to zero, the usual way to hide objects in glTF. Rotations are
+    interpolated spherically, the pelvis linearly. `origin_m` (3,), metres, is the file's origin in
+    the world, in the file's axes.
     """
     file = _File()
     shared: dict[str, int] = {}
@@ -60,7 +63,9 @@ def glb_bytes(
 
 
 class _File:
-    """glTF's lists, and its binary part: arrays one after the other, each described by an accessor."""
+    """The lists of a glTF file, and its binary part: arrays one after the other, each described by
+    an accessor.
+    """
 
     def __init__(self) -> None:
         names = "nodes meshes materials skins accessors bufferViews".split()
@@ -69,14 +74,14 @@ class _File:
         self._binary = bytearray()
 
     def add(self, kind: str, **what: Any) -> int:
-        """Add to one of the lists; the number in it."""
+        """Append to the list `kind`; returns the index in it."""
         self.lists[kind].append(what)
         return len(self.lists[kind]) - 1
 
     def array(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
-        """The accessor of an array; positions and times need `bounds`."""
-        flat = np.ascontiguousarray(values.mT if values.ndim == 3 else values)  # matrices go column by column
-        self._binary += bytes(-len(self._binary) % 4)  # each array begins at a multiple of 4 bytes
+        """Append an array and return its accessor; positions and times need `bounds`."""
+        flat = np.ascontiguousarray(values.mT if values.ndim == 3 else values)  # matrices are column-major
+        self._binary += bytes(-len(self._binary) % 4)  # arrays are aligned to 4 bytes
         place = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": flat.nbytes}
         self._binary += flat.tobytes()
         limits = {"min": np.atleast_1d(flat.min(0)).tolist(), "max": np.atleast_1d(flat.max(0)).tolist()}
@@ -90,7 +95,7 @@ class _File:
         )
 
     def content(self, roots: list[int], more: dict[str, Any]) -> bytes:
-        """The whole file, whose scene are the nodes `roots`, with `more` properties."""
+        """The whole file; its scene has the root nodes `roots`, and `more` are further properties."""
         binary = bytes(self._binary) + bytes(-len(self._binary) % 4)
         tree = {
             "asset": {"version": "2.0", "generator": "shapepose-fg"},
@@ -108,10 +113,12 @@ class _File:
 
 
 def influences(weights: Array) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
-    """The bones (Nv, 4) that move each vertex most, with their weights (Nv, 4); then the next four, if there are.
+    """The four bones (Nv, 4) with the largest weights of each vertex, and these weights (Nv, 4);
+    then the next four, and so on.
 
-    All sets together are the weights (Nv, 24) themselves. A program that reads the first set alone and makes it
-    sum to 1 again draws 1 in 100 vertices of the open body, at neck and shoulders, more than 1 mm elsewhere.
+    All sets together are equal to the weights (Nv, 24). A program that reads and renormalises only
+    the first set draws 1 in 100 vertices of the open body, at neck and shoulders, with an error of
+    more than 1 mm.
     """
     order = np.argsort(-weights, axis=1, kind="stable")
     sorted_weights = np.take_along_axis(weights, order, axis=1).astype(np.float32)
@@ -119,16 +126,17 @@ def influences(weights: Array) -> list[tuple[NDArray[np.uint8], NDArray[np.float
     sets = []
     for start in range(0, most, _SET):
         part = slice(start, start + _SET)
-        # glTF wants 0 for a bone without weight.
+        # glTF requires bone 0 for a weight of zero.
         joints = np.where(sorted_weights[:, part] > 0, order[:, part], 0).astype(np.uint8)
         sets.append((joints, np.ascontiguousarray(sorted_weights[:, part])))
     return sets
 
 
 def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], triangles: int) -> int:
-    """Nodes of a person in the pose of its first frame, with mesh, material and skin; the number of the first.
+    """Add the nodes of a person in the pose of the first frame, with mesh, material and skin;
+    returns the index of the first node.
 
-    All people have the same `triangles` and `shared` attributes of vertices, which are accessors.
+    All people have the same `triangles` and `shared` vertex attributes, which are accessors.
     """
     first, rest, name = len(file.lists["nodes"]), motion.rest, f"person_{who}"
     file.add("nodes", name=name, children=[first + 1, first + 1 + BONES])
@@ -152,7 +160,7 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
     material = file.add("materials", name=name, pbrMetallicRoughness=surface)
     primitive = {"attributes": attributes, "indices": triangles, "material": material}
     mesh = file.add("meshes", name=name, primitives=[primitive])
-    # A bone's frame in the T-pose is the body's own, moved to the joint.
+    # In the T-pose, a bone's frame is that of the body, translated to the joint.
     inverse = np.tile(np.eye(4, dtype=np.float32), (BONES, 1, 1))
     inverse[:, :3, 3] = -rest.joints
     bones = list(range(first + 1, first + 1 + BONES))
@@ -162,7 +170,7 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
 
 
 def _animate(file: _File, first: int, motion: Motion, times: Array) -> None:
-    """The channels of a person whose node is number `first`."""
+    """Add the animation channels of the person whose first node is `first`."""
 
     def channel(node: int, path: str, at: int, values: Array, interpolation: str = "LINEAR") -> None:
         output = file.array(values.astype(np.float32))
@@ -183,13 +191,13 @@ def _animate(file: _File, first: int, motion: Motion, times: Array) -> None:
 
 
 def _shortest(rotations: Array) -> Array:
-    """Quaternions (F, 24, 4) with signs such that each is near the one before."""
+    """Quaternions (F, 24, 4) with signs such that successive ones are close to each other."""
     inner = (rotations[1:] * rotations[:-1]).sum(axis=-1, keepdims=True)
     signs = np.cumprod(np.where(inner < 0, -1.0, 1.0), axis=0)
     return np.concatenate([rotations[:1], rotations[1:] * signs])
 
 
 def _linear(colour: tuple[float, float, float]) -> list[float]:
-    """A colour as glTF's factors have it: linear light, from sRGB (IEC 61966-2-1)."""
+    """A colour in linear light, as required by glTF, converted from sRGB (IEC 61966-2-1)."""
     srgb = np.array(colour)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).tolist()

@@ -1,7 +1,8 @@
-"""Points with names as files of markers: TRC (OpenSim, Pose2Sim: text, metres), C3D (laboratories: binary, mm).
+"""Marker files of named points: TRC (OpenSim, Pose2Sim: text, metres), C3D (laboratories: binary,
+mm).
 
-Both are y up. A missing marker is NaN in TRC (its other notation is a blank, but OpenSim 4.6 refuses a row whose
-last marker is blank), and has the residual -1 in C3D, which ezc3d writes.
+Both are y up. A missing marker is NaN in TRC (a blank is also allowed, but OpenSim 4.6 refuses a
+row with a blank last marker), and has the residual -1 in C3D, which is written by ezc3d.
 """
 
 import tempfile
@@ -23,7 +24,7 @@ from shapepose_fg.io.export.take import Take, opensim_axes
 from shapepose_fg.io.pose2sim_project import Pose2SimProject
 
 _MOST = 65_535
-"""Maximum number of frames, and of a frame, in a C3D file, which has 16 bits for them."""
+"""Maximum number of frames in a C3D file, and maximum frame number: both have 16 bits."""
 _TRC_HEAD = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
 
 
@@ -34,9 +35,9 @@ class Markers:
     names: tuple[str, ...]
     """(M,) names."""
     xyz: Array
-    """(T, M, 3) metres, y up; NaN where the marker is missing."""
+    """(T, M, 3) metres, y up; NaN if the marker is missing."""
     sigma_m: Array
-    """(T, M) standard deviation, root mean square over the axes, metres; NaN where unknown."""
+    """(T, M) standard deviation, root mean square over the axes, metres; NaN if unknown."""
 
     @property
     def there(self) -> Mask:
@@ -45,12 +46,12 @@ class Markers:
 
     @property
     def frames(self) -> Index:
-        """(F,) the frames with a marker."""
+        """(F,) the frames with at least one marker."""
         return np.flatnonzero(self.there.sum(axis=1))
 
 
 def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | None = None) -> Markers:
-    """The markers of one person; `arrays` is the body model, for `MarkerSet.BODY` only."""
+    """The markers of one person; `arrays` is the body model, required only for `MarkerSet.BODY`."""
     axes = opensim_axes(take.up)
     if kind == MarkerSet.BODY:
         if arrays is None:
@@ -67,8 +68,9 @@ def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | No
 
 
 def opensim_names(joints: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of joints in Pose2Sim's OpenSim models: ours, except for the middle of the hips, which is `Hip` in
-    the model for HALPE_26, which has the top of the head too, and `CHip` in those for BODY_25 and COCO.
+    """Names of joints in Pose2Sim's OpenSim models. They are ours, except for MidHip: `Hip` in the
+    model for HALPE_26 (which also has the top of the head), and `CHip` in those for BODY_25 and
+    COCO.
     """
     hip = "Hip" if "Head" in joints else "CHip"
     return tuple(hip if name == MID_HIP else name for name in joints)
@@ -85,7 +87,9 @@ def write_trc(job: Job) -> Written:
 
 
 def write_c3d(job: Job) -> Written:
-    """A file per person, or several of 65,535 frames, from the first to the last with a marker, at one rate."""
+    """A file per person, from the first to the last frame with a marker, at a constant rate;
+    several files beyond 65,535 frames.
+    """
     optional("ezc3d", "export")
     written = Written()
     even, origin = _c3d_take(written, job.take)
@@ -100,7 +104,9 @@ def write_c3d(job: Job) -> Written:
 
 
 def _c3d_take(written: Written, take: Take) -> tuple[Take, Array]:
-    """The take as C3D can hold it, at one rate and near its origin (3,), metres in the axes of the file."""
+    """The take in a form for C3D: at a constant rate and near a local origin (3,), metres in the
+    axes of the file.
+    """
     even = written.at_one_rate(take)
     return written.near_origin(even, opensim_axes(take.up), "c3d", "its parameter POINT:ORIGIN_M")
 
@@ -108,7 +114,7 @@ def _c3d_take(written: Written, take: Take) -> tuple[Take, Array]:
 def _each(
     job: Job, take: Take, kind: str, written: Written, write: Callable[[int, Markers, Take, Written], None]
 ) -> Written:
-    """Write all people with a marker; others are noted."""
+    """Write a file for each person with a marker; people without markers are noted."""
     for person, who in enumerate(take.persons.tolist()):
         markers = markers_of(take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None)
         if len(markers.frames) > 0:
@@ -119,10 +125,11 @@ def _each(
 
 
 def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: str) -> str:
-    """A TRC file, metres to 6 digits; `name` stands in its first line.
+    """A TRC file, metres with 6 decimals; `name` is in its first line.
 
-    A frame without any marker has no row, for OpenSim's inverse kinematics stops at one. The rows' own numbers and
-    times say what is missing; `fps` is for readers that want a rate. ValueError where no frame has a marker.
+    A frame without any marker has no row, because OpenSim's inverse kinematics would stop there.
+    Frame numbers and times of the rows show which are missing; `fps` is for programs that need a
+    rate. ValueError if no frame has a marker.
     """
     rows = markers.frames
     if len(rows) == 0:
@@ -172,10 +179,10 @@ def c3d_bytes(
     """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where frames count from 1.
     `part` has at most 65,535 frames, and the last is number 65,535 at most.
 
-    A point's residual is the standard deviation of its place in whole millimetres, which the format keeps in a
-    byte: 1 to 255, where 255 is more, too. It is 0 where it is not known (C3D's word for a point that was
-    computed), and -1 where the point is missing. `origin_m` (3,) is where the points' origin is in the world,
-    metres, in the axes of the file.
+    A point's residual is the standard deviation of its position in whole millimetres, clipped to 1
+    to 255 because the format has one byte for it. It is 0 if unknown (in C3D: a computed point),
+    and -1 if the point is missing. `origin_m` (3,), metres, is the origin of the points in the
+    world, in the axes of the file.
     """
     ezc3d = optional("ezc3d", "export")
     xyz, sigma, there = markers.xyz[part], markers.sigma_m[part], markers.there[part]
@@ -185,7 +192,7 @@ def c3d_bytes(
     point["RATE"]["value"] = [fps]
     point["LABELS"]["value"] = list(markers.names)
     point["UNITS"]["value"] = ["mm"]
-    # The axes as Pose2Sim's files have them: up on the screen is y.
+    # Axes as in Pose2Sim's files: y is up.
     file.add_parameter("POINT", "X_SCREEN", "+Z")
     file.add_parameter("POINT", "Y_SCREEN", "+Y")
     if origin_m is not None and origin_m.any():
@@ -196,18 +203,19 @@ def c3d_bytes(
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = np.where(there, residuals, -1).T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, xyz.shape[1], len(xyz)), dtype=bool)
-    with tempfile.TemporaryDirectory() as folder:  # ezc3d writes to a path only
+    with tempfile.TemporaryDirectory() as folder:  # ezc3d writes only to a path
         path = Path(folder) / "person.c3d"
         file.write(str(path))
         return path.read_bytes()
 
 
 def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProject) -> Written:
-    """A TRC and a C3D file per person into pose-3d/, where Pose2Sim's next steps look for NAME_A-B.trc; of one
-    person only, where the project is of one: who has most joints in the detections of most frames.
+    """Write a TRC and a C3D file per person into pose-3d/, where Pose2Sim's next steps look for
+    NAME_A-B.trc. For a single-person project, only the person with the most detected joints is
+    written.
 
-    Frames have the project's numbers. A note says why there is no C3D, or nothing at all: this comes at the end of
-    a run, which must not fail here.
+    Frames have the project's numbers. A note gives the reason if there is no C3D or no file: this
+    is the last step of a run, which must not fail here.
     """
     written, folder = Written(), project.pose_3d
     try:

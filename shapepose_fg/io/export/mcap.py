@@ -1,4 +1,4 @@
-"""A result as an MCAP file of ROS 2 messages."""
+"""Exports a result as an MCAP file of ROS 2 messages."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from shapepose_fg.io.ros.mcap_files import McapWriter
 
 
 def write_mcap(job: Job) -> Written:
-    """`people.mcap`: a message of each kind a frame, empty in frames without people."""
+    """Write `people.mcap`: one message of each type per frame, empty in frames without people."""
     take, written, path = job.take, Written(), job.folder / "people.mcap"
 
     def write(stream) -> None:

@@ -1,4 +1,6 @@
-"""Bodies in motion: AMASS-style npz for learning code (z up, metres, radians); BVH for animation (y up)."""
+"""Exports motions of bodies: AMASS-style npz for learning code (z up, metres, radians), and BVH for
+animation (y up).
+"""
 
 import warnings
 from collections.abc import Iterator
@@ -24,11 +26,11 @@ _SHARED = 22
 _AMASS_BETAS = 16
 """Number of shape components in AMASS."""
 OPEN_BODY = "shapepose-fg open body"
-"""Name of the shipped body in files."""
+"""Name of the built-in body model in files."""
 
 
 def write_amass(job: Job) -> Written:
-    """A file per person and segment of frames without a long hole, named by its first and last frame."""
+    """Write a file per person and segment without long gaps, named by its first and last frame."""
     written = Written()
     body = OPEN_BODY if job.body is None else job.body.name
     for name, segment, take in all_segments(job, "amass", z_up(job.take.up), written):
@@ -49,8 +51,9 @@ def write_amass(job: Job) -> Written:
 def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
     """The arrays of AMASS for one segment of one person.
 
-    `poses` (F, 156) are SMPL-H's: pelvis and body are ours; SMPL's two hand joints have no counterpart there, so
-    the fingers are zero, which is SMPL-H's flat hand. `poses_smpl` (F, 72) are all 24 joints of SMPL.
+    `poses` (F, 156) are SMPL-H's: pelvis and body are ours; SMPL's two hand joints have no
+    counterpart in SMPL-H, so all finger rotations are zero (a flat hand). `poses_smpl` (F, 72) are
+    all 24 joints of SMPL.
     """
     frames, rest = len(segment.index), segment.rest
     vectors = Rotation.from_quat(segment.rotations.reshape(-1, 4)).as_rotvec().reshape(frames, -1)
@@ -62,7 +65,7 @@ def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
         "poses_smpl": vectors,
         "betas": np.pad(rest.betas, (0, _AMASS_BETAS - len(rest.betas))),
         "num_betas": np.array(len(rest.betas)),
-        # Older and newer files of AMASS spell it differently.
+        # Older and newer files of AMASS spell this key differently.
         "mocap_framerate": np.array(fps),
         "mocap_frame_rate": np.array(fps),
         "filled": np.asarray(segment.filled),
@@ -70,7 +73,7 @@ def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
 
 
 def _gender(body: str) -> str:
-    """The gender of a body model by the name of its file, as SMPL's are named; neutral where there is none."""
+    """The gender of a body model by its file name, in SMPL's style; neutral if the name has none."""
     name = body.lower().replace("-", "_")
     words = name.replace(".", "_").split("_")
     if "female" in words or "f" in words:
@@ -79,7 +82,7 @@ def _gender(body: str) -> str:
 
 
 def write_bvh(job: Job) -> Written:
-    """A file per person and segment of frames without a long hole, named by its first and last frame."""
+    """Write a file per person and segment without long gaps, named by its first and last frame."""
     written = Written()
     for name, segment, take in all_segments(job, "bvh", y_up(job.take.up), written):
         written.add(name.with_name(f"{name.name}.bvh"), bvh_text(segment, take.fps))
@@ -87,25 +90,28 @@ def write_bvh(job: Job) -> Written:
 
 
 def bvh_text(motion: Motion, fps: float) -> str:
-    """A BVH file: the T-pose, and per frame the place of the pelvis and the rotations.
+    """A BVH file: the T-pose, and per frame the position of the pelvis and the rotations.
 
-    The pelvis' own offset is zero: some programs add it to the place of a frame, others do not.
+    The pelvis has offset zero, because some programs add the offset to its position in a frame, and
+    others do not.
     """
     count = len(motion.index)
     lines = ["HIERARCHY", *_joint(0, motion.rest, ""), "MOTION", f"Frames: {count}", f"Frame Time: {1 / fps:.12g}"]
     angles = _zxy_degrees(motion.rotations[:, _ORDER]).reshape(count, -1)
-    # The rounding is a hundredth of a millimetre at the end of the longest chain.
+    # Rounding errors are a hundredth of a millimetre at the end of the longest chain.
     rows = np.concatenate([np.char.mod("%.6f", motion.pelvis), np.char.mod("%.5f", angles)], axis=1).tolist()
     return "\n".join([*lines, *(" ".join(row) for row in rows)]) + "\n"
 
 
 def _zxy_degrees(rotations: Array) -> Array:
-    """(F, B, 3) angles about z, then the turned x, then the turned y, degrees, of quaternions (F, B, 4).
+    """Euler angles (F, B, 3) of quaternions (F, B, 4), degrees: about z, then the rotated x, then
+    the rotated y.
 
-    From frame to frame no angle jumps by a full turn: programs that draw between frames go along the line.
+    No angle jumps by a full turn between frames, because programs interpolate angles linearly.
     """
     with warnings.catch_warnings():
-        # With x at 90 degrees z and y are one turn; any split of it will do.
+        # With x at 90 degrees, z and y rotate about the same axis (gimbal lock); any split is
+        # valid.
         warnings.filterwarnings("ignore", message="Gimbal lock")
         angles = Rotation.from_quat(rotations.reshape(-1, 4)).as_euler("ZXY", degrees=True)
     return np.unwrap(angles.reshape(*rotations.shape[:2], 3), axis=0, period=360)
@@ -115,18 +121,18 @@ _CHILDREN = [[child for child in range(BONES) if SMPL_PARENTS[child] == joint] f
 
 
 def _tree(joint: int) -> Iterator[int]:
-    """A joint and all below it, as they stand in the file."""
+    """A joint and all its descendants, in the order of the file."""
     yield joint
     for child in _CHILDREN[joint]:
         yield from _tree(child)
 
 
 _ORDER = np.array(list(_tree(0)))
-"""SMPL's joints in the order of the file: channels follow the hierarchy."""
+"""SMPL's joints in the order of the file; channels follow the hierarchy."""
 
 
 def _joint(joint: int, rest: RestBody, indent: str) -> Iterator[str]:
-    """The lines of a joint and of all below it."""
+    """The lines of a joint and of all its descendants."""
     yield f"{indent}{'ROOT' if joint == 0 else 'JOINT'} {SMPL_24[joint]}"
     yield indent + "{"
     inside, place = indent + "\t", "6 Xposition Yposition Zposition" if joint == 0 else "3"

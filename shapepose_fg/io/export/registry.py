@@ -24,14 +24,14 @@ from shapepose_fg.io.solved_setup import CAMERAS, body_of
 
 
 class MarkerSet(StrEnum):
-    """Which points are markers, and their names."""
+    """Selection and names of the markers."""
 
     OPENSIM = "opensim"
     """The joints of the result, named as in the OpenSim models of Pose2Sim."""
     JOINTS = "joints"
-    """The joints of the result with its own names."""
+    """The joints of the result, with the names of the result."""
     BODY = "body"
-    """The 24 joints of the body: smooth, and there whenever the body is."""
+    """The 24 joints of the body: smooth, and available in all frames with a body."""
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class Job:
     folder: Path
     """The output folder."""
     body_file: Path | None = None
-    """File of the body model; None for the one that the result was made with."""
+    """File of the body model; None for the one with which the result was made."""
     markers: MarkerSet = MarkerSet.OPENSIM
     """Markers of TRC and C3D."""
     fill_gaps_s: float = 0.2
-    """Longest hole in a body's motion that is interpolated where a format can have none, s."""
+    """Longest gap in a body's motion, s, that is interpolated for formats without gaps."""
 
     @property
     def body(self) -> Path | None:
-        """File of the body model; None for the shipped one."""
+        """File of the body model; None for the built-in one."""
         named = self.take.people.run.get("body")
         return self.body_file if self.body_file is not None or named is None else Path(str(named))
 
     @cached_property
     def arrays(self) -> SmplArrays:
-        """The body model; InputError where its file is missing."""
+        """The body model; InputError if its file is missing."""
         return body_of(self.take.people.run, self.body_file)
 
 
@@ -68,18 +68,19 @@ class Written:
     files: list[Path] = field(default_factory=list)
     """The written files."""
     notes: list[str] = field(default_factory=list)
-    """Notes on what was left out or changed, a sentence each."""
+    """Notes on what was left out or changed, one sentence each."""
 
     def add(self, path: Path, content: str | bytes) -> None:
-        """Write a file, whole or not at all."""
+        """Write a file, atomically."""
         write_content(path, content)
         self.files.append(path)
 
     def near_origin(self, take: Take, turn: Array, kind: str, where: str) -> tuple[Take, Array]:
-        """The take for formats of seven digits, and (3,) its origin, metres, in the axes that result from `turn`
-        (3, 3).
+        """The take shifted to a local origin for single-precision formats, and that origin (3,),
+        metres, in the axes that result from the rotation `turn` (3, 3).
 
-        An origin that is not the world's is noted, with the place in the file that states it, `where`.
+        If the origin is not that of the world, it is noted, together with the place in the file
+        that states it, `where`.
         """
         local, origin = take.near_origin()
         origin = turn @ origin
@@ -92,7 +93,9 @@ class Written:
         return local, origin
 
     def at_one_rate(self, take: Take) -> Take:
-        """The take for formats with one rate; frames that have no place at it are noted."""
+        """The take at a constant rate, for formats that require one; frames that do not fit the
+        rate are noted.
+        """
         even, lost = take.at_one_rate()
         if lost > 0:
             self.notes.append(
@@ -108,20 +111,22 @@ class Format:
     name: str
     """Name on the command line."""
     about: str
-    """Content and readers, in a few words."""
+    """Content, and programs that read it, in a few words."""
     writer: str
-    """Module and function that writes it: `write(job: Job) -> Written`; with `rows` it is `write(opened, rows,
-    folder) -> Written` of an `OpenedReconstruction` and the rows of it (R,), None for all."""
+    """Module and function that writes it: `write(job: Job) -> Written`. With `rows` it is
+    `write(opened, rows, folder) -> Written` of an `OpenedReconstruction` and row numbers (R,), None
+    for all."""
     identities: bool = True
-    """Whether it has people over time, and so needs a result with identities."""
+    """Whether it stores people over time, and therefore requires a result with identities."""
     observations: bool = False
-    """Whether it has the detections that people were solved from."""
+    """Whether it includes the detections from which people were solved."""
     rows: bool = False
-    """Whether it has the result's rows as they are, and is written without having them all in memory."""
+    """Whether it contains the rows of the result unchanged, and is written without loading all into
+    memory."""
 
     @property
     def write(self) -> Any:
-        """The writer; InputError where a package is missing or a take lacks what it needs."""
+        """The writer function; InputError if a package is missing or the take lacks a requirement."""
         module, function = self.writer.split(":")
         return getattr(import_module(f"shapepose_fg.io.export.{module}"), function)
 
@@ -144,11 +149,13 @@ FORMATS = {
         ),
     )
 }  # fmt: skip
-"""Formats by name. A format of your own is an entry here and a module beside this one."""
+"""Formats by name. To add one, write a module beside this one, and an entry here."""
 
 
 def chosen(names: Sequence[str]) -> list[Format]:
-    """The formats of these names, each once, in the order given; InputError for unknown names."""
+    """The formats with these names, without duplicates, in the given order; InputError for unknown
+    names.
+    """
     for name in names:
         if name not in FORMATS:
             raise InputError(f"format {name}: must be one of {' '.join(FORMATS)}")
@@ -165,11 +172,11 @@ def export_result(
     body: Path | None = None,
     **options: Any,
 ) -> dict[str, Written]:
-    """Export a result to several formats into `folder`; returns the output by format. InputError where it is
-    impossible.
+    """Export a result to several formats into `folder`; returns the output by format. InputError if
+    that is impossible, or if a format has no file to write.
 
-    `options` are those of `read_take`, the others `Job`'s; `body` is the present file of the body model. Existing
-    files are replaced. A format without any file is an InputError too.
+    `options` are passed to `read_take`, the other arguments to `Job`; `body` is the current path of
+    the body model. Existing files are replaced.
     """
     job: Job | None = None
     if not all(each.rows for each in formats):
@@ -198,10 +205,11 @@ def read_take(
     observations: bool = True,
     **options: Any,
 ) -> Take:
-    """Read what is exported of the result at `path`; InputError, one sentence, where it is impossible.
+    """Read the part of the result at `path` that is exported; InputError, one sentence, if that is
+    impossible.
 
-    `up` is needed where there is no cameras.json beside people.npz. `frames` and `persons` choose rows;
-    `observations` also reads their detections. `options` are those of `Take.of`.
+    `up` is required if there is no cameras.json beside people.npz. `frames` and `persons` choose
+    rows; `observations` also reads their detections. `options` are those of `Take.of`.
     """
     cameras = results_folder(path) / CAMERAS
     if up is not None and up not in get_args(Axis):
@@ -215,7 +223,7 @@ def read_take(
                 " write it with `people.save(folder, rig)`"
             )
         people = opened.rows(chosen_rows(opened, path, frames, persons), observations=observations)
-    if frames is not None:  # of those that were reconstructed the ones that are asked for
+    if frames is not None:  # the requested frames among the reconstructed ones
         spans = covered_frames(people.run) or []
         cut = [[max(span.start, frames.start), min(span.stop, frames.stop)] for span in spans]
         people = people.with_run(frames=[[start, stop] for start, stop in cut if start < stop])

@@ -1,4 +1,5 @@
-"""Rerun recordings of a take: written as RRD or shown in the viewer, with a layout, and without telemetry.
+"""Rerun recordings of a take: written to an RRD file or shown in the viewer, with a layout, and
+with telemetry switched off.
 
 In the recording's own axes, metres; missing values are not drawn.
 """
@@ -26,11 +27,11 @@ from shapepose_fg.io.export.take import Take, y_up
 
 APPLICATION = "shapepose-fg"
 _CONNECT_S, _PATIENCE_S = 10.0, 30
-"""Time that a running viewer, and one that is started, may take to answer, s."""
+"""Maximum time to connect to a running viewer, and to a newly started one, s."""
 
 
 def new_stream() -> Any:
-    """An empty recording; InputError where rerun-sdk is not installed."""
+    """An empty recording; InputError if rerun-sdk is not installed."""
     rr = optional("rerun", "view")
     stream = rr.RecordingStream(APPLICATION)
     rr.set_log_time_enabled(False, recording=stream)
@@ -40,8 +41,8 @@ def new_stream() -> Any:
 
 @contextmanager
 def shown(first: Any, url: str | None) -> Iterator[Any]:
-    """A recording that is shown by the viewer at `url`, or by one that is started, with `first` as its layout;
-    InputError where that fails.
+    """A recording that is shown by the viewer at `url`, or by a newly started one; `first` is its
+    layout. InputError if that fails.
     """
     stream, rr = new_stream(), optional("rerun", "view")
     try:
@@ -53,7 +54,7 @@ def shown(first: Any, url: str | None) -> Iterator[Any]:
                 recording=stream,
                 default_blueprint=first,
                 executable_path=viewer_file(),
-                hide_welcome_screen=True,  # it would ask the network for examples
+                hide_welcome_screen=True,  # the welcome screen would load examples from the network
             )
     except (RuntimeError, ValueError, OSError) as error:
         place = "started" if url is None else f"reached at {url}"
@@ -63,12 +64,14 @@ def shown(first: Any, url: str | None) -> Iterator[Any]:
 
 
 def viewer_file() -> str | None:
-    """The viewer of rerun-sdk, also where its folder is not on the PATH; any other one; or None."""
+    """The viewer of rerun-sdk, even if its folder is not on the PATH; otherwise another installed
+    viewer, or None.
+    """
     return shutil.which("rerun", path=sysconfig.get_path("scripts")) or shutil.which("rerun")
 
 
 def quiet_viewer() -> list[str]:
-    """Switch telemetry off; returns notes. InputError where that fails."""
+    """Switch telemetry off; returns notes. InputError if that fails."""
     viewer = viewer_file()
     if viewer is None or not switch_off(viewer):
         return []
@@ -78,7 +81,7 @@ def quiet_viewer() -> list[str]:
 
 
 def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
-    """The body model, or a note where its file is missing: the rest can be shown without it."""
+    """The body model, or a note if its file is missing: the rest can be shown without it."""
     try:
         return job.arrays, []
     except InputError as error:
@@ -87,9 +90,9 @@ def body_if_there(job: Job) -> tuple[SmplArrays | None, list[str]]:
 
 @contextmanager
 def written(path: Path, first: Any) -> Iterator[Any]:
-    """A recording that is written to `path` at the end of the block, whole or not at all."""
+    """A recording that is written to `path` at the end of the block, atomically."""
     stream = new_stream()
-    with tempfile.TemporaryDirectory() as folder:  # rerun writes to a path only
+    with tempfile.TemporaryDirectory() as folder:  # rerun writes only to a path
         draft = Path(folder) / "people.rrd"
         stream.save(draft, default_blueprint=first)
         yield stream
@@ -100,7 +103,7 @@ def written(path: Path, first: Any) -> Iterator[Any]:
 
 
 def write_rrd(job: Job) -> Written:
-    """Write `people.rrd`; without bodies where the body model is missing."""
+    """Write `people.rrd`; without bodies if the body model is missing."""
     found, path = Written(), job.folder / "people.rrd"
     take, origin = found.near_origin(job.take, np.eye(3), "rrd", "origin_m of the entity world/origin")
     arrays, notes = body_if_there(job)
@@ -114,15 +117,17 @@ def write_rrd(job: Job) -> Written:
 
 
 def layout_of(take: Take) -> Any:
-    """The viewer's first layout for a take."""
+    """The viewer's initial layout for a take."""
     drawn = [f"{person_path(who)}/bones" for who in take.persons.tolist()]
     return layout(take.up, take.rig, take.people.joints.reshape(-1, 3), drawn)
 
 
 def layout(up: Axis, rig: Rig | None, around: Array, drawn: Sequence[str]) -> Any:
-    """The viewer's first layout: the world, every camera with people drawn over what it saw, and two plots.
+    """The viewer's initial layout: the world, every camera with people drawn over its detections,
+    and two plots.
 
-    It looks at the points `around` (N, 3); `drawn` is what of people is drawn in cameras.
+    The initial view shows the points `around` (N, 3), metres; `drawn` are the parts of people that
+    are drawn in camera views.
     """
     optional("rerun", "view")
     import rerun.blueprint as rrb
@@ -157,7 +162,7 @@ def layout(up: Axis, rig: Rig | None, around: Array, drawn: Sequence[str]) -> An
 
 
 def _eye(rrb: Any, axis: Axis, around: Array) -> Any:
-    """Looks down on the points (N, 3) from the side, from far enough to see all of them."""
+    """A viewpoint above and beside the points (N, 3), far enough to see all of them."""
     around = around[np.isfinite(around).all(axis=1)]
     low, high = np.quantile(around, [0.02, 0.98], axis=0) if len(around) > 0 else (np.zeros(3), np.ones(3))
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.0)
@@ -168,10 +173,11 @@ def _eye(rrb: Any, axis: Axis, around: Array) -> Any:
 
 
 def switch_off(viewer: str) -> bool:
-    """Switch rerun's telemetry off, which its viewer sends to its makers, with the program `viewer`.
+    """Switch off rerun's telemetry (usage statistics that its viewer sends to the developers), by
+    the program `viewer`.
 
-    For this and all later uses of rerun, as its manual says; True where it was on. InputError where that fails:
-    nothing is sent unasked.
+    According to rerun's manual, the setting is permanent. Returns True if telemetry was on.
+    InputError if switching off fails, so that nothing is sent without consent.
     """
 
     def says(command: str) -> str:
@@ -180,7 +186,9 @@ def switch_off(viewer: str) -> bool:
         return done.stdout
 
     def on() -> bool:
-        """Whether telemetry is on; where the variable CI is set, rerun has none and prints `null`."""
+        """Whether telemetry is on. If the variable CI is set, rerun has no telemetry and prints
+        `null`.
+        """
         settings = json.loads(says("config"))
         return settings is not None and settings.get("analytics_enabled", True)
 

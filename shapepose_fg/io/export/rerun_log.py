@@ -27,45 +27,45 @@ from shapepose_fg.io.footage.placement import CameraFootage, Placement
 _CAMERAS = "world/cameras"
 """Path of the cameras in the recording."""
 _REGION = float(np.sqrt(2 * gammaincinv(1.5, 0.95)))
-"""Radius, in standard deviations, of the ellipsoid that holds 95 % of a Gaussian."""
+"""Radius, in standard deviations, of the 95 % ellipsoid of a 3D Gaussian."""
 _JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
 _PALE = 0.6
-"""Share of white in the colour of a joint that no view saw."""
+"""Share of white in the colour of a joint that no view detected."""
 _CHUNK = 64
-"""Number of bodies that are posed at once."""
+"""Number of bodies that are posed in one batch."""
 _GATES = {
     Gate.TOO_FAR: (213, 43, 43),
     Gate.CONTRADICTS_BODY: (214, 39, 190),
     Gate.BEHIND_CAMERA: (90, 90, 90),
     Gate.NOT_PLACED: (150, 150, 150),
 }
-"""Colours of unused detections, by reason; used ones have their person's."""
+"""Colours of unused detections, by reason; used ones have the colour of their person."""
 _USED_DOT, _UNUSED_DOT = -2.0, -3.0
-"""Radii of dots on the screen, independent of zoom, which rerun marks by negative values."""
+"""Radii of dots in screen units, independent of the zoom; rerun marks these by negative values."""
 _QUALITY = 75
-"""Quality of the JPEGs, out of 100: a second of four cameras in full HD is about 30 MB."""
+"""JPEG quality, 0 to 100; one second of four cameras in full HD has about 30 MB."""
 
 
 def person_path(who: int) -> str:
-    """Path of a person in the recording."""
+    """Path of a person's entities in the recording."""
     return f"world/people/{who}"
 
 
 def camera_path(name: str) -> str:
-    """Path of a camera in the recording, for any name."""
+    """Path of a camera's entities in the recording, for any camera name."""
     return f"{_CAMERAS}/{optional('rerun', 'view').escape_entity_path_part(name)}"
 
 
 def _set_time(stream: Any, take: Take, index: int) -> None:
-    """Set the frame of what is logged from now on."""
+    """Set the frame and time for subsequent logging."""
     stream.set_time("frame", sequence=int(take.frames[index]))
     stream.set_time("time", duration=float(take.times_s[index]))
 
 
 def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
-    """Log everything of a take on the timelines `frame` and `time` (seconds).
+    """Log a complete take on the timelines `frame` and `time` (seconds).
 
-    Cameras and what they saw where they are known; bodies where `arrays`, the body model, is given.
+    Cameras and detections are logged if they are known; bodies if the body model `arrays` is given.
     """
     rr, skin_of = optional("rerun", "view"), None if arrays is None else Skin.of(arrays)
     log_world(stream, take.up, take.rig)
@@ -81,7 +81,9 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
 
 
 class LiveLog:
-    """Logs people who come frame by frame; logs the world and its cameras at the beginning."""
+    """Logs people frame by frame as they arrive; the world and its cameras are logged at the
+    beginning.
+    """
 
     def __init__(self, stream: Any, rig: Rig, arrays: SmplArrays) -> None:
         self._rr, self._stream, self._rig = optional("rerun", "view"), stream, rig
@@ -89,7 +91,7 @@ class LiveLog:
         log_world(stream, rig.up, rig)
 
     def moment(self, rows: Reconstruction) -> None:
-        """Log one frame's people; people who are not in `rows` any more are cleared."""
+        """Log the people of one frame, and clear those who are no longer in `rows`."""
         persons, time_s = rows.person.astype(np.int64), rows.time_s[:1]
         if len(rows) > 0:
             self._stream.set_time("time", duration=float(time_s[0]))
@@ -111,7 +113,7 @@ class LiveLog:
 
 @dataclass(frozen=True)
 class Skin:
-    """A body model, and the part of its skin that is drawn."""
+    """A body model, and the simplified surface that is drawn."""
 
     arrays: SmplArrays
     kept: Index
@@ -121,12 +123,12 @@ class Skin:
 
     @classmethod
     def of(cls, arrays: SmplArrays) -> "Skin":
-        """A skin that is coarse enough for a viewer."""
+        """Simplify the surface for a viewer."""
         return cls(arrays, *thinned(arrays.template, arrays.faces)[:2])
 
 
 def log_world(stream: Any, up: Axis, rig: Rig | None) -> None:
-    """Log what is static: the up axis, and known cameras."""
+    """Log static content: the up axis, and the cameras, if known."""
     rr = optional("rerun", "view")
     axes = f"RIGHT_HAND_{up[-1].upper()}_{'DOWN' if up[0] == '-' else 'UP'}"
     stream.log("world", getattr(rr.ViewCoordinates, axes), static=True)
@@ -139,7 +141,7 @@ def _sigma_path(who: int) -> str:
 
 
 def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> None:
-    """Log what is static for a person: the line's colour, and the triangles of the skin."""
+    """Log static content of a person: line colour, and triangles of the surface."""
     colour = _rgb8(np.array(colour_of(who)))
     stream.log(_sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True)
     if skin_of is not None:
@@ -149,7 +151,9 @@ def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> N
 
 
 def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
-    """Log joints, bones, ellipsoids and sigma of one person, frame by frame; clear what ends."""
+    """Log joints, bones, ellipsoids and sigmas of one person, frame by frame; clear them when the
+    person leaves.
+    """
     who, people, there_before = int(take.persons[person]), take.people, False
     path, plot, colour = person_path(who), _sigma_path(who), np.array(colour_of(who))
     bones, sigma = bones_of(tuple(people.joint_names.tolist())), 1e3 * sigma_m(people.covariance)
@@ -183,7 +187,7 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
 
 
 def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array) -> Any:
-    """The 95 % regions of joints."""
+    """The 95 % ellipsoids of joints."""
     fine = np.isfinite(covariance).all(axis=(1, 2))
     variance, axes = principal_axes(covariance[fine])
     return rr.Ellipsoids3D(
@@ -196,7 +200,7 @@ def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array
 
 
 def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: Skin) -> None:
-    """Log the body of one person in the frames that have one."""
+    """Log the body of one person, in the frames that have one."""
     path, arrays, faces = f"{person_path(int(take.persons[person]))}/body", skin_of.arrays, skin_of.faces
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
@@ -227,7 +231,7 @@ def _log_moving(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
 
 
 def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
-    """Log lenses and poses of cameras; their pictures are those of cameras without distortion."""
+    """Log lenses and poses of cameras; their pictures are undistorted."""
     for camera in rig.cameras:
         pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
         lens = rr.Pinhole(
@@ -243,8 +247,8 @@ def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
 
 
 def _log_observations(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
-    """Log each camera's detections of the people: used ones in their colours, unused ones by reason; and
-    residuals.
+    """Log each camera's detections (used ones in the person's colour, unused ones by reason), and
+    the residuals.
     """
     table = take.people.observations
     if table is None or tuple(table.view_names.tolist()) != rig.names:
@@ -281,7 +285,9 @@ def log_pictures(
     pictures: Sequence[tuple[CameraFootage, Footage]],
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Log the cameras' pictures of a take's frames, undistorted, so that people and detections fit them."""
+    """Log the pictures of the cameras in the frames of a take, undistorted, so that people and
+    detections match them.
+    """
     rr = optional("rerun", "view")
     if take.rig is None:
         raise ValueError("pictures need cameras")
@@ -306,7 +312,9 @@ def log_pictures(
 
 
 def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Place of each pixel of the calibrated picture without distortion in a picture: columns and rows, (H, W)."""
+    """Maps for undistortion (columns and rows, (H, W)): position in the original picture of each
+    pixel of the undistorted, calibrated picture.
+    """
     width, height = camera.image_size
     column, row = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([column.ravel(), row.ravel()], axis=1)

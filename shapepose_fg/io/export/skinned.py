@@ -1,4 +1,6 @@
-"""The bodies of a take as bones and a skin, in NumPy, from which BVH, glTF, AMASS and marker files are made."""
+"""The bodies of a take as bones and skinned surface, in NumPy; used by the exports to BVH, glTF,
+AMASS and marker files.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +19,7 @@ from shapepose_fg.io.export.take import Take
 
 BONES = len(SMPL_PARENTS)
 _VISIBLE_M = 1e-3
-"""Difference between shapes, m, up to which no note is given."""
+"""Maximum difference between the shapes of one person, m, without a note."""
 
 
 @dataclass(frozen=True)
@@ -31,28 +33,31 @@ class RestBody:
 
     @cached_property
     def joints(self) -> Array:
-        """(24, 3) the joints."""
+        """(24, 3) joint positions."""
         return rest_joints(self.arrays, self.betas[None])[0]
 
     @cached_property
     def vertices(self) -> Array:
-        """(Nv, 3) the skin."""
+        """(Nv, 3) vertex positions."""
         return self.arrays.template + self.arrays.shapes @ self.betas
 
     @property
     def offsets(self) -> Array:
-        """(24, 3) each joint from its parent; the pelvis from the origin."""
+        """(24, 3) offset of each joint from its parent; for the pelvis, from the origin."""
         return _offsets(self.joints[None])[0]
 
     def tips(self) -> dict[int, Array]:
-        """(3,) from each joint without children to the end of its bone: as far as its skin goes on."""
+        """Vectors (3,) from each joint without children to the end of its bone, which is the
+        farthest vertex of the bone's surface.
+        """
         leaves = set(range(BONES)) - set(SMPL_PARENTS)
         bone_of = self.arrays.weights.argmax(axis=1)
         tips = {}
         for leaf in leaves:
             along = self.joints[leaf] - self.joints[SMPL_PARENTS[leaf]]
             along /= np.linalg.norm(along)
-            # A mesh may give a bone no skin of its own; then it ends 1 cm on, for a bone needs a length.
+            # In some meshes a bone has no vertices of its own; it then gets 1 cm, because a bone
+            # needs a length.
             reach = (self.vertices[bone_of == leaf] - self.joints[leaf]) @ along
             tips[leaf] = along * max(float(reach.max(initial=0.0)), 0.01)
         return tips
@@ -60,30 +65,32 @@ class RestBody:
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of one person's body: F frames with a body, in the axes of a format."""
+    """The motion of one person's body in F frames, in the axes of a format."""
 
     rest: RestBody
-    """The body, one shape for all frames."""
+    """The body in the T-pose, with one shape for all frames."""
     index: Index
     """(F,) frames of the take that have a body."""
     rotations: Array
-    """(F, 24, 4) each bone against its parent, the pelvis against the world; quaternions x y z w."""
+    """(F, 24, 4) rotation of each bone relative to its parent (pelvis: relative to the world);
+    quaternions x y z w."""
     pelvis: Array
-    """(F, 3) the pelvis in the world, metres."""
+    """(F, 3) position of the pelvis in the world, metres."""
     spread_m: float = 0.0
-    """Largest distance of a joint from its place with the frame's own shape, m; 0 where all have one shape."""
+    """Largest difference of a joint's position, m, between the common shape and the shape of a
+    frame; 0 if all frames have the same shape."""
     filled: Mask | None = None
-    """(F,) mask of interpolated frames; None where no hole was filled."""
+    """(F,) mask of interpolated frames; None if no gap was filled."""
 
     def joints(self) -> Array:
-        """(F, 24, 3) the joints in the world, metres."""
+        """(F, 24, 3) joint positions in the world, metres."""
         return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
 
     def segments(self, longest_hole: int) -> Iterator["Motion"]:
-        """The motion in parts without holes; a hole of up to `longest_hole` frames is interpolated.
+        """Split the motion at gaps; gaps of up to `longest_hole` frames are interpolated.
 
-        Rotations turn at a constant rate from the one before the hole to the one after it, the pelvis moves on a
-        line.
+        Rotations are interpolated spherically (slerp) between the frames before and after the gap,
+        the pelvis linearly.
         """
         cuts = np.flatnonzero(np.diff(self.index) > longest_hole + 1) + 1
         for part in np.split(np.arange(len(self.index)), cuts):
@@ -118,7 +125,7 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motio
 
 
 def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) -> Iterator[tuple[int, Motion]]:
-    """All people with a body, and their motions in the world rotated by `axes` (3, 3).
+    """All people with a body, with their motions in the world rotated by `axes` (3, 3).
 
     People without a body, or with several shapes, are noted in `written`.
     """
@@ -136,7 +143,9 @@ def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) ->
 
 
 def all_segments(job: Job, kind: str, axes: Array, written: Written) -> Iterator[tuple[Path, Motion, Take]]:
-    """All motions at one rate without long holes: file without suffix, motion, take of its frames."""
+    """All motions at a constant rate, split at long gaps: path without suffix, motion, and take of
+    its frames.
+    """
     take = written.at_one_rate(job.take)
     for who, motion in everybody(job, take, kind, axes, written):
         for segment in motion.segments(int(job.fill_gaps_s * take.fps + 1e-6)):
@@ -152,9 +161,10 @@ def rest_joints(arrays: SmplArrays, betas: Array) -> Array:
 
 
 def skin(arrays: SmplArrays, betas: Array, rotations: Array, pelvis: Array, only: Index) -> Array:
-    """(F, M, 3) the vertices `only` (M,) of bodies (F, 10), turned (F, 24, 4) and placed (F, 3); metres.
+    """(F, M, 3) positions of the vertices `only` (M,), metres, for `betas` (F, 10), `rotations` (F,
+    24, 4) and `pelvis` (F, 3).
 
-    Without the corrections of the skin that depend on the pose, which the open body does not have.
+    Pose-dependent corrections of the surface are not applied; the open body has none.
     """
     rest = rest_joints(arrays, betas)
     turn = _accumulated(rotations)
@@ -167,7 +177,9 @@ def skin(arrays: SmplArrays, betas: Array, rotations: Array, pelvis: Array, only
 
 
 def pose_joints(offsets: Array, rotations: Array, pelvis: Array) -> Array:
-    """(F, 24, 3) joints of bones with `offsets` (F or 1, 24, 3) from their parents, turned and placed."""
+    """(F, 24, 3) joint positions, metres, for bones with `offsets` (F or 1, 24, 3) from their
+    parents, `rotations` (F, 24, 4) and `pelvis` (F, 3).
+    """
     turn = _accumulated(rotations)
     places = [pelvis]
     for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
@@ -176,11 +188,13 @@ def pose_joints(offsets: Array, rotations: Array, pelvis: Array) -> Array:
 
 
 def _offsets(rest: Array) -> Array:
-    """(B, 24, 3) joints in the T-pose from their parents; the pelvis from the origin."""
+    """(B, 24, 3) offset of each joint in the T-pose from its parent; for the pelvis, from the
+    origin.
+    """
     return np.concatenate([rest[:, :1], rest[:, 1:] - rest[:, np.array(SMPL_PARENTS[1:])]], axis=1)
 
 
 def _accumulated(rotations: Array) -> Array:
-    """(F, 24, 3, 3) world from bone, of quaternions (F, 24, 4) against the parent."""
+    """(F, 24, 3, 3) rotations world from bone, from quaternions (F, 24, 4) relative to the parent."""
     cross = hat(rotations[..., :3])
     return accumulate(np.eye(3) + 2 * (rotations[..., 3:, None] * cross + cross @ cross))

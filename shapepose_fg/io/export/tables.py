@@ -1,6 +1,7 @@
-"""Results as tables: CSV, a line per person, frame and joint, for notebooks; Parquet, all columns, for archives.
+"""Exports results as tables: CSV, a line per person, frame and joint, for notebooks; Parquet, all
+columns, for archives.
 
-In the recording's own axes, metres.
+Axes are those of the recording; metres.
 """
 
 import csv
@@ -24,22 +25,22 @@ COLUMNS = (
     "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s vz_m_s"
     " known confidence"
 ).split()
-"""The first line of a CSV file."""
+"""Header of the CSV file."""
 _GROUP_ROWS = 4096
-"""Number of rows in a group of Parquet: some 20 MB, which readers load separately."""
+"""Number of rows in a group of Parquet: about 20 MB, which readers load separately."""
 _OBSERVED = "observations."
-"""Prefix of the names of observations.npz's columns in Parquet."""
+"""Prefix of the Parquet columns from observations.npz."""
 
 
 def write_csv(job: Job) -> Written:
-    """`joints.csv`."""
+    """Write `joints.csv`."""
     written = Written()
     written.add(job.folder / "joints.csv", csv_text(job.take))
     return written
 
 
 def csv_text(take: Take) -> str:
-    """A line for each joint with a place; unknown values are empty."""
+    """A line for each joint with a position; unknown values are empty."""
 
     def words(values: Array, digits: str = "%.6f") -> list[str]:
         return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
@@ -72,12 +73,13 @@ def csv_text(take: Take) -> str:
 
 
 def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path) -> Written:
-    """`people.parquet`: a row per person and frame, columns as in people.npz and observations.npz.
+    """Write `people.parquet`: a row per person and frame, with the columns of people.npz and
+    observations.npz.
 
-    `rows` (R,), rising, chooses; None takes all; some are in memory at a time. An array of a row is a flat list in
-    C order, of a length that is the same in all rows; its shape is in the column's metadata, as JSON under
-    `shape`. The file's metadata has `joint_names`, `known_names`, `view_names` and `gate_names`, and `run`, which
-    is run.json.
+    `rows`: sorted indices to write, or None for all. Written in blocks. An array in a row is a flat
+    list in C order, of constant length; its shape is in the metadata of the column, as JSON under
+    `shape`. The metadata of the file have `joint_names`, `known_names`, `view_names` and
+    `gate_names`, and `run` (the content of run.json).
     """
     arrow, parquet = optional("pyarrow", "archive"), optional("pyarrow.parquet", "archive")
     rows = np.arange(len(opened)) if rows is None else rows
@@ -86,7 +88,7 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
         own = arrow.string() if values.dtype.kind == "U" else arrow.from_numpy_dtype(values.dtype)
         return own if values.ndim == 1 else arrow.list_(own, int(np.prod(values.shape[1:])))
 
-    # Without a row there are columns too.
+    # A file without rows still has all columns.
     first, about = _columns(opened, rows[:1])
     fields = [
         arrow.field(name, kind(values), metadata={"shape": json.dumps(values.shape[1:])})
@@ -112,7 +114,7 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
 
 
 def _columns(opened: OpenedReconstruction, rows: Index) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """All columns in some rows, by their names, and the metadata of the whole file."""
+    """All columns of some rows, by name, and the metadata of the whole file."""
     people = opened.rows(rows)
     table = people.observations
     columns = {name: getattr(people, name) for name in people.ROWS}

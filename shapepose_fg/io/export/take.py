@@ -1,4 +1,4 @@
-"""The people of a result on one timeline, each with a row for every frame: the input of exports."""
+"""The input of exports: the people of a result on one timeline, each with an entry for every frame."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,42 +22,43 @@ _TO_Y_UP: dict[Axis, list[list[int]]] = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
     "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
-"""The smallest rotation that takes each axis to y."""
+"""For each up axis, the smallest rotation that maps it to y."""
 _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""(x, y, z) to (x, -z, y): the rotation that Blender's importers apply to a file whose y is up."""
+"""(x, y, z) to (x, -z, y): the rotation that Blender's importers apply to files with y up."""
 _FORWARD_X = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-"""Rotation about y, with which a world whose z is up becomes (y, z, x), as Pose2Sim writes it."""
+"""Rotation about y that turns a world with z up into (y, z, x), as written by Pose2Sim."""
 _LONGEST = 1_000_000
-"""Maximum number of frames of a file with one rate: nine hours at 30 Hz. Beyond, times have another unit or a
-hole."""
+"""Maximum number of frames of a file with a constant rate: nine hours at 30 Hz. With more frames,
+the times have a wrong unit or a gap."""
 _BODY_BYTES = 2_000
-"""Approximate memory of one person's body per frame while it is written, bytes."""
+"""Approximate memory for one person's body per frame during export, bytes."""
 _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
-"""Columns of a result that are NaN where no view saw a joint; those of `BODY` are where none saw the person."""
+"""Columns that `seen_only` sets to NaN if no view detected the joint; those of `BODY`, if no view
+detected the person."""
 _FAR_M = 1000.0
-"""Largest coordinate that a float of 32 bits keeps to a tenth of a millimetre, metres."""
+"""Largest coordinate, m, that single precision represents to a tenth of a millimetre."""
 
 
 @dataclass(frozen=True)
 class Take:
-    """P people over T frames; a person's row of a frame may be missing."""
+    """P people in T frames; a person may be missing in some frames."""
 
     people: Reconstruction
-    """The rows; joints that are left out are NaN in it."""
+    """The rows; joints that are left out are NaN."""
     persons: NDArray[np.int64]
     """(P,) identities."""
     rows: Index
-    """(P, T) row of `people` of each person in each frame; -1 where there is none."""
+    """(P, T) row of `people` for each person and frame; -1 if there is none."""
     frames: NDArray[np.int64]
     """(T,) numbers of the frames, as in people.npz."""
     times_s: Array
-    """(T,) rising times of the frames, seconds."""
+    """(T,) increasing times of the frames, seconds."""
     fps: float
     """Frame rate, Hz (`rate_of`)."""
     up: Axis
     """Axis of the world that points up."""
     rig: Rig | None = None
-    """The cameras; None where they are unknown."""
+    """The cameras; None if unknown."""
 
     @classmethod
     def of(
@@ -70,11 +71,12 @@ class Take:
         seen_only: bool = False,
         identities: bool = True,
     ) -> "Take":
-        """The timeline of a result; ValueError where it has none.
+        """Make a take from a result; ValueError if it has no timeline.
 
-        `fps` replaces the result's own times, and is needed where these are unknown. `seen_only` leaves out every
-        joint that no view saw in that frame, and the bodies of rows where none was seen. With `identities` off, a
-        result without identities is a Take too: a person is then a number within the frame.
+        `fps` replaces the times of the result, and is required if these are unknown. `seen_only`
+        leaves out every joint that no view detected in the frame, and the body if no joint was
+        detected. With `identities` False, results without identities are accepted; `person` is then
+        a number within the frame.
         """
         if len(people) == 0:
             raise ValueError("the result has no people, so there is nothing to export")
@@ -84,7 +86,7 @@ class Take:
                 " csv or rrd"
             )
         people = _seen(people) if seen_only else people
-        # All frames that were reconstructed, those without people too.
+        # All reconstructed frames, including those without people.
         spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
         frames = np.unique(np.concatenate([people.frame, *spans])).astype(np.int64)
         persons, person = np.unique(people.person, return_inverse=True)
@@ -106,18 +108,20 @@ class Take:
         return cls(people, persons.astype(np.int64), rows, frames, times, rate, up, rig)
 
     def column(self, name: str, person: int) -> NDArray[Any]:
-        """(T, ...) a column of the result for one person; NaN, 0 in whole numbers, where there is no row."""
+        """(T, ...) a column of the result for one person; NaN (0 for integers) in frames without a
+        row.
+        """
         values, rows = getattr(self.people, name), self.rows[person]
         column = np.full((len(rows), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype)
         column[rows >= 0] = values[rows[rows >= 0]]
         return column
 
     def near_origin(self) -> tuple["Take", Array]:
-        """Return these people and cameras in the frame of a local origin, and (3,) that origin, whole metres of
-        the world.
+        """The take shifted to a local origin for single-precision formats, and that origin (3,), in
+        whole metres of the world.
 
-        It is for formats of seven digits, whose steps are centimetres 400 km from the world's origin. The local
-        origin is the world's where no joint is farther than a kilometre from that.
+        In single precision, coordinates 400 km from the origin have steps of centimetres. The local
+        origin is that of the world if no joint is farther than a kilometre from it.
         """
         every = self.people.joints.reshape(-1, 3)
         every = np.concatenate([every[np.isfinite(every).all(axis=1)], self.people.transl])
@@ -129,11 +133,12 @@ class Take:
         return replace(self, people=people, rig=None if self.rig is None else _moved(self.rig, origin)), origin
 
     def at_one_rate(self) -> tuple["Take", int]:
-        """Return these people at exactly `fps` frames a second, for formats that know no other rate, and a count.
+        """The take at exactly `fps` frames a second, for formats with a constant rate, and the
+        number of dropped frames.
 
-        A frame goes to the nearest step, numbered on from the first; steps that no frame is near to are holes. The
-        count is the number of frames left out because another is nearer to their step. InputError where that would
-        be more than a million frames.
+        Each frame is assigned to the nearest time step, counted from the first; steps without a
+        frame are gaps. A frame is dropped if another one is nearer to its step. InputError for more
+        than a million frames.
         """
         step = (self.times_s - self.times_s[0]) * self.fps
         if step[-1] >= _LONGEST:
@@ -154,7 +159,7 @@ class Take:
 
 
 def _moved(rig: Rig, origin: Array) -> Rig:
-    """The cameras and their trajectories in a world whose origin is `origin` (3,) of theirs."""
+    """The cameras and their trajectories relative to a new `origin` (3,), metres."""
 
     def local(pose: Array) -> Array:
         shifted = pose.copy()
@@ -166,13 +171,15 @@ def _moved(rig: Rig, origin: Array) -> Rig:
 
 
 def _check_memory(persons: int, frames: int) -> None:
-    """InputError where joints of all people in all frames, and one person's body, do not fit in memory."""
+    """InputError if the joints of all people in all frames, and one person's body, do not fit in
+    memory.
+    """
     what = f"people.npz: {persons} people over {frames} frames"
     check_memory(what, frames * (2 * 8 * persons + _BODY_BYTES), "--frames, --person")
 
 
 def _seen(people: Reconstruction) -> Reconstruction:
-    """The people without joints that no view saw."""
+    """The people with joints that no view detected set to NaN."""
     if not (people.known != Known.UNKNOWN).any():
         raise ValueError("people.npz does not contain how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
@@ -185,7 +192,7 @@ def _seen(people: Reconstruction) -> Reconstruction:
 
 
 def _times(people: Reconstruction, frames: NDArray[np.int64], fps: float | None) -> Array:
-    """Times of the frames: frames without a row lie between those with one."""
+    """Times of the frames; frames without a row are interpolated."""
     if fps is not None:
         return frames / typed_rate(fps)
     known, first = np.unique(people.frame, return_index=True)
@@ -209,18 +216,21 @@ def _fps_of(people: Reconstruction) -> float:
 
 
 def y_up(up: Axis) -> Array:
-    """(3, 3) rotation from a world with the axis `up` upwards to y up: BVH and glTF.
+    """(3, 3) rotation from a world with the up axis `up` to y up, for BVH and glTF.
 
-    Z up becomes (x, z, -y), which Blender's importers undo: there the numbers are those of the world again.
+    Z up becomes (x, z, -y), which Blender's importers invert: in Blender the coordinates are again
+    those of the world.
     """
     return np.array(_TO_Y_UP[up], dtype=np.float64)
 
 
 def z_up(up: Axis) -> Array:
-    """(3, 3) rotation to z up, as AMASS has it; the identity where z is up."""
+    """(3, 3) rotation to z up, for AMASS; the identity if z is already up."""
     return _Z_FROM_Y @ y_up(up)
 
 
 def opensim_axes(up: Axis) -> Array:
-    """(3, 3) rotation to y up in TRC and C3D: Pose2Sim's, so that the same cameras give the same numbers."""
+    """(3, 3) rotation to y up for TRC and C3D; the same as in Pose2Sim, so that the same cameras
+    give equal coordinates.
+    """
     return _FORWARD_X @ y_up(up)

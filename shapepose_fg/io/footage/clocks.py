@@ -1,4 +1,4 @@
-"""Times of each camera's pictures, from the footage itself or from the user's options."""
+"""Times of each camera's pictures, from the footage or from the user's options."""
 
 import re
 from collections.abc import Sequence
@@ -15,9 +15,10 @@ from shapepose_fg.io.validation import is_number
 def clocks_of(
     footage: Sequence[Footage], fps: Sequence[str], start: Sequence[str], cameras: Sequence[str]
 ) -> tuple[list[CameraClock], bool]:
-    """The clock of each camera, and whether it is in seconds: without any rate frames are counted.
+    """The clock of each camera, and whether it is in seconds; without any frame rate it is in
+    frames.
 
-    `fps` and `start` are options, as `per_camera` reads them.
+    `fps` and `start` are options in the form that `per_camera` reads.
     """
     rates = [typed_rate(text) for text in per_camera("--fps", fps, cameras, one_for_all=True)]
     starts = per_camera("--start", start, cameras)
@@ -26,7 +27,8 @@ def clocks_of(
     if has_clock and not all(timed):
         name = cameras[timed.index(False)]
         raise InputError(f"camera {name}: the pictures have no times; give --fps {name}=RATE")
-    # Pictures of one number belong together: all are counted from the first number that any camera has.
+    # Pictures with the same number belong together: all are counted from the lowest number of any
+    # camera.
     first = min((each.number[0] for each in footage if each.time_s is None), default=0)
     clocks = []
     for name, each, rate, text in zip(cameras, footage, rates, starts, strict=True):
@@ -43,7 +45,7 @@ def clocks_of(
 
 
 def typed_rate(text: str | None) -> float | None:
-    """A frame rate, Hz."""
+    """Parse a frame rate, Hz."""
     if text is None:
         return None
     if not is_number(text) or not 0.01 <= float(text) <= 1e5:
@@ -52,7 +54,7 @@ def typed_rate(text: str | None) -> float | None:
 
 
 def typed_start(text: str | None, period: float, has_clock: bool) -> float:
-    """Time of a camera's first frame, in seconds, or in frames where there is no clock."""
+    """Parse the time of a camera's first frame: in seconds, or in frames if there is no clock."""
     if text is None:
         return 0.0
     match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())

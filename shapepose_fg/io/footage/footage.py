@@ -17,17 +17,17 @@ from shapepose_fg.io.camera_names import in_order, last_number
 from shapepose_fg.io.footage.places import PICTURES
 
 Picture = NDArray[np.uint8]
-"""(H, W, 3) blue, green, red."""
+"""A picture: (H, W, 3) in the order blue, green, red."""
 Progress = Callable[[int, int], None]
-"""Called with the number of frames that are done, and the number of all."""
+"""Callback with the number of frames that are done, and the total number."""
 
 _READ_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _SAFE_READING = (
     "protocol_whitelist;file"
     "|format_whitelist;mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,mpeg,mpegts,mpegvideo,asf,h264,hevc,m4v"
 )
-"""Options for reading untrusted videos: the file alone, and no playlist, which could name other files and
-addresses."""
+"""Options for reading untrusted videos: only the file itself, and no playlists, which could name
+other files and addresses."""
 _MOST_BYTES = 2**29
 """Maximum size of a picture's file, bytes."""
 _LARGEST = 16384
@@ -35,9 +35,10 @@ _LARGEST = 16384
 
 
 def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
-    """The footage at `path`: a video (decoded once, for its frames and times), a folder, or a picture.
+    """Open the footage at `path`: a video (decoded once, for its frames and times), a folder of
+    pictures, or a picture.
 
-    InputError where nothing in it can be read.
+    InputError if nothing in it can be read.
     """
     if path.is_dir() or path.suffix.lower() in PICTURES:
         return PictureFiles.open(path)
@@ -47,7 +48,7 @@ def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
 def glance(path: Path, capture: Any = None) -> tuple[tuple[int, int], float]:
     """Size (width, height) and frame rate that a video's header states, without decoding it.
 
-    The rate is 0 where there is none, or it is impossible. `capture` is the video, where it is open.
+    The rate is 0 if it is missing or invalid. `capture` is the video, if it is already open.
     """
     capture = _capture(path) if capture is None else capture
     size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
@@ -57,27 +58,29 @@ def glance(path: Path, capture: Any = None) -> tuple[tuple[int, int], float]:
 
 @dataclass
 class Video:
-    """The frames of a video file that can be read."""
+    """The readable frames of a video file."""
 
     path: Path
     size: tuple[int, int]
     """Width and height of the pictures, pixels."""
     time_s: Array
-    """(N,) the frames' own times in the file, seconds after the first."""
+    """(N,) time stamps of the frames in the file, seconds after the first."""
     notes: tuple[str, ...] = ()
-    """Notes on problems of the file, a sentence each."""
+    """Notes on problems of the file, one sentence each."""
     _capture: Any = field(default=None, repr=False)
     _next: int = 0
     _last: Picture | None = None
 
     @property
     def number(self) -> Index:
-        """(N,) frames count from 0."""
+        """(N,) numbers of the frames, counted from 0."""
         return np.arange(len(self.time_s))
 
     @classmethod
     def open(cls, path: Path, progress: Progress | None = None) -> "Video":
-        """Look through the video at `path`: every frame is decoded once, which shows what is cut or damaged."""
+        """Open the video at `path`; every frame is decoded once, to detect truncated or damaged
+        files.
+        """
         capture = _capture(path)
         size, fps = glance(path, capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
@@ -94,7 +97,8 @@ class Video:
         if len(stamps) == 0:
             raise InputError(f"{path}: no frame of this video can be read; give an undamaged video")
         time_s, notes = _times(path, np.array(stamps), fps)
-        # Files tell of a frame or two that players do not show; more is a file that was cut or damaged.
+        # Headers often count one or two frames too many; a larger difference means a truncated or
+        # damaged file.
         if announced - len(stamps) > 2:
             notes.append(
                 f"{path}: only {len(stamps)} of the {announced} frames in its header can be read; the file is"
@@ -103,7 +107,7 @@ class Video:
         return cls(path, size, time_s, tuple(notes))
 
     def at(self, place: int) -> Picture | None:
-        """The picture of frame `place`; None where it cannot be decoded."""
+        """The picture of frame `place`; None if it cannot be decoded."""
         if self._capture is not None and place == self._next - 1:
             return self._last
         if self._capture is None or place < self._next:
@@ -128,15 +132,15 @@ class PictureFiles:
     files: tuple[Path, ...]
     """(N,) the files in the order of their numbers."""
     number: Index
-    """(N,) number of each frame, rising."""
+    """(N,) number of each frame, increasing."""
     notes: tuple[str, ...] = ()
-    """Notes on problems of the files, a sentence each."""
+    """Notes on problems of the files, one sentence each."""
     time_s: Array | None = None
-    """Always None: files of pictures have no times."""
+    """Always None: picture files have no time stamps."""
 
     @classmethod
     def open(cls, path: Path) -> "PictureFiles":
-        """The pictures at `path`; the last number in a file's name is its frame's."""
+        """Open the pictures at `path`; the last number in a file name is the frame number."""
         files = [path]
         if path.is_dir():
             files = [each for each in path.iterdir() if each.suffix.lower() in PICTURES and each.name[0] != "."]
@@ -159,7 +163,7 @@ class PictureFiles:
         return cls(path, _size(paths[0]), paths, np.array(numbers, dtype=np.intp), notes)
 
     def at(self, place: int) -> Picture | None:
-        """The picture of frame `place`; None where the file cannot be read, or is of another size."""
+        """The picture of frame `place`; None if the file cannot be read, or has another size."""
         try:
             return _fitting(_decoded(self.files[place]), self.size)
         except InputError:
@@ -167,22 +171,22 @@ class PictureFiles:
 
 
 Footage = Video | PictureFiles
-"""The footage of one camera: N numbered frames, of which some may have no picture."""
+"""The footage of one camera: N numbered frames, some of which may have no picture."""
 
 
 def _fitting(picture: Any, size: tuple[int, int]) -> Picture | None:
-    """A picture that could be read and has the size; else None."""
+    """The picture if it was readable and has the expected size, otherwise None."""
     return picture if picture is not None and picture.shape[1::-1] == size else None
 
 
 def _capture(path: Path) -> Any:
-    """The video at `path`, opened by FFmpeg under the rules for untrusted files."""
+    """The video at `path`, opened by FFmpeg with the options for untrusted files."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such video; check the path")
     before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
     os.environ[_READ_OPTIONS] = _SAFE_READING
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent; read when the first video is opened
-    # What OpenCV would say of a damaged file on stderr is said below.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent; this is read when the first video is opened
+    # Messages of OpenCV about damaged files are replaced by ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
@@ -198,7 +202,7 @@ def _capture(path: Path) -> Any:
 def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
     """(N,) seconds after the first frame, and notes on irregular times.
 
-    The file's own times where they rise; else times by the rate that it states.
+    Time stamps of the file if they increase, otherwise times from its frame rate.
     """
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if fps < 0.01:
@@ -216,7 +220,7 @@ def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
 
 
 def _size(file: Path) -> tuple[int, int]:
-    """Return the width and height of a picture, pixels."""
+    """Width and height of a picture, pixels."""
     picture = _decoded(file)
     if picture is None:
         raise InputError(f"{file}: cannot be read as a picture; give an undamaged one")
@@ -224,7 +228,9 @@ def _size(file: Path) -> tuple[int, int]:
 
 
 def _decoded(file: Path) -> Any:
-    """The picture in a file; None where it cannot be read. InputError for a pipe, or a file that is too large."""
+    """The picture in a file; None if it cannot be read. InputError for a pipe, or a file that is
+    too large.
+    """
     content = np.frombuffer(read_bytes(file, _MOST_BYTES), dtype=np.uint8)
     try:
         return cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

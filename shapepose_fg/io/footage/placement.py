@@ -1,4 +1,6 @@
-"""The place of calibrated pixels in pictures of the footage; and footage.json, the pictures behind detections."""
+"""Mapping between calibrated pixels and pixels of the footage; and footage.json, which lists the
+pictures of detections.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,30 +21,32 @@ from shapepose_fg.io.footage.places import per_camera
 from shapepose_fg.io.validation import validated
 
 FOOTAGE = "footage.json"
-"""The file beside the detections."""
+"""Name of the file beside the detections."""
 
 _BLOCK = 16
-"""Block size of video coders, pixels: a few columns or rows are added or removed with them."""
+"""Block size of video coders, pixels: coders pad or crop a few columns or rows to a multiple of it."""
 
 
 class PlacementKind(StrEnum):
-    """How pictures of another size were made from calibrated ones."""
+    """How pictures of another size were made from pictures of the calibrated size."""
 
     SAME = "same"
-    """They have the same size."""
+    """The sizes are equal."""
     CROP = "crop"
-    """Columns on the right and rows at the bottom were cut off, or added."""
+    """Columns on the right and rows at the bottom were cropped, or padded."""
     CROP_CENTRE = "crop-centre"
-    """Columns on both sides, and rows above and below, were cut off, or added, equally many."""
+    """Equal numbers of columns on both sides, and of rows above and below, were cropped, or padded."""
     SCALE = "scale"
-    """They were resized, each axis on its own."""
+    """The pictures were resized, with independent scales of the axes."""
     LETTERBOX = "letterbox"
-    """They were resized alike along both axes, with bars on two sides."""
+    """The pictures were resized with the same scale along both axes, with bars on two sides."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """The place of calibrated pixels in a picture: along each axis, edges at scale * u + shift."""
+    """Position of calibrated pixels in a picture: along each axis, an edge u is at scale * u +
+    shift.
+    """
 
     kind: PlacementKind
     """How the pictures were made."""
@@ -61,24 +65,28 @@ class Placement:
 
     @cached_property
     def shift(self) -> Array:
-        """(2,) the left and upper edges of the calibrated picture, pixels from the picture's own edges."""
+        """(2,) position of the left and upper edges of the calibrated picture, relative to the
+        picture's edges, pixels.
+        """
         centred = self.kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
         return (self.picture_size - self.scale * self.calibrated_size) / 2 if centred else np.zeros(2)
 
     @property
     def region(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom edge of the calibrated part of the picture; 0 is a pixel's centre."""
+        """Left, top, right, bottom edge of the calibrated part of the picture; 0 is the centre of
+        the first pixel.
+        """
         low = np.maximum(self.shift, 0.0)
         high = np.minimum(self.shift + self.scale * self.calibrated_size, self.picture_size)
         left, top, right, bottom = np.concatenate([low, high]) - 0.5
         return float(left), float(top), float(right), float(bottom)
 
     def to_picture(self, xy: Array) -> Array:
-        """Pixels (..., 2) of the picture from calibrated pixels (as the lens gives them)."""
+        """Pixels (..., 2) of the picture for calibrated pixels (with distortion)."""
         return (xy + 0.5) * self.scale + self.shift - 0.5
 
     def to_calibrated(self, xy: Array) -> Array:
-        """Calibrated pixels (..., 2) from pixels of the picture."""
+        """Calibrated pixels (..., 2) for pixels of the picture."""
         return (xy + 0.5 - self.shift) / self.scale - 0.5
 
 
@@ -104,11 +112,11 @@ def placements_of(
 def place(
     name: str, picture_size: tuple[int, int], calibrated_size: tuple[int, int], wanted: PlacementKind | None
 ) -> tuple[Placement, str | None]:
-    """The placement of camera `name`, and a sentence where it was inferred from sizes.
+    """The placement of camera `name`, and a sentence if it was inferred from the sizes.
 
-    Inferred are: equal sizes; a difference of up to 16 pixels, which was cut off or added on the right or at the
-    bottom; and otherwise the same shape at another size, which was resized. InputError for any other size, unless
-    `wanted` states the kind, and where the wanted kind is impossible.
+    Inferred kinds are: `same` for equal sizes; `crop` for a difference of up to 16 pixels;
+    otherwise `scale` for the same aspect ratio. InputError for any other size, unless `wanted`
+    gives the kind, and if the wanted kind is impossible.
     """
     (width, height), (full_width, full_height) = picture_size, calibrated_size
     full = f"{full_width} x {full_height}"
@@ -125,7 +133,7 @@ def place(
             f" {name}=crop); if they were cropped on both sides, give {name}=crop-centre; if resized,"
             f" {name}=scale"
         )
-    # Of one shape, to within the rounding of both sides to whole pixels.
+    # The same aspect ratio, up to rounding of both sides to whole pixels.
     elif abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
         kind = PlacementKind.SCALE
         note = f"{sizes} of the same aspect ratio: they are assumed to be resized (--image-placement {name}=scale)"
@@ -143,16 +151,16 @@ def place(
 
 @dataclass(frozen=True)
 class CameraFootage:
-    """The pictures of one camera that detections were made from."""
+    """The pictures of one camera from which detections were made."""
 
     name: str
-    """The camera."""
+    """Name of the camera."""
     path: Path
     """The video, picture, or folder of pictures."""
     placement: Placement
-    """Where calibrated pixels lie in the pictures."""
+    """Position of calibrated pixels in the pictures."""
     places: Index
-    """(T,) the picture of each frame, counted from 0 in the file; -1 where there is none."""
+    """(T,) index of the picture of each frame, counted from 0 in the file; -1 if there is none."""
 
 
 _Size = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
@@ -173,7 +181,7 @@ class _File(BaseModel):
 
 
 def write_used_footage(file: Path, cameras: Sequence[CameraFootage], about: dict[str, Any]) -> None:
-    """Write `file`, with `about` in it."""
+    """Write footage.json as `file`, with further entries `about`."""
     entries = [
         {
             "name": each.name,
@@ -190,7 +198,7 @@ def write_used_footage(file: Path, cameras: Sequence[CameraFootage], about: dict
 
 
 def read_used_footage(file: Path) -> list[CameraFootage]:
-    """Read what `write_used_footage` wrote; InputError, one sentence, on anything else."""
+    """Read a file written by `write_used_footage`; InputError, one sentence, for any other content."""
     found = []
     for camera in validated(_File, read_json(file), file, "run shapepose-fg detect again").cameras:
         placement = Placement(camera.placement, camera.picture_size, camera.calibrated_size)

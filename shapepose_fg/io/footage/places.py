@@ -7,17 +7,18 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.camera_names import listing, told_by_parts
 
 VIDEOS = frozenset(".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .ts .mts .m2ts .wmv".split())
-"""Endings of videos."""
+"""File extensions of videos."""
 PICTURES = frozenset(".jpg .jpeg .png .bmp .tif .tiff .webp".split())
-"""Endings of pictures."""
+"""File extensions of pictures."""
 _INNER = ("videos", "images", "video", "image")
-"""Folders of footage in other programs' projects."""
+"""Names of subfolders with footage in other programs' projects."""
 
 
 def per_camera(
     option: str, given: Sequence[str], cameras: Sequence[str], *, one_for_all: bool = False
 ) -> list[str | None]:
-    """(V,) the value of an option for each camera: CAMERA=VALUE, or where allowed one VALUE for all.
+    """(V,) the value of an option for each camera: CAMERA=VALUE, or if `one_for_all` is set one
+    VALUE for all.
 
     InputError for unknown cameras, and for duplicates.
     """
@@ -62,8 +63,8 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
 
 
 def names_of_footage(given: Sequence[str]) -> list[str]:
-    """Names of cameras from the arguments of `find_footage` alone: a folder's videos, or else its other
-    footage, or the names before `=`. InputError where there is nothing.
+    """Names of cameras from the arguments of `find_footage`: the names before `=`, or the videos of
+    a folder, or its other footage if it has no videos. InputError if there are none.
     """
     if len(given) > 1 or ("=" in given[0] and not Path(given[0]).exists()):
         return [text.partition("=")[0] for text in given]
@@ -77,7 +78,7 @@ def names_of_footage(given: Sequence[str]) -> list[str]:
 
 
 def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """The entries of a folder for each camera, by their names: videos, pictures, and folders that hold
+    """The entries of a folder for each camera, by their names: videos, pictures, and folders with
     pictures.
     """
     if folder.is_file():

@@ -1,7 +1,8 @@
-"""The fields of the ROS 2 messages that are written and read: those of ROS, and three of our own.
+"""Definitions of the ROS 2 messages that are written and read: those of ROS, and three of this
+project.
 
-ROS's are as in the distributions from Humble on, without constants and comments. Of nav_msgs/Odometry and two
-related messages only the fields that are read are here.
+Those of ROS are as in the distributions from Humble on, without constants and comments.
+nav_msgs/Odometry and two related messages have only the fields that are read.
 """
 
 import re
@@ -56,7 +57,9 @@ _FIELDS = {
 
 
 def definition(name: str) -> str:
-    """The text of a message and of all messages in it, as MCAP files hold it; `name` is package/Message."""
+    """The text of a message and of all messages in it, as stored in MCAP files; `name` is
+    package/Message.
+    """
     order = [name]
     for each in order:
         inner = (field.split()[0].partition("[")[0] for field in _FIELDS[each].split(";"))
@@ -69,16 +72,18 @@ def definition(name: str) -> str:
 
 
 def type_name(name: str) -> str:
-    """package/msg/Message, as ROS 2 calls it."""
+    """Type name package/msg/Message, as used by ROS 2."""
     package, message = name.split("/")
     return f"{package}/msg/{message}"
 
 
 def check_definition(name: str, text: str) -> None:
-    """Check that a message with the layout `text` has all fields of `name` (package/Message) that are read.
+    """Check that a message definition `text` has all fields of `name` (package/Message) that are
+    read.
 
-    Messages may have further fields. ValueError that names the message and the field. Arrays whose items take no
-    bytes, or of very many items, are refused, too: a short message could have any number of them.
+    Messages may have further fields. ValueError that names the message and the field. Arrays of
+    items without bytes, or with very many items, are refused, too: a short message could expand to
+    any number of them.
     """
     parts = re.split(r"^=+\s*MSG: *(\S+) *$", "\n".join(text.splitlines()), flags=re.MULTILINE)
     theirs = {
@@ -105,7 +110,7 @@ def check_definition(name: str, text: str) -> None:
 
 
 def _fields(message: str, text: str) -> dict[str, str]:
-    """The types of a message's fields by their names, of a text with comments, constants and defaults."""
+    """Types of a message's fields by name, from a text with comments, constants and defaults."""
     found = dict[str, str]()
     for line in text.splitlines():
         kind, _, rest = line.partition("#")[0].strip().partition(" ")
@@ -121,18 +126,18 @@ def _fields(message: str, text: str) -> dict[str, str]:
 
 
 def _plain(name: str) -> str:
-    """package/Message of package/msg/Message."""
+    """Convert package/msg/Message to package/Message."""
     return name.replace("/msg/", "/")
 
 
 _FAMILY = {each: "whole" for n in (8, 16, 32, 64) for each in (f"int{n}", f"uint{n}")}
 _FAMILY |= {"byte": "whole", "char": "whole", "bool": "bool", "string": "string", "wstring": "wstring"}
 _FAMILY |= {"float32": "real", "float64": "real"}
-"""Kinds of values by type of ROS; any other type is a message."""
+"""Kind of value for each primitive ROS type; any other type is a message."""
 _MOST_ITEMS = 2**16
 """Maximum number of items of an array of fixed size."""
 _TIME = {
     each: {"sec": "int32", "nanosec": "uint32"}
     for each in ("builtin_interfaces/Time", "builtin_interfaces/Duration")
 }
-"""Messages without a definition in the file."""
+"""Messages whose definition may be missing in the file."""

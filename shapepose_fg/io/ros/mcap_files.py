@@ -1,4 +1,4 @@
-"""MCAP files of ROS 2 messages: people written, detections read, without a ROS installation."""
+"""MCAP files of ROS 2 messages: writes people and reads detections, without a ROS installation."""
 
 import math
 from collections import Counter, deque
@@ -40,25 +40,25 @@ from shapepose_fg.io.ros.poses import KINDS, Frames, frame_of, stamp_ns
 
 _DETECTIONS = "shapepose_msgs/Detections"
 _LASTS_S = 0.2
-"""Lifetime of the markers of a person who is not seen any more, s."""
+"""Lifetime of the markers of a person who is no longer seen, s."""
 _CHUNK = 2**26
-"""Maximum size of a decompressed chunk, bytes; those of ROS 2 have one million."""
+"""Maximum size of a decompressed chunk, bytes; ROS 2 writes chunks of one million bytes."""
 _WINDOW, _MOST_RECORDS = 2**27, 2**19
-"""Maximum size of zstd's window, bytes, its own program's default; and maximum number of records of a chunk,
-which are all in memory: 64 MiB of records of 128 bytes."""
+"""Maximum window size of zstd, bytes (the default of its command-line program); and maximum number
+of records of a chunk, which are all in memory."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
 _LOOK_S = 0.1
-"""Interval between searches for the poses of waiting pictures, s of the log's time: each search reads all
+"""Interval between searches for the poses of waiting pictures, s of log time; each search reads all
 poses."""
 _POSES_KEPT_S = 3.0
-"""Time for which poses are kept, s, so that detections that were logged later find theirs."""
+"""Time for which poses are kept, s, for detections that are logged later than their poses."""
 View = tuple[str, Detections, float, Array | None, Array | None]
 """The arguments of `OnlineReconstructor.push_view`."""
 
 
 class McapWriter(AbstractContextManager["McapWriter"]):
-    """Writes people frame by frame; a context manager, without whose end a file has no index."""
+    """Writes people frame by frame. A context manager; the file's index is written at its end."""
 
     def __init__(self, stream: IO[bytes], rig: Rig | None) -> None:
         self._file = optional("mcap_ros2.writer", "ros").Writer(stream)
@@ -71,8 +71,8 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         self._file.finish()
 
     def frame(self, rows: Reconstruction, time_s: float, kind: str = "settled") -> None:
-        """Write the people of one frame: /people, /people/markers, /tf; before the first one cameras,
-        /tf_static.
+        """Write the people of one frame: /people, /people/markers, /tf; before the first frame also
+        cameras and /tf_static.
         """
         if not self._begun and self._rig is not None:
             self._message("/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s), time_s)
@@ -87,12 +87,14 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         moved = body_transforms(rows, time_s)["transforms"]
         if self._rig is not None:
             moved += carrier_transforms(self._rig, time_s)["transforms"]
-        # One place for a body at a time: the refined one, where both are written.
+        # A body frame has one pose at a time: the refined one, if both are written.
         if moved and kind != "now":
             self._message("/tf", "tf2_msgs/TFMessage", {"transforms": moved}, time_s)
 
     def detections(self, camera: str, seen: list[list[float]], time_s: float, rig: Rig) -> None:
-        """Write one camera's detections: x, y, score of each keypoint, of each person, in picture pixels."""
+        """Write one camera's detections: for each person, x, y and score of each keypoint, pixels
+        of the picture.
+        """
         which = rig.cameras[rig.names.index(camera)]
         people = [{"pose_keypoints_2d": each} for each in seen]
         message = {"header": header(optical(which), time_s), "camera": camera, "people": people}
@@ -105,11 +107,12 @@ class McapWriter(AbstractContextManager["McapWriter"]):
 
 
 def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]) -> Iterator[View]:
-    """The arguments of `OnlineReconstructor.push_view` in the order of the log: camera, detections, time by the
-    stamp, seconds, and for a moving camera its interpolated pose with covariance.
+    """Yield the arguments of `OnlineReconstructor.push_view` in the order of the log: camera,
+    detections, time stamp in seconds, and for a moving camera its interpolated pose with
+    covariance.
 
-    A picture waits for the pose after it. `note` receives cameras whose pictures had none. InputError, one
-    sentence, for an invalid file or one without detections.
+    A picture is yielded only after the next pose has been read. `note` receives messages about
+    cameras without poses. InputError, one sentence, for an invalid file or one without detections.
     """
     number, frames, unplaced, begun_s, tidied_s = 0, Frames(), Counter[tuple[str, str]](), math.inf, -math.inf
     looked_s, left = -math.inf, 0
@@ -161,7 +164,9 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
 
 
 def read_frame(file: Path, frame: str, name: str) -> Trajectory:
-    """The trajectory of a frame, or of a topic of poses; without `frame`, the only one. InputError."""
+    """The trajectory of a coordinate frame, or of a topic of poses; without `frame`, of the only
+    one that moves. InputError if there is none.
+    """
     frames = Frames()
     with open_regular(file, _CURE_POSES) as stream:
         for topic, kind, _, message in _decoded(stream, file, set(KINDS), _CURE_POSES):
@@ -177,8 +182,8 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
 
 @contextmanager
 def _whole(file: Path, cure: str) -> Iterator[None]:
-    """InputError where a message in the block lacks a field, or has another kind of value there: the library
-    may interpret a damaged definition differently from `check_definition`.
+    """Context manager: InputError if a message lacks a field, or has a value of another kind there.
+    The library may parse a damaged definition differently from `check_definition`.
     """
     try:
         yield
@@ -187,14 +192,15 @@ def _whole(file: Path, cure: str) -> Iterator[None]:
 
 
 def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
-    """Topic, kind, time of the log, and content of messages; InputError for damaged files."""
+    """Topic, type, log time and content of the messages; InputError for damaged files."""
     factory, decoders = optional("mcap_ros2.decoder", "ros").DecoderFactory(), dict[int, Any]()
     try:
         for schema, channel, message in _messages(stream):
             if schema is not None and schema.name in wanted:
                 if id(schema) not in decoders:
                     check_definition(schema.name.replace("/msg/", "/"), schema.data.decode())
-                    # A schema is kept with its decoder: by another of its number neither is replaced.
+                    # A schema is kept together with its decoder, so that another schema with the
+                    # same number replaces neither.
                     own = replace(schema, id=len(decoders) + 1)
                     decoders[id(schema)] = schema, factory.decoder_for(channel.message_encoding, own)
                 decode = decoders[id(schema)][1]
@@ -207,8 +213,9 @@ def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iter
 
 
 def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
-    """Schema, channel and record of each message: chunk by chunk, so that one is in memory at a time, and in each
-    by the time of the log. ValueError for a chunk of more than `_CHUNK` bytes, of which no more are unpacked.
+    """Schema, channel and record of each message, chunk by chunk (one is in memory at a time),
+    sorted by log time within a chunk. ValueError for a chunk of more than `_CHUNK` bytes, which is
+    not decompressed further.
     """
     reading = optional("mcap.stream_reader", "ros")
     schemas, channels = {}, {}
@@ -230,15 +237,15 @@ def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
 
 
 def _unpacked(chunk: Any) -> bytes:
-    """The records of a chunk. ValueError for more than `_CHUNK` bytes, which are not unpacked, or than
-    `_MOST_RECORDS`, and for records that end behind it.
+    """The records of a chunk. ValueError for more than `_CHUNK` bytes (not decompressed further),
+    for more than `_MOST_RECORDS` records, and for records that extend beyond the chunk.
     """
     lz4, zstd = optional("lz4.frame", "ros"), optional("zstandard", "ros")
     claims = {"zstd": zstd.frame_content_size, "lz4": lambda packed: lz4.get_frame_info(packed)["content_size"]}
     claim = max(claims.get(chunk.compression, len)(chunk.data), chunk.uncompressed_size)
     if claim > _CHUNK:
         raise ValueError(f"a chunk claims {claim} bytes, over {_CHUNK}")
-    # What is packed, and the chunk beside it, may say another size, or none.
+    # The sizes stated in the compressed data and in the chunk's header may be wrong or missing.
     if chunk.compression == "lz4":
         data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=_CHUNK + 1)
     elif chunk.compression == "zstd":

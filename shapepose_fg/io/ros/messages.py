@@ -1,8 +1,9 @@
-"""Rows of a result, and cameras, as the contents of ROS 2 messages.
+"""Converts rows of a result, and cameras, to the contents of ROS 2 messages.
 
-Frames are REP 103's and 105's: `map` has z up and holds `world`, the calibration's; `<camera>_optical` is a
-camera's, z forward; `body_<identity>` is a person's, x to the front and z to the head, at the middle of the hips.
-Stamps are the clock of the pictures.
+Coordinate frames follow REP 103 and 105: `map` has z up and is the parent of `world`, the frame of
+the calibration; `<camera>_optical` is a camera, z forward; `body_<identity>` is a person, at the
+midpoint of the hips, x to the front and z to the head. Time stamps are on the clock of the
+pictures.
 """
 
 import math
@@ -24,18 +25,20 @@ MAP, WORLD = "map", "world"
 NS = 1_000_000_000
 """Nanoseconds per second."""
 _LAST_S = 2**31
-"""Upper limit of a stamp's seconds, which have 32 bits."""
+"""Upper limit of the seconds in a time stamp, which have 32 bits."""
 _SPHERES, _LINES = 7, 5
 """`SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker."""
 _JOINT_M, _BONE_M = 0.05, 0.03
 _BODY_FROM_FRONT = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-"""Rotation to SMPL's axes (x left, y up, z front) from a frame whose x is front, y left and z up."""
+"""Rotation to SMPL's axes (x left, y up, z front) from a frame with x front, y left and z up."""
 _LENSES = {4: "equidistant", 5: "plumb_bob"}
 """Names of lens models by the number of coefficients; those with more are `rational_polynomial`."""
 
 
 def nanoseconds(time_s: float) -> int:
-    """A time in nanoseconds for the log of an MCAP file; InputError before 1970 and after 2038."""
+    """Convert a time in seconds to nanoseconds, for the log of an MCAP file; InputError before 1970
+    and after 2038.
+    """
     if not 0 <= time_s < _LAST_S:
         raise InputError(f"time {time_s:g} s: ROS times must be 0 to 2^31 s; give times from 0 on")
     return round(time_s * NS)
@@ -48,7 +51,7 @@ def header(frame_id: str, time_s: float) -> Message:
 
 
 def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
-    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN where unknown."""
+    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN if unknown."""
     names = "joints covariance velocity velocity_covariance betas global_orient body_pose transl".split()
     people = [
         {"person": int(rows.person[n]), "status": str(rows.status[n]), "known": rows.known[n].tolist()}
@@ -64,7 +67,7 @@ def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
 
 
 def body_transforms(rows: Reconstruction, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: `body_<identity>` of everybody whose hips are placed and whose body is known."""
+    """tf2_msgs/TFMessage: `body_<identity>` of all people with known hips and a body."""
     from scipy.spatial.transform import Rotation
 
     made = []
@@ -77,7 +80,9 @@ def body_transforms(rows: Reconstruction, time_s: float) -> Message:
 
 
 def fixed_transforms(rig: Rig, time_s: float) -> Message:
-    """tf2_msgs/TFMessage of static frames: the world in `map`, and cameras in it or on their carriers."""
+    """tf2_msgs/TFMessage of static frames: from `map` to `world`, and from `world`, or from their
+    carriers, to the cameras.
+    """
     from scipy.spatial.transform import Rotation
 
     up, z = rig.up_vector, np.array([0.0, 0, 1])
@@ -90,7 +95,7 @@ def fixed_transforms(rig: Rig, time_s: float) -> Message:
 
 
 def carrier_transforms(rig: Rig, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: carriers of cameras, in the world."""
+    """tf2_msgs/TFMessage: transforms from the world to each camera carrier (such as a robot)."""
     at = np.full(1, time_s)
     return {
         "transforms": [_transform(WORLD, ros_name(each.name), each.at(at)[0], time_s) for each in rig.trajectories]
@@ -98,7 +103,7 @@ def carrier_transforms(rig: Rig, time_s: float) -> Message:
 
 
 def camera_info(camera: Camera, time_s: float) -> Message:
-    """sensor_msgs/CameraInfo for pictures with distortion."""
+    """sensor_msgs/CameraInfo for pictures with lens distortion."""
     width, height = camera.image_size
     return {
         "header": header(optical(camera), time_s),
@@ -116,7 +121,9 @@ def camera_info(camera: Camera, time_s: float) -> Message:
 
 
 def markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Message:
-    """visualization_msgs/MarkerArray: joints and bones of everybody, with a lifetime of `lasts_s`."""
+    """visualization_msgs/MarkerArray: joints and bones of all people, with a lifetime of `lasts_s`
+    seconds.
+    """
     return {"markers": list(_markers(rows, time_s, lasts_s))}
 
 
@@ -144,18 +151,20 @@ def _markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Iterator[Me
 
 
 def ros_name(name: str) -> str:
-    """A name of topics and frames: letters, digits and underscores, not a digit first."""
+    """Convert to a valid name of topics and frames: letters, digits and underscores, not beginning
+    with a digit.
+    """
     plain = re.sub(r"\W", "_", name, flags=re.ASCII)
     return plain if not plain[:1].isdigit() else f"_{plain}"
 
 
 def optical(camera: Camera) -> str:
-    """The frame of a camera, z forward."""
+    """Name of a camera's optical frame, z forward."""
     return f"{ros_name(camera.name)}_optical"
 
 
 def _hips(rows: Reconstruction, n: int) -> Array:
-    """(3,) the middle of the hips; NaN where unknown."""
+    """(3,) midpoint of the hips, metres; NaN if unknown."""
     names = rows.joint_names.tolist()
     at = [names.index(each) for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"]) if each in names]
     return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)

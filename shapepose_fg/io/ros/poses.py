@@ -1,4 +1,4 @@
-"""Poses of a robot's parts: transforms, odometry and poses in ROS 2 messages, as a tree of frames."""
+"""Poses from ROS 2 messages (transforms, odometry and poses), as a tree of coordinate frames."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -17,14 +17,16 @@ TREE = "tf2_msgs/TFMessage"
 _WITH_CHILD = "nav_msgs/Odometry"
 _ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")
 KINDS = tuple(map(type_name, (TREE, _WITH_CHILD, *_ALONE)))
-"""Messages that hold poses."""
+"""Types of messages with poses."""
 _STATIC = "tf_static"
 _TURN_THEN_WAY = np.array([3, 4, 5, 0, 1, 2])
-"""Order of rotation before translation in ROS's covariances, which have translation first."""
+"""Indices that reorder ROS covariances (translation, rotation) to rotation, translation."""
 
 
 class Frames:
-    """Poses of frames in their parents, collected from messages, and chained along the tree."""
+    """Poses of coordinate frames relative to their parents, collected from messages, and composed
+    along the tree.
+    """
 
     def __init__(self) -> None:
         self._parent: dict[str, str] = {}
@@ -34,7 +36,7 @@ class Frames:
         self._known: dict[str, Trajectory] = {}
 
     def add(self, topic: str, kind: str, message: Any, place: str) -> None:
-        """Add a message of one of `KINDS`. InputError naming `place` where a pose in it is invalid.
+        """Add a message of one of `KINDS`. InputError naming `place` if a pose in it is invalid.
 
         Odometry has precedence over transforms of the same frame, because it has covariances.
         """
@@ -54,12 +56,14 @@ class Frames:
 
     @property
     def moving(self) -> list[str]:
-        """Frames that move in their parents and carry no other that does."""
+        """Frames that move relative to their parents, without descendants that do."""
         carries = {self._parent[child] for child in self._told}
         return sorted(child for child in self._told if child not in carries)
 
     def chain(self, frame: str) -> list[str]:
-        """A frame, its parent, and so on, up to the one below `world` or the last that has a parent."""
+        """A frame, its parent, and so on, up to the frame below `world`, or to the last one with a
+        parent.
+        """
         found = list[str]()
         while frame in self._parent and frame != WORLD and frame not in found:
             found.append(frame)
@@ -67,18 +71,18 @@ class Frames:
         return found
 
     def moves(self, frame: str) -> bool:
-        """Whether the frame, or one above it, has several poses over time."""
+        """Whether the frame, or one of its ancestors, has several poses over time."""
         return any(each in self._told for each in self.chain(frame))
 
     def at(self, frame: str, time_s: Array) -> tuple[Array, Array, Mask]:
-        """Poses (N, 4, 4) of a frame in the root of its tree at times (N,), their covariances (N, 6, 6),
-        rotation before translation along its own axes, 0 where there are none, and (N,) whether poses are near
-        enough in time.
+        """Poses (N, 4, 4) of a frame in the root of its tree at times (N,), their covariances (N,
+        6, 6), rotation, then translation, along its own axes (0 if unknown), and (N,) whether poses
+        close enough in time exist.
         """
         poses = np.tile(np.eye(4), (len(time_s), 1, 1))
         surely, there = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
         for each in self.chain(frame):
-            # Of A B, what errs is A's error seen from B, and B's own.
+            # The error of a product A B is the error of A, transformed to B, plus the error of B.
             link = self._trajectory(each) if each in self._told else None
             if link is not None:
                 there &= link.covers(time_s)
@@ -90,7 +94,9 @@ class Frames:
         return poses, surely, there
 
     def trajectory(self, frame: str, name: str) -> Trajectory:
-        """The trajectory of a frame, at the times of the link in its chain that has most poses. ValueError."""
+        """The trajectory of a frame, at the times of the link in its chain with the most poses.
+        ValueError if it has none.
+        """
         moved = [each for each in self.chain(frame) if each in self._told]
         most = max(moved, key=lambda each: len(self._told[each]))
         time_s = np.array(sorted(self._told[most])) / NS
@@ -101,14 +107,14 @@ class Frames:
         return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
 
     def forget(self, before_s: float) -> None:
-        """Drop earlier poses, except for the last of each link."""
+        """Drop poses before `before_s`, except for the last one of each link."""
         for child, told in self._told.items():
             for stamp in sorted(stamp for stamp in told if stamp < before_s * NS)[:-1]:
                 del told[stamp]
                 self._known.pop(child, None)
 
     def _trajectory(self, child: str) -> Trajectory | None:
-        """One link over time; None where it has one pose only."""
+        """One link over time; None if it has only one pose."""
         if child not in self._known and len(self._told[child]) > 1:
             told = sorted(self._told[child].items())
             time_s, poses = np.array([at for at, _ in told]) / NS, np.stack([pose for _, (pose, _) in told])
@@ -118,7 +124,9 @@ class Frames:
 
 
 def _links(topic: str, kind: str, message: Any) -> Iterator[tuple[str, str, int, Array, Any]]:
-    """Parent, child, stamp in nanoseconds, x y z qx qy qz qw and 36 numbers or None, of each pose in a message."""
+    """Parent, child, stamp in nanoseconds, x y z qx qy qz qw and 36 numbers or None, for each pose
+    in a message.
+    """
     stamped = message.transforms if kind == type_name(TREE) else [message]
     for each in stamped:
         covariance = None
@@ -134,12 +142,12 @@ def _links(topic: str, kind: str, message: Any) -> Iterator[tuple[str, str, int,
 
 
 def stamp_ns(header: Any) -> int:
-    """Stamp of a std_msgs/Header, nanoseconds."""
+    """Time stamp of a std_msgs/Header, nanoseconds."""
     return header.stamp.sec * NS + header.stamp.nanosec
 
 
 def frame_of(carrier: str) -> str:
-    """The frame of a carrier: what is behind the # of a file's name, else its own name."""
+    """The coordinate frame of a carrier: the part of its name after #, otherwise the whole name."""
     file, _, frame = carrier.partition("#")
     return frame.lstrip("/") if frame else ros_name(file)
 
@@ -155,8 +163,8 @@ def _matrix(pose: Array, place: str) -> Array:
 
 
 def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
-    """(6, 6) covariance of rotation before translation along the frame's own axes, from ROS's 36 numbers along
-    the parent's; None where these are zero, which means unknown, or begin with -1.
+    """(6, 6) covariance of rotation, then translation, along the frame's own axes, from ROS's 36
+    values along the parent's axes; None if these are zero (unknown), or begin with -1.
     """
     if numbers is None:
         return None
@@ -165,14 +173,16 @@ def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
         return None
     if not np.isfinite(parents).all() or np.linalg.eigvalsh(parents)[0] < -1e-9 * max(1.0, parents.max()):
         raise InputError(f"{place}: a covariance must be finite, without negative eigenvalues; write zeros")
-    # Some write the largest double for what is not known.
+    # Some programs write the largest double for an unknown value.
     parents = np.minimum(parents, MOST_VARIANCE / 10)
     turn = np.kron(np.eye(2), _matrix(pose, place)[:3, :3])
     return np.asarray(turn.T @ (parents + parents.T) / 2 @ turn)
 
 
 def _of_inverse(poses: Array) -> Array:
-    """(N, 6, 6) adjoints of the inverses of poses (N, 4, 4): from a parent's axes to the frame's."""
+    """(N, 6, 6) adjoints of the inverses of poses (N, 4, 4): they transform from a parent's axes to
+    the frame's.
+    """
     R, (x, y, z) = poses[:, :3, :3].mT, poses[:, :3, 3].T
     none = np.zeros_like(x)
     found = np.zeros((len(poses), 6, 6))
