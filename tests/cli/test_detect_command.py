@@ -174,7 +174,7 @@ def test_one_camera_is_enough_to_detect(kitchen):
     (["--videos", "shots", "--start", "{a}=2"], "--start 2: must be seconds, such as 0.2s, or frames"),
     (["--videos", "shots", "--start", "{a}=2s"], "the frame rate is unknown; give --fps"),
     (["--videos", "shots", "--start", "{a}=2f", "--start", "{a}=3f"], "is given twice"),
-    (["--videos", "shots", "--start", "{a}=50f"], "have no moment in common; check --start"),
+    (["--videos", "shots", "--start", "{a}=50f"], "have no time in common; check --start"),
     (["--videos", "shots", "--image-placement", "bent"], "must be one of same crop crop-centre scale letterbox"),
     (["--videos", "shots", "--image-placement", "same"], "1280 x 720; give another --image-placement"),
     (["--videos", "shots"], "give --image-placement: letterbox"),

@@ -75,7 +75,7 @@ def test_what_is_no_regular_file_is_not_waited_for(tmp_path):
 def test_a_file_has_bounds(tmp_path):
     with (tmp_path / "settings.toml").open("wb") as stream:
         stream.truncate(2**31)  # takes no room on the disk
-    assert "over 1 MiB are too much" in refused(read_toml, tmp_path / "settings.toml")
+    assert "the file is over 1 MiB" in refused(read_toml, tmp_path / "settings.toml")
 
 
 @pytest.mark.parametrize(

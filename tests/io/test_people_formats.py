@@ -403,12 +403,12 @@ BAD_SKELETONS = [
     (
         'neck = ["r_sho", "l_sho"]',
         'neck = ["neck", "l_sho"]',
-        "the middle Neck is made of Neck, which must be a key",
+        "the midpoint Neck uses Neck, which must be a key",
     ),
     (
         'neck = ["r_sho", "l_sho"]',
         'neck = ["MidHip", "l_sho"]',
-        "the middle Neck is made of MidHip, which must be",
+        "the midpoint Neck uses MidHip, which must be",
     ),
     ("[middles]", "core = []\n[middles]", "core must have at least one joint, by which a person is found"),
 ]
