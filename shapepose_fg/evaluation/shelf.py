@@ -136,7 +136,7 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
     if not scored.any():
         raise InputError(
             "none of the reconstructed frames is annotated; reconstruct annotated frames:"
-            " {_spans(np.unique(ground_truth.frame[acted]))}"
+            f" {_spans(np.unique(ground_truth.frame[acted]))}"
         )
     truth, frame = ground_truth.joints[scored], ground_truth.frame[scored]
     distance = _distances(truth, frame, people)

@@ -49,7 +49,7 @@ def test_it_may_lean_and_up_may_be_any_axis():
 @pytest.mark.parametrize(
     ("heights", "why"),
     [
-        ([0.0] * 5, "5 looks"),
+        ([0.0] * 5, "5 measurements"),
         (np.linspace(0, 1, 40), "agree"),  # stairs
         ([0.0] * 20 + [0.4] * 20, "agree"),  # a stage
         ([0.4] * 30 + [0.0] * 2, "below"),  # a stage that somebody stepped down from

@@ -125,7 +125,7 @@ def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
     assert set(reasons(solved([0.9, 0.0], sigma_m=0.04), here)) == {0}
     # With the body beside the views 4 cm is 2.8 cm: 0.6 m are 21 of them.
     both = reasons(solved([0.6, 0.0], sigma_m=0.04, body_sigma_m=0.04), here)
-    assert both == {0: "ran away from what views and body say of it"}
+    assert both == {0: "diverged from its views and the body"}
 
 
 def test_a_joint_with_a_factor_of_one_s_own_ran_away_after_a_metre():

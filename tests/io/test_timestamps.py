@@ -105,7 +105,7 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("0\n33\n67\n", "frames are 33.5 s apart; write seconds"),
         (
             "cam0 cam1\n0 1000\n1 1001\n2 1002\n",
-            "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no moment in common; give times",
+            "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no time in common; give times",
         ),
         ("cam0 cam1\n0 -\n1 -\n2 -\n", "camera cam1 has no times; leave it out with --without"),
         ("frame cam0 cam1\n0 0 0\n- 1 1\n2 2 2\n", "line 3 must hold numbers, got '-'"),

@@ -280,7 +280,7 @@ def test_who_is_not_there_is_said(people, scene):
     {
         "time_s must increase": lambda people: replace(people, time_s=np.zeros(len(people))),
         "does not at person": lambda people: replace(people, time_s=np.full(len(people), np.nan)),
-        "is twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
+        "occurs twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
         "persons must be at most": lambda people: with_both(people, person=people.person + 10**6),
         "people.problems must be": lambda people: people.with_run(people={"problems": 3}),
         "setup.left_out": lambda people: people.with_run(setup={"left_out": [{"camera": {}, "frames": [0, 9]}]}),

@@ -197,7 +197,7 @@ def test_a_network_in_another_body_s_words_says_the_same_of_the_same_body():
         (["--body", "second.npz", "--output", "notes.txt/w"], "notes.txt: results cannot be written here"),
         (
             ["--body", "second.npz", "--output", "empty"],
-            "empty: this is a folder, and a file is to be written here",
+            "empty: this is a folder, but a file must be written here",
         ),
         ([], "Missing option"),
     ],
