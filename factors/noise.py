@@ -58,7 +58,8 @@ def robust_kernel(name: KernelName | None, width_sigma: float | None = None) -> 
 def kernel_weight(
     name: KernelName | None, whitened_norm: ArrayLike, width_sigma: float | None = None
 ) -> NDArray[np.float64]:
-    """Weight (...,) that the kernel gives residuals whose whitened norm is `whitened_norm` (...,): 1 at 0.
+    """Weight (...,) of the kernel for residuals with the whitened norm `whitened_norm` (...,); 1 at
+    0.
 
     This is the weight of the squared residual when GTSAM linearises a robust factor, for arrays.
     """

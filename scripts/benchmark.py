@@ -1,12 +1,15 @@
-"""What whole commands cost, here and at an earlier commit: python scripts/benchmark.py [--against COMMIT].
+"""Measure the cost of complete commands, now and at an earlier commit: python scripts/benchmark.py
+[--against COMMIT].
 
-Runs `shapepose-fg reconstruct` as a process of its own on one recording after the other, alternately from this
-checkout and from the commit's, each `--rounds` times after one short run that is not counted (it compiles). Prints
-medians of the processor's time, the clock's and peak memory with their spread, the ratio, and the clock's time of
-each stage. One thread a process; on a machine that does nothing else.
+Runs `shapepose-fg reconstruct` as a separate process on each recording, alternately from this
+checkout and from that of the commit, `--rounds` times each after a short warm-up run (which
+compiles and is not counted). Prints medians and spread of processor time, wall time and peak
+memory, the ratio, and the wall time of each stage. Processes use one thread; the machine should be
+idle otherwise.
 
-The recording is Shelf where it is found (`--data`), the built-in scene otherwise; `crowd` is salsa of eight people
-before six cameras, from recorded motions where they are found. Longer ones are played forwards and backwards.
+The recording is Shelf if it is available (`--data`), otherwise the built-in scene. `crowd` is salsa
+of eight people and six cameras, from recorded motions if these are available. Longer recordings are
+made by playing it forwards and backwards.
 """
 
 import argparse
@@ -50,27 +53,28 @@ CASES = {
     "crowd, fast": ("crowd", ("--preset", "fast")),
     "recording, paper": ("short", ("--preset", "paper")),
 }
-"""Which recording, and options beside those of all; a preset is of this checkout, the commit runs its default."""
+"""For each case, the recording and additional options. A preset applies to this checkout; the
+commit runs its default."""
 _LONG = 3000
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 @dataclass(frozen=True)
 class Spent:
-    """What a run of a command took."""
+    """Resources used by a run of a command."""
 
     cpu_s: float
-    """Seconds of the processor; NaN with worker processes, whose times nobody adds up."""
+    """Processor time, seconds; NaN with worker processes, whose times are not included."""
     wall_s: float
-    """Seconds of the clock."""
+    """Wall time, seconds."""
     peak_mib: float
-    """The most memory of the process, MiB."""
+    """Peak memory of the process, MiB."""
     stages_s: dict[str, float]
-    """The clock's seconds of each stage, without those of stages inside it."""
+    """Wall time of each stage, seconds, without that of stages inside it."""
 
 
 def main() -> None:
-    """Measure and print."""
+    """Run the measurements and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     data = os.environ.get("SHAPEPOSE_DATA", HERE.parent / "shared")
     parser.add_argument(
@@ -97,7 +101,9 @@ def main() -> None:
 
 
 def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int) -> dict[str, list[Spent]]:
-    """The command in each tree, alternately, `rounds` times after a warm-up; a preset in this one only."""
+    """Run the command in each tree, alternately, `rounds` times after a warm-up; presets only in
+    this tree.
+    """
     spent: dict[str, list[Spent]] = {name: [] for name in trees}
     at = options.index("--preset") if "--preset" in options else len(options)
     own = {name: [*options[:at], *(options[at:] if name == "here" else options[at + 2 :])] for name in trees}
@@ -111,7 +117,7 @@ def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: 
 
 
 def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
-    """Run `reconstruct` of the checkout `tree`; the error that it printed where it fails."""
+    """Run `reconstruct` from the checkout `tree`; if it fails, raise its error message."""
     workers = [] if "--workers" in options else ["--workers", "1"]
     command = [sys.executable, "-m", "shapepose_fg", "reconstruct", *options, *workers, "--overwrite"]
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(tree)}
@@ -133,8 +139,8 @@ def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
 
 
 def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
-    """A recording of `frames` frames: `recording` played forwards and backwards in turn, so that no person
-    jumps.
+    """A recording of `frames` frames: `recording` played alternately forwards and backwards, so
+    that people do not jump.
     """
     count = len(recording)
     turns = (divmod(frame, count) for frame in range(frames))
@@ -143,7 +149,7 @@ def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
 
 @contextmanager
 def _checkouts(commit: str | None, work: Path) -> Iterator[dict[str, Path]]:
-    """Checkouts by their names: this one, and that of a commit where one is asked for."""
+    """Checkouts by name: this one and, if requested, that of a commit."""
     if commit is None:
         yield {"here": HERE}
         return
@@ -156,7 +162,9 @@ def _checkouts(commit: str | None, work: Path) -> Iterator[dict[str, Path]]:
 
 
 def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[list[str], int]:
-    """Options that name a recording, which is written into `folder` where no file holds it, and its frames."""
+    """Options for a recording of a `kind`, which is written into `folder` if necessary, and its
+    number of frames.
+    """
     recording, rig, fps = _crowd(data) if kind == "crowd" else _short(data)
     count = _LONG if kind == "long" else len(recording)
     count = min(count, frames or count)
@@ -177,7 +185,7 @@ def _short(data: Path) -> tuple[DetectionSequence, Rig, float]:
 
 
 def _crowd(data: Path) -> tuple[DetectionSequence, Rig, float]:
-    """Eight people before six cameras: who dance salsa, or of the built-in scene."""
+    """Eight people and six cameras: salsa from recorded motions, or the built-in scene."""
     motions = data / "data" / "cmu_mocap" / "cmu_smpl24.npz"
     if motions.is_file():
         scene = sequence("salsa", "report", Mocap.load(motions), cameras=6, until=408).part(range(108, 408))
@@ -187,7 +195,7 @@ def _crowd(data: Path) -> tuple[DetectionSequence, Rig, float]:
 
 
 def _machine() -> str:
-    """Processor, cores, how busy it was, versions."""
+    """Description of the machine: processor, cores, load, versions."""
     load = f", load {os.getloadavg()[0]:.1f} before the start" if hasattr(os, "getloadavg") else ""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
@@ -198,7 +206,7 @@ def _machine() -> str:
 
 
 def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
-    """Medians with least and most, and the last tree's share of the first's."""
+    """Medians with minimum and maximum, and the ratio of the last tree to the first."""
     table = Table(title=title, title_justify="left")
     table.add_column("seconds")
     for name in spent:

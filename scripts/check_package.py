@@ -1,11 +1,13 @@
 """Build sdist and wheel, install the wheel into an empty environment, and use it: python scripts/check_package.py
 
-The wheel is built from the sdist, so that what the sdist lacks is noticed. The environment takes the dependencies
-from the one that runs this (torch is a large download), but nothing of this folder.
+The wheel is built from the sdist, so that files missing in the sdist are noticed. The environment
+reuses the dependencies of the running one (torch is a large download), but nothing from this
+folder.
 
-With --versions oldest newest, one environment is made with the oldest versions that pyproject.toml allows (as far
-as wheels for the interpreter exist), and one with the newest, without constraints.txt. In each the demo runs, then
-the fast tests. --python python3.11 python3.13 tries other interpreters. Exit code 1 where something fails.
+With --versions oldest newest, one environment is made with the oldest versions that pyproject.toml
+allows (as far as wheels for the interpreter exist), and one with the newest, without
+constraints.txt. In each, the demo and then the fast tests are run. --python python3.11 python3.13
+tests other interpreters. Exit code 1 if something fails.
 """
 
 import argparse
@@ -45,7 +47,7 @@ print(f"Python {platform.python_version()}", *(f"{name} {version(name)}" for nam
 
 
 def main() -> None:
-    """Make the environments one after the other, and use them."""
+    """Create and test the environments one after the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--versions", nargs="+", choices=("oldest", "newest"), help="versions of dependencies")
     parser.add_argument("--python", nargs="*", default=[sys.executable], help="interpreters; by default this one")
@@ -68,7 +70,9 @@ def main() -> None:
 
 
 def run(place: Path, *command: object) -> str:
-    """Run a command in a folder, without this folder's packages; returns the last line that it printed."""
+    """Run a command in a folder, without the packages of this checkout; returns the last line of
+    its output.
+    """
     words = [str(each) for each in command]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment |= {"OMP_NUM_THREADS": "1"}
@@ -81,13 +85,13 @@ def run(place: Path, *command: object) -> str:
 
 
 def built(place: Path) -> str:
-    """Build at `place`, install into an empty environment, and use it."""
+    """Build at `place`, install the wheel into an empty environment, and use it."""
     run(place, sys.executable, "-m", "build", "--outdir", place / "dist", ROOT)
     wheel = next((place / "dist").glob("*.whl"))
     venv.create(place / "empty", with_pip=False)
     python = place / "empty" / "bin" / "python"
     run(place, sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel)
-    # After the environment's own packages, and without what `pip install -e` left there.
+    # After the environment's own packages, and without links left by `pip install -e`.
     site = Path(sysconfig.get_path("purelib", vars={"base": str(place / "empty")}))
     paths = [each for each in sys.path if each.endswith("site-packages")]
     (site / "dependencies.pth").write_text("\n".join(paths) + "\n", encoding="utf-8")
@@ -97,7 +101,9 @@ def built(place: Path) -> str:
 
 
 def tried(python: str, which: str, place: Path, tests: list[str]) -> str:
-    """Install the package with some versions of its dependencies at `place`, run the demo and the tests."""
+    """Install the package with the oldest or newest versions of its dependencies at `place`; run
+    the demo and the tests.
+    """
     own = place / "bin" / "python"
     if not own.exists():
         run(place, python, "-m", "venv", place)

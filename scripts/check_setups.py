@@ -1,10 +1,12 @@
-"""Measure the set-up check: faults that it names, and sound cameras that it accuses by biased detectors.
+"""Measure the set-up check: detected faults, and false findings on correct cameras with biased
+detectors.
 
     python scripts/check_setups.py --rigs 0:20 --output checks.csv
 
-Simulated rooms of 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same faults are made with a
-detector of the usual errors, and none with detectors that have lasting biases; run from a clone.
-docs/evaluation.md has the results. About a minute and a half a room on one core.
+Simulated rooms with 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same kinds of
+faults are simulated with a detector of typical errors; detectors with lasting biases are simulated
+without faults. Run it from a clone. docs/evaluation.md has the results. About a minute and a half
+per room on one core.
 """
 
 import argparse
@@ -40,7 +42,7 @@ from tests.setup_check.spoiled_setups import (
 
 FRAMES = 150
 LEVELS = ((0.02, 0.04), (0.02, 0.12), (0.06, 0.12))
-"""Least and largest bias of a joint in a view, parts of the person's size."""
+"""Minimum and maximum bias of a joint in a view, as shares of the person's size."""
 
 
 def main() -> None:
@@ -86,7 +88,7 @@ def _words(found: list[Finding] | tuple[Finding, ...]) -> str:
 
 
 def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator[Spoiled]:
-    """One fault of each kind, of a camera that is drawn; all move joints by 2 cm or more."""
+    """One fault of each kind, on a randomly drawn camera; all faults move joints by 2 cm or more."""
     rig = scene.rig
 
     def view() -> int:
@@ -124,7 +126,7 @@ def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator
 
 
 def _biased(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator[tuple[str, Recording]]:
-    """The recording by detectors with lasting biases."""
+    """The recording as detected by detectors with lasting biases."""
     shape = scene.people, 25, len(scene.rig)
     people = np.array([scene.truth_at(frame) for frame in range(len(seen))])
     yield "no bias", seen

@@ -1,12 +1,16 @@
-"""Fit what joints' covariances are made of (`estimation/calibration.py`) to the errors in simulated recordings.
+"""Fit the parameters of joint covariances (`estimation/calibration.py`) to the errors in simulated
+recordings.
 
     python scripts/fit_covariances.py --mocap ../shared/data/cmu_mocap/cmu_smpl24.npz --output calibration.json
 
-Crowds, crossings and pairs before two to six cameras, 4 s each; half an hour on one core. The mean log score of
-the true joint under its Gaussian is maximised: joints of two views, one and none have a share each, and what is
-farther than `FAR` has little hold, so that errors that no clue announces do not widen all the rest. At last all is
-widened until regions of 95 % hold so many of these joints, of people who are known well and badly alike: errors
-have longer tails than Gaussians, and the longer, the worse a person is known.
+Crowds, crossings and pairs with two to six cameras, 4 s each; half an hour on one core. The mean
+log score of the true joint under its Gaussian is maximised. Joints seen by two or more views, by
+one and by none have fixed shares in it, and errors beyond `FAR` have little influence, so that
+outliers without any feature that predicts them do not widen all covariances. Finally, all
+covariances are scaled so that 95 % regions have nominal coverage for people of every association
+uncertainty: the errors have heavier tails than a Gaussian, the more so the more uncertain a person
+is. The detector's noise law that ships (`estimation/noise_law.py`) is the mean of what is
+learnt from these recordings.
 """
 
 import argparse
@@ -22,6 +26,7 @@ import torch
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.calibration import WEIGHTS, Calibration, Clues
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -37,19 +42,19 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("crowd", "report", 777, 4), ("crossing", "tune", 7011, 2), ("crowd", "tune", 7012, 2),
     ("salsa", "tune", 7013, 2), ("crossing", "tune", 7014, 2),
 )  # fmt: skip
-"""Scene, split, seed, cameras. Of `report` the seeds that all was developed on: exchanged limbs are rare, and in
-those of `tune` there were none for long."""
+"""Scene, split, seed, number of cameras. Seeds of `report` are those used during development; they
+are needed because exchanged limbs are rare, and long ones did not occur with the seeds of `tune`."""
 FRAMES, FPS = 120, 30.0
 SHARES = (0.5, 0.7, 1.0)
-"""Shares in the log score of joints that no view, one view, and more views see."""
+"""Shares in the log score of joints that are seen by no view, by one view, and by two or more."""
 FAR = 30.0
-"""Squared Mahalanobis distance beyond which the log score's loss grows with its logarithm only."""
+"""Squared Mahalanobis distance beyond which the loss grows only logarithmically."""
 AT_95 = 7.815
-"""Squared Mahalanobis distance within which 95 % of a Gaussian in three dimensions are."""
+"""95 % quantile of chi-squared with 3 degrees of freedom (squared Mahalanobis distance)."""
 ROUND = 0.05
-"""Over so much the corner of the quantile's loss is rounded."""
+"""Width over which the kink of the quantile loss is smoothed."""
 ALIKE = ("Nose Eye Ear", "Neck", "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle", "Toe Heel")
-"""Joints that have one scale."""
+"""Groups of joints with a common scale."""
 
 
 def main() -> None:
@@ -58,13 +63,27 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="JSON file to be written")
     arguments = parser.parse_args()
     mocap = Mocap.load(arguments.mocap)
-    found = [pair for case in CASES for pair in errors(*case, mocap)]
-    arguments.output.write_text(json.dumps(fitted(found), indent=1) + "\n", encoding="utf-8")
+    laws = list[NoiseLaw]()
+    found = [pair for case in CASES for pair in errors(*case, mocap, laws)]
+    content = fitted(found) | {"noise": mean_law(laws)}
+    arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> Iterator[tuple[Clues, np.ndarray]]:
-    """For each window of a recording what is known of its joints, and how far they are off (N, J, 3), metres; NaN
-    for false positives.
+def mean_law(laws: list[NoiseLaw]) -> dict:
+    """The mean noise law of recordings: what ships."""
+    weights = np.array([law.count for law in laws]) + 1e-6
+    squared, gross = (
+        np.average(values, axis=0, weights=weights)
+        for values in (np.square([law.times for law in laws]), [law.gross for law in laws])
+    )
+    return NoiseLaw(tuple(np.sqrt(squared).round(2).tolist()), tuple(gross.round(3).tolist())).as_dict()
+
+
+def errors(
+    name: str, split: Split, seed: int, cameras: int, mocap: Mocap, laws: list[NoiseLaw]
+) -> Iterator[tuple[Clues, np.ndarray]]:
+    """For each window of a recording, the features of its joints, and their errors (N, J, 3),
+    metres; NaN for false positives. Its noise law is appended to `laws`.
     """
     if name == "two":
         scene = built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
@@ -76,7 +95,8 @@ def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> It
     truly = Calibration.covariance
     with patch.object(Calibration, "covariance", lambda self, clues: seen.append(clues) or truly(self, clues)):
         times = FrameTimes.from_fps(FPS, len(detections))
-        reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
+        people = reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
+    laws.append(NoiseLaw.from_dict(people.run["noise_law"]))
     for clues in seen:
         found, true = match_people(clues.frame, clues.joints, scene.keypoints), np.full(clues.joints.shape, np.nan)
         true[found.row] = scene.keypoints[found.frame, found.person]
@@ -84,7 +104,7 @@ def errors(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> It
 
 
 def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
-    """The file's content."""
+    """The fitted parameters, as the content of the output file."""
     names = BODY_25.joints
     group = np.array(
         [next(n for n, each in enumerate(ALIKE) if name.endswith(tuple(each.split()))) for name in names]
@@ -124,7 +144,8 @@ def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
         return total
 
     optimiser.step(loss)
-    # Quantile regression: by how much squared distances' 95 % are over a Gaussian's, with how a person is known.
+    # Quantile regression: ratio of the 95 % quantile of squared distances to that of a Gaussian, as
+    # a function of the uncertainty of a person.
     squared, wider = torch.log(squares()[1].detach() / AT_95), torch.zeros(2, dtype=off.dtype, requires_grad=True)
     optimiser = torch.optim.LBFGS([wider], max_iter=100, line_search_fn="strong_wolfe")
 

@@ -1,6 +1,7 @@
-"""Write docs/licences.md: the licences of everything that is installed with this package.
+"""Write docs/licences.md: the licences of all packages that are installed with this one.
 
-Run by hand after a dependency is added (python scripts/licences.py); tests/project/test_licences.py says when.
+Run it by hand (python scripts/licences.py) when tests/project/test_licences.py fails after a
+dependency was added.
 """
 
 import re
@@ -35,7 +36,7 @@ _SHORT = {
 
 
 def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
-    """Every distribution that is installed with this one and these extras, by its name."""
+    """All distributions that are installed with this one and these extras, by name."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     own = list(project["dependencies"])
     for extra in extras:
@@ -46,7 +47,7 @@ def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
         name, wanted = waiting.pop()
         try:
             here = distribution(name)
-        except PackageNotFoundError:  # of another system
+        except PackageNotFoundError:  # a dependency of other operating systems
             continue
         key = re.sub(r"[-_.]+", "-", here.metadata["Name"]).lower()
         if key in found:
@@ -61,7 +62,7 @@ def needed(extras: tuple[str, ...]) -> dict[str, Distribution]:
 
 
 def licence(of: Distribution) -> str:
-    """The licence that a distribution's metadata name, as short as they do."""
+    """The licence in the metadata of a distribution, as the short name given there."""
     metadata: Any = of.metadata
     if metadata.get("License-Expression"):
         return metadata.get("License-Expression")
@@ -74,7 +75,7 @@ def licence(of: Distribution) -> str:
 
 
 def page() -> str:
-    """The whole document."""
+    """The text of the whole page."""
     always, text = needed(()), HEAD
     more = {name: each for name, each in needed(EXTRAS).items() if name not in always}
     for title, rows in (("## Always", always), (f"## With the extras {', '.join(EXTRAS)}", more)):

@@ -1,9 +1,11 @@
-"""Measure a detector's lasting biases (`shapepose_fg/setup_check/biases.py`) by a recording with good cameras.
+"""Measure a detector's lasting biases (`shapepose_fg/setup_check/biases.py`) on a recording with
+well-calibrated cameras.
 
     python scripts/measure_biases.py calibration.json detections [--up z]
 
-Prints the sizes under which the residuals are likeliest: of a joint of one person in one view, of whole people's
-shifts and enlargements, of what all people have in common; parts of a person's size.
+Prints the maximum-likelihood sizes of the biases, as shares of a person's size: of a joint of one
+person in one view, of shifts and scalings of whole people, and of the part that all people have in
+common.
 """
 
 import argparse
@@ -18,7 +20,7 @@ from shapepose_fg.setup_check.small import Problem
 
 LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 RATIOS = (0.3, 1.0, 3.0)
-"""Standard deviations of shifts and of enlargements, relative to that of a joint's bias."""
+"""Standard deviations of shifts and scalings, relative to that of a joint's bias."""
 
 
 def main() -> None:

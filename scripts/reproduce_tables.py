@@ -1,4 +1,4 @@
-"""The tables of README.md and docs/ that are measured anew: python scripts/reproduce_tables.py [--update].
+"""Measure the tables of README.md and docs/ again: python scripts/reproduce_tables.py [--update].
 
     python scripts/reproduce_tables.py --quick                        # does everything work? two minutes
     python scripts/reproduce_tables.py --list                         # names of the tables
@@ -7,10 +7,11 @@
     python scripts/reproduce_tables.py --only "who is there" --list --cases     # names of its cases
     python scripts/reproduce_tables.py --only "who is there" --seeds 6301 --cases "crowd 3 cameras 10 Hz"
 
-Scenes come from fixed seeds. Recordings and recorded motions are taken from `--data FOLDER` (or SHAPEPOSE_DATA);
-what needs them is left out without. Figures are kept in the folder `--results`, one file a case, for each commit
-of the code: a run that was stopped goes on; with changes that are not committed, use `--afresh`. `--update` writes
-tables between their marks `<!-- NAME @COMMIT -->` and `<!-- end -->`; a table without marks names its commit.
+Scenes come from fixed seeds. Recordings and recorded motions are read from `--data FOLDER` (or
+SHAPEPOSE_DATA); tables that need them are skipped if they are missing. Results are stored in the
+folder `--results`, one file per case and commit of the code, so that an interrupted run is resumed;
+with uncommitted changes, use `--afresh`. `--update` writes tables between their marks `<!-- NAME
+@COMMIT -->` and `<!-- end -->`; a table without marks names its commit.
 """
 
 import argparse
@@ -28,7 +29,7 @@ DOCS = ROOT / "docs"
 
 
 def main() -> None:
-    """Measure what was asked for, and print or write the tables."""
+    """Measure the requested tables, and print or write them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     given = os.environ.get("SHAPEPOSE_DATA")
     parser.add_argument("--data", type=Path, default=None if given is None else Path(given))
@@ -83,36 +84,44 @@ def main() -> None:
 
 
 def recordings(folder: Path) -> Path | None:
-    """The folder, or the folder data in it, that has one of the recordings; None where neither has."""
+    """The given folder, or its subfolder data, if it has one of the recordings; None if neither
+    has.
+    """
     those = (each for each in (folder / "data", folder) if any((each / name).is_dir() for name in RECORDINGS))
     return next(those, None)
 
 
 def code_commit() -> str:
-    """The last commit that changed the code that figures come from; "-changed" where there are newer changes."""
+    """The last commit that changed the measured code; with the suffix "-changed" if there are
+    uncommitted changes.
+    """
     code = ("--", "shapepose_fg", "factors")
     commands = (("log", "-1", "--format=%h", *code), ("status", "--porcelain", *code))
     try:
         runs = [subprocess.run(("git", "-C", ROOT, *each), capture_output=True, text=True) for each in commands]
-    except FileNotFoundError:  # no git
+    except FileNotFoundError:  # git is not installed
         return "unknown"
     commit, changed = (each.stdout.strip() for each in runs)
     return (commit or "unknown") + ("-changed" if changed else "")
 
 
 def begins(name: str, words: str) -> bool:
-    """Whether `name` begins with these words."""
+    """Whether `name` begins with the given words."""
     return f"{name} ".startswith(f"{words} ")
 
 
 def has_words(name: str, words: str) -> bool:
-    """Whether a case has all of these words in its name: "crowd 3 cameras" finds "crowd 6301 3 cameras 10 Hz"."""
+    """Whether the name of a case contains all given words: "crowd 3 cameras" matches "crowd 6301 3
+    cameras 10 Hz".
+    """
     there, wanted = (re.split(r"[\s,:]+", each.casefold()) for each in (name, words))
     return set(wanted) <= set(there)
 
 
 def write_table(name: str, text: str, commit: str) -> bool:
-    """Put `text` between the marks of `name` on each page that has them; returns whether one has."""
+    """Write `text` between the marks of `name` on each page that has them; returns whether a page
+    has them.
+    """
     marked = re.compile(rf"<!-- {re.escape(name)}( @[\w-]+)? -->\n.*?(<!-- end -->)", re.DOTALL)
     pages = {page: page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
     pages = {page: old for page, old in pages.items() if marked.search(old) is not None}

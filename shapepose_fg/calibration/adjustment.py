@@ -1,9 +1,10 @@
-"""Bundle adjustment: poses and lenses of all cameras, and joints of people, in one factor graph (GTSAM).
+"""Bundle adjustment: poses and lenses of all cameras, and joints of people, in one factor graph
+(GTSAM).
 
-A joint seen by a camera is `ProjectionFactorPPPC` between pose, joint and lens, with a robust kernel; its fourth
-variable, the pose of the lens on the camera's body, is held at zero. (`GeneralSFMFactor2` treats joints behind a
-camera as ones without error, and prints that.) Prior knowledge about each camera is a prior on its pose and its
-lens.
+The detection of a joint is a `ProjectionFactorPPPC` between pose, joint and lens, with a robust
+kernel; its fourth variable, the lens's pose on the camera's body, is fixed at zero.
+(`GeneralSFMFactor2` gives joints behind a camera zero error, and prints that.) Prior knowledge on
+each camera is a prior on its pose and its lens.
 """
 
 from collections.abc import Sequence
@@ -27,14 +28,14 @@ Q = 13
 _HELD = 1e-6
 """Standard deviation of fixed parameters, rad or m."""
 _HELD_PX = 0.1
-"""Standard deviation that is added to those of the intrinsics and of the lens, pixels; tighter constraints of
-single numbers would damp what they share."""
+"""Standard deviation added to those of intrinsics and distortion, pixels; tighter constraints on
+single parameters would slow the convergence of shared ones."""
 _ANYWHERE_M = 10.0
 _STEPS = 6
 _ENOUGH = 1e-4
 _PRIOR_WIDTH = 4.0
-"""Standard deviations, of six parameters, at which the robust kernel of a camera's prior takes effect: a camera
-that was bumped must not pull the rig."""
+"""Width of the robust kernel of a camera's prior, in standard deviations of six parameters; a
+bumped camera must not pull the rig."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Freedom:
     centre_px: float = 0.0
     """Principal point, each axis, pixels."""
     lens: float = 0.0
-    """Each of k1 k2 p1 p2, without unit."""
+    """Each of k1 k2 p1 p2, dimensionless."""
 
     @property
     def sigmas(self) -> Array:
@@ -66,12 +67,13 @@ class Adjusted:
     rig: Rig
     """The adjusted cameras."""
     covariance: Array
-    """(V, Q, V, Q) covariance of the cameras' parameters relative to the rig as a whole, whose place is that of
-    the given rig."""
+    """(V, Q, V, Q) covariance of the cameras' parameters relative to the rig as a whole, which has
+    the gauge of the given rig."""
     people: People
     """The people, with joints at their adjusted positions."""
     scale: float
-    """Ratio of the detector's errors to those that were measured for detectors: robust, from the residuals."""
+    """Ratio of the detector's errors to those measured for detectors: robust, from the
+    residuals."""
 
     def sigma(self, part: slice) -> Array:
         """(V,) standard deviation of some of the parameters together: root of their summed variances."""
@@ -91,12 +93,11 @@ def adjust(
 ) -> Adjusted:
     """Adjust cameras to `people`, starting at `start`, with the prior `given` and its `freedom`.
 
-    The camera `reference` keeps its pose; without one the mean pose of the rig is kept, and `scaled` leaves its
-    size out of the covariance.
-
-    `dilution` is the number of correlated errors of a detection, over joints and frames, that count as one: the
-    priors are strengthened by it and the covariance scaled, so that the kernel keeps its width in pixels. `scale`
-    multiplies the detections' standard deviations.
+    The camera `reference` keeps its pose; without one the mean pose of the rig is kept, and with
+    `scaled` the covariance excludes the rig's size. `dilution` is the number of correlated errors
+    of a detection, over joints and frames, that count as one: the priors are strengthened by it and
+    the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies the
+    detections' standard deviations.
     """
     free = freedom.lens > 0
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -130,7 +131,7 @@ def adjust(
     order = gtsam.Ordering()
     for each in [*dict.fromkeys(joints), *last]:
         order.push_back(each)
-    # Ceres's way damps each parameter by its own information: pixels and metres stand side by side.
+    # Ceres' damping uses each parameter's own information, since pixels and metres are mixed.
     params = gtsam.LevenbergMarquardtParams.CeresDefaults()
     params.setMaxIterations(_STEPS)
     params.setRelativeErrorTol(_ENOUGH)
@@ -142,7 +143,7 @@ def adjust(
     moved = np.full_like(people.points, np.nan)
     moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
     placed = replace(people, points=moved)
-    # A joint that went behind a camera tells nothing, not even where it is.
+    # A joint behind a camera has no constraints, so that its position needs a prior.
     depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
     for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
         graph.addPriorPoint3(each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M))
@@ -156,7 +157,7 @@ def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
     away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
-    # A joint of n views takes 3 of 2 n numbers for itself.
+    # A joint seen by n views uses up 3 of its 2 n residuals.
     left = np.sqrt(np.maximum(1 - 1.5 / np.maximum(views, 2), 0.25))
     return float(np.median((away / left)[people.seen]) / np.sqrt(2 * np.log(2)))
 
@@ -206,7 +207,7 @@ def _information(
     for each in joints:
         first.push_back(each)
     lens = 9 if free else 5
-    # From GTSAM's parameters to ours; a camera that sees nobody is in no factor.
+    # Map GTSAM's parameters to ours; a camera without sightings is in no factor.
     seen, count = sorted(set(views)), len(rig)
     to = np.zeros((len(seen) * (6 + lens), count * Q))
     for n, view in enumerate(seen):
@@ -217,12 +218,14 @@ def _information(
         to[at + 6 : at + 6 + lens, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view], free)
     last.push_back(B(0))
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(first)
-    information = rest.hessian(last)[0][: len(to), : len(to)]  # the lens stays on the body
+    information = rest.hessian(last)[0][: len(to), : len(to)]  # the lens is fixed to the body
     return to.T @ information @ to
 
 
 def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | None, scaled: bool) -> Array:
-    """(V, Q, V, Q) covariance of the cameras' parameters, without what moves, or scales, the rig as a whole."""
+    """(V, Q, V, Q) covariance of the cameras' parameters, without rigid motion, or scaling, of the
+    whole rig.
+    """
     V = len(rig)
     prior = np.tile(sigmas, (V, 1))
     if reference is not None:

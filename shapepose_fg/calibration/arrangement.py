@@ -1,4 +1,6 @@
-"""Poses of all cameras from relative poses of pairs: the spanning tree with most agreement, then a pose graph."""
+"""Poses of all cameras from relative poses of pairs: best spanning tree by agreement, then a pose
+graph.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,7 +35,7 @@ class Edge:
     score: float
     """Score of the pair (`Relative.score`)."""
     covariance: Array
-    """(6, 6) covariance of bTa as GTSAM's poses change, in the first camera's frame: rotation, rad, then
+    """(6, 6) covariance of bTa in GTSAM's tangent, in the first camera's frame: rotation, rad, then
     translation, m."""
 
     @classmethod
@@ -48,7 +50,7 @@ class Edge:
 
 
 def arranged(edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
-    """(V, 4, 4) poses in the frame of the first camera, for `edges` that connect all."""
+    """(V, 4, 4) poses in the frame of the first camera, for `edges` that connect all cameras."""
     rng, best, most = np.random.default_rng(0), np.zeros((0,)), -np.inf
     for trial in range(_TREES):
         luck = rng.gumbel(size=len(edges)) if trial > 0 else np.zeros(len(edges))
@@ -67,7 +69,7 @@ def agreement(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> float:
 
 
 def _alike(poses: Array, a: int, b: int, edge: Edge) -> float:
-    """Agreement of a pair's poses with its edge: 1 where they are equal, 0 where they are far apart."""
+    """Agreement of a pair's poses with its edge, from 1 if equal to 0 if far apart."""
     bTa = np.linalg.solve(poses[b], poses[a])
     turn, _ = difference(bTa[:3], edge.bTa[:3])
     ways = [each[:3, 3] / np.linalg.norm(each[:3, 3]) for each in (bTa, edge.bTa)]
@@ -89,7 +91,7 @@ def _tree(order: list[tuple[int, int]], edges: Mapping[tuple[int, int], Edge], v
 
 
 def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
-    """Poses that fit all pairs best, by a pose graph with a robust kernel (Cauchy)."""
+    """Poses refined by a pose graph of all pairs, with a robust kernel (Cauchy)."""
     graph, values, kernel = gtsam.NonlinearFactorGraph(), gtsam.Values(), robust_kernel("cauchy")
     for view, pose in enumerate(poses):
         values.insert(X(view), gtsam.Pose3(pose))

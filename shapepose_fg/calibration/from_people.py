@@ -1,7 +1,8 @@
-"""Estimates the poses of cameras with known lenses from walking people alone.
+"""Estimates the poses of cameras with known lenses from walking people only.
 
-Pairs of cameras (`relative`), all cameras (`arrangement`), then association and bundle adjustment in turn
-(`adjustment`), and at last scale, up and the floor (`levelling`). An undetermined result is refused.
+The steps are pairs of cameras (`relative`), all cameras (`arrangement`), alternating association
+and bundle adjustment (`adjustment`), and last scale, up and the floor (`levelling`). An
+undetermined result is rejected.
 """
 
 from collections.abc import Callable, Iterable
@@ -38,8 +39,8 @@ from shapepose_fg.setup_check.matching import Sightings
 _BURST_S, _BURSTS = 10.0, 6
 """Duration of the intervals in which people are tracked, s, and their number, spread over the recording."""
 _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
-"""Frames of the first rounds; number of these rounds, of rounds with all frames, and of rounds with each half
-of them."""
+"""Number of frames in the first rounds, number of these rounds, of rounds with all frames, and of
+rounds with each half of them."""
 _STILL_DEG = 0.03
 """Rotation per round below which cameras have converged, degrees."""
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
@@ -49,13 +50,15 @@ _LEAST_PEOPLE = 10
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """Maximum standard deviation of a rotation, and maximum difference between halves of the recording, degrees."""
 _UNUSUAL = 3.0
-"""Standard deviations of stature within which people are assumed to be adults."""
+"""Maximum deviation of stature, in standard deviations, for people assumed to be adults."""
 _FREE = Freedom(turn_deg=20.0, move_m=1.0)
 _FILM = "film two or more people for a minute who walk through all views, near and far, not on one line"
 
 
 class Undetermined(ValueError):
-    """People do not determine the cameras: a sentence each that names the cause and the cure."""
+    """The people do not determine the cameras; `problems` has a sentence each with
+    cause and cure.
+    """
 
     def __init__(self, problems: tuple[str, ...], found: "Calibrated | None" = None):
         super().__init__("; ".join(problems))
@@ -67,23 +70,25 @@ class Calibrated:
     """Estimated cameras with their uncertainty."""
 
     adjusted: Adjusted
-    """The cameras, people's places and covariances, in metres; z is up, the floor at 0."""
+    """The cameras, people's positions and covariances, in metres; z is up, the floor at 0."""
     world: World
     """Scale, up and floor of the rig."""
     apart_deg: Array
-    """(V,) difference of rotations between halves of the recording, each estimated without the other, degrees."""
+    """(V,) difference of rotations between halves of the recording, each estimated separately,
+    degrees."""
     apart_m: Array
-    """(V,) distance between the places of each camera as halves of the recording give them, each without the
-    other, metres."""
+    """(V,) distance between the positions of each camera estimated from halves of the recording,
+    metres."""
     held_out_px: float
-    """Median distance of a joint from where the other cameras put it, on halves that were not used, pixels."""
+    """Median distance of a joint from its prediction by the other cameras, on held-out halves,
+    pixels."""
     counts: Index
     """(V,) number of people, one per frame, from which each camera was estimated."""
     explained: Array
     """(V,) share of the people seen by each camera that another camera sees too."""
     missed_px: Array
-    """(N, V) distances of joints from where the other cameras put them, on halves that were not used, pixels;
-    NaN where unknown."""
+    """(N, V) distances of joints from their predictions by the other cameras, on held-out halves,
+    pixels; NaN if unknown."""
     notes: tuple[str, ...] = field(default=())
     """Notes on what is weakly observed, a sentence each."""
 
@@ -129,12 +134,13 @@ def calibrate(
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Rig | None = None,
 ) -> Calibrated:
-    """Estimate the poses of the cameras of `rig`, whose own poses are ignored, from the people in `detections`.
+    """Estimate the poses of the cameras of `rig`, ignoring its own poses, from the people in
+    `detections`.
 
-    `focal` is the prior standard deviation of focal lengths, as a share; 0 keeps them. The scale comes from
-    `measured` distances, or from adults. Cameras that are about as in `start` are not searched. Undetermined where
-    cameras share too little, or motion does not determine them; InputError where measured distances contradict
-    each other.
+    `focal` is the prior standard deviation of focal lengths, as a share; 0 keeps them. The scale
+    comes from `measured` distances, or from the stature of adults. `start` are approximate cameras,
+    which replace the search. Raises Undetermined if cameras share too few people, or motion does
+    not determine them; InputError if measured distances contradict each other.
     """
     measured = measured or Measured()
     views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
@@ -198,7 +204,9 @@ def _pairs(
 
 
 def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
-    """The tracks of each camera, in its own frame; Undetermined where one sees hardly anybody."""
+    """The tracks of each camera, in its own frame; raises Undetermined if one sees too
+    few people.
+    """
     seen_s = np.bincount(sightings.view, minlength=len(rig)) / fps
     if len(few := np.flatnonzero(seen_s < _LEAST_S)) > 0:
         figures = ", ".join(f"{each:.1f}" for each in seen_s[few])
@@ -274,7 +282,7 @@ class _How:
 
 
 def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
-    """Cameras, people and covariances in another unit."""
+    """Cameras, people and covariances scaled to another unit."""
     unit = np.ones(adjusted.covariance.shape[1])
     unit[MOVE] = factor
     covariance = adjusted.covariance * unit[:, None, None] * unit
@@ -287,7 +295,7 @@ def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
 
 
 def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, footage: Footage) -> Calibrated:
-    """The result, or an error that says what is wrong with it."""
+    """The validated result; raises Undetermined with the problems."""
     rig, people = adjusted.rig, adjusted.people
     apart_deg, apart_m = _apart_by(*halves)
     counts = people.seen.any(axis=1).sum(axis=0)

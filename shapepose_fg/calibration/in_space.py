@@ -1,5 +1,5 @@
-"""Time offsets of three or more cameras: a joint's place and motion from the others, compared with each
-camera's view.
+"""Time offsets of three or more cameras: positions and velocities of joints from the other cameras,
+compared with each camera's view.
 """
 
 from dataclasses import dataclass
@@ -22,15 +22,15 @@ _REWEIGHED = 10
 _NUDGE = 0.25
 """Shift of a clock for numerical derivatives, frames: more than the errors to be found."""
 _LEAST_OTHERS = 0.2
-"""Minimum weight of all other blocks when one is weighted."""
+"""Minimum total weight of all other blocks, in the correction for one block."""
 _FASTEST = 2.5
-"""Maximum speed of a joint, statures per second: faster ones have changed their person."""
+"""Maximum speed of a joint, statures per second; faster ones are identity switches."""
 
 
 @dataclass(frozen=True)
 class InSpace:
-    """People in space, and their tracks: offsets are those at which each camera sees what the others
-    triangulate.
+    """People in 3D and their tracks: offsets align each camera's view with the triangulation by the
+    others.
     """
 
     tracks: list[Tracks]
@@ -44,14 +44,14 @@ class InSpace:
     member: Index
     """(P, V) the track of each person in each camera; -1 for none."""
     step: int
-    """Frames from one time to the next."""
+    """Step between times, frames."""
     fps: float
     """Frame rate, Hz."""
 
     @classmethod
     def of(cls, pairwise: Pairwise) -> "InSpace":
-        """People at consecutive times, as many as are useful. Tracks that contradict most others of the person
-        are left out, because two dancers may be nearer to each other than a camera's error.
+        """Build it from people at consecutive times. Tracks that contradict most others of a person
+        are excluded, because two dancers may be nearer to each other than a camera's error.
         """
         tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))
@@ -98,7 +98,8 @@ class InSpace:
         late, errors = self.all_late(shift)
         shift -= late - late.mean()
         late, errors = self.all_late(shift)
-        # A clock that is moved moves what its camera places, too, and joints that miss by more count less.
+        # A clock offset also changes the triangulation, and joints with larger residuals have
+        # smaller weights.
         slope = np.stack([self.all_late(shift + _NUDGE * one)[0] - late for one in np.eye(V)], axis=1) / _NUDGE
         inverse = np.linalg.pinv((slope - slope[0])[1:, 1:], rcond=1e-3)
         for _ in range(2):
@@ -128,7 +129,7 @@ class InSpace:
         return np.stack(rays, axis=2), np.stack(speed, axis=2), np.stack(xy, axis=2), np.stack(size, axis=1)
 
     def _moving(self, points: Array, speed: Array) -> Array:
-        """(P, J, 3) velocities of joints at `points`, metres per frame, from the changes of directions to them
+        """(P, J, 3) velocities of joints at `points`, metres per frame, from changes of directions
         (P, J, V, 3).
         """
         away = points[:, :, None] - centres_of(self.views)
@@ -142,10 +143,10 @@ class InSpace:
         return np.where(enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan)
 
     def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, Array]:
-        """Delay of one camera's clock relative to the others' triangulation, frames; and the contributions of B
-        blocks (B,).
+        """Delay of one camera's clock relative to the others' triangulation, frames; and the
+        contributions of B blocks (B,).
 
-        The squares of the contributions sum to the variance. Infinite where nothing is known.
+        The squares of the contributions sum to the variance. Infinite if the delay is unobserved.
         """
         block = block_frames(self.fps, float(np.ptp(self.time)))
         blocks = int(np.ptp(self.time) // block) + 1
@@ -195,7 +196,8 @@ class InSpace:
             return 0.0, np.full(blocks, np.inf)
         miss, calm, fast, time = (np.concatenate(each) for each in (off, change, own, now))
         weight = np.concatenate(weights)
-        # The speeds of what others place have not seen this camera's errors; its own say what a frame changes.
+        # Velocities from the others are independent of this camera's errors; its own give the
+        # change per frame.
         gains = (weight * (calm * fast).sum(axis=-1)).sum(axis=1)
         if (gain := float(gains.sum())) <= 0:
             return 0.0, np.full(blocks, np.inf)
@@ -211,7 +213,7 @@ class InSpace:
         gains *= trust
         part = np.bincount(when, gains, blocks) / gains.sum()
         errors = np.bincount(when, trust * score - late * gains, blocks) / gains.sum()
-        # A block that weighs much pulls the mean to itself: without it the mean were farther away.
+        # A block with a large weight pulls the mean towards itself; this corrects its deviation.
         return float(late), errors / np.maximum(1 - part, _LEAST_OTHERS)
 
 

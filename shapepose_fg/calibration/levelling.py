@@ -1,4 +1,6 @@
-"""Gives a rig a world: scale from people's stature, up from standing people, the floor at 0."""
+"""Aligns a rig with the world: scale from people's stature, up from standing people, the floor at
+0.
+"""
 
 from dataclasses import dataclass
 
@@ -15,31 +17,33 @@ from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.findings import ADULT_M as ADULT_M
 
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
-"""Standard deviations of the scale from `build_of`, as shares of it: of bones among adults, and among people of
-a known stature; and the error that all people share, from the detector and their origin."""
+"""Standard deviations of the scale from `build_of`, as shares: of bones among adults, and among
+people of a known stature; and the error common to all people, from the detector."""
 _TAPE_M = 0.02
 """Standard deviation of a distance between lenses that was measured with a tape, m."""
 _CONTRADICTS = 4.0
-"""Number of standard deviations from which on measurements contradict each other."""
+"""Number of standard deviations above which measurements contradict each other."""
 _LEAN_RAD = np.radians(3.0)
-"""Largest lean of people's mean trunk, from which the floor is searched, rad."""
+"""Maximum lean of people's mean trunk for the search of the floor, rad."""
 _ANKLE_M = 0.10
 """Height of a standing person's ankles above the floor, m."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Prior on the size of the rig: distances between cameras, or people's stature, or that they are adults."""
+    """Prior on the size of the rig: distances between cameras, or people's stature, by default that
+    of adults.
+    """
 
     stature_m: float | None = None
-    """People's median stature; None for adults'."""
+    """Median stature of the people, m; None for adults'."""
     distances: tuple[tuple[int, int, float], ...] = ()
-    """Pairs of cameras, and metres between their lenses; these determine the scale where there are any."""
+    """Pairs of cameras, and metres between their lenses; if given, they determine the scale."""
 
     def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
-        """Factor by which the distances scale the cameras, and its standard deviation.
+        """Scale factor of the cameras from the distances, and its standard deviation.
 
-        InputError where distances contradict each other.
+        Raises InputError if distances contradict each other.
         """
         rig, V = adjusted.rig, len(adjusted.rig)
         length, metres = np.empty(len(self.distances)), np.array([each for *_, each in self.distances])
@@ -73,48 +77,49 @@ class World:
     stature_m: float
     """Median stature of the people, metres, at this scale."""
     persons: int
-    """Number of people who were seen at a time."""
+    """Number of people seen at once."""
     floor: Floor | None
-    """Floor under the ankles, in the frame before; None where they are on no level plane."""
+    """Floor under the ankles, in the frame before levelling; None if they are not on a
+    level plane."""
     upright: float
     """Agreement of people's upright directions: the length of their trunks' mean direction, 1 at most."""
 
 
 def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
-    """Metres per unit of the people's places, if their median stature is `stature_m`, or an adult's; NaN if no
-    bones are seen.
+    """Metres per unit of the people's positions, for a median stature `stature_m`, or an adult's;
+    NaN without bones.
     """
     return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
 
 
 def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
-    """The rig with all distances from the `fixed` point (3,), by default the origin, `factor` times as large."""
+    """The rig scaled by `factor` about the `fixed` point (3,), by default the origin."""
     wTc = rig.wTc
     wTc[:, :3, 3] = fixed + factor * (wTc[:, :3, 3] - fixed)
     return rig.at_poses(wTc)
 
 
 def at_once(people: People) -> int:
-    """Number of people who were seen at a time, in all but the fullest tenth of the frames."""
+    """Number of people seen at once, in all but the fullest tenth of the frames."""
     _, counts = np.unique(people.frame, return_counts=True)
     return int(np.percentile(counts, 90)) if len(counts) > 0 else 0
 
 
 def sigma_of_scale(persons: int, known: bool) -> float:
-    """Standard deviation of the scale, as a share of it, from the bones of this many people, of `known` stature
-    or not.
+    """Standard deviation of the scale, as a share, from the bones of `persons` people, of `known`
+    stature or not.
     """
     return float(np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON))
 
 
 def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -> tuple[Rig, World]:
-    """The rig with z up, the floor at 0, people in the middle, and y away from the first camera."""
+    """The rig with z up, the floor at 0, people in the centre, and y away from the first camera."""
     build = build_of(people.points, skeleton)
     upright = float(np.linalg.norm(build.up))
     up = build.up / upright if upright > 0 else -rig.cameras[0].wTc[:3, 1]
     names = [skeleton.joints[joint] for joint in skeleton.core]
     feet = [n for n, name in enumerate(names) if name.endswith("Ankle")]
-    # Of two views alone one in fifty is 10 cm under the floor, where nobody stands.
+    # With two views only, one ankle in fifty is 10 cm below the floor.
     sure = (people.seen[:, feet].sum(axis=-1) >= min(3, len(rig))).all(axis=1)
     ankles = people.points[sure][:, feet]
     floor: Floor | None = None

@@ -1,4 +1,6 @@
-"""Offsets between pairs of cameras to a part of a frame: tracks that are one person, and how their rays meet."""
+"""Time offsets between pairs of cameras with subframe accuracy: tracks of one person, and
+intersection of rays.
+"""
 
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -32,7 +34,7 @@ class Pairwise:
     """Frame rate, Hz."""
 
     def same(self, a: int, b: int, gate: float = _GATE) -> list[tuple[int, int]]:
-        """Pairs of tracks of cameras a and b that are one person over all the time that both have."""
+        """Pairs of tracks of cameras a and b that are one person over their whole common time."""
         one, other, apart = self.tracks[a], self.tracks[b], self.shift[b] - self.shift[a]
         stride = max(1, round(0.1 * self.fps))
         rows = np.arange(0, len(one.frame), stride)
@@ -51,7 +53,7 @@ class Pairwise:
         spans = [(each.frame[each.first], each.lasts) for each in (one, other)]
 
         def rival(pair: tuple[int, int], side: int) -> bool:
-            """Whether another track of the same time fits the same one better."""
+            """Whether another simultaneous track fits the same one better."""
             for each in kept:
                 same, differs = each[1 - side] == pair[1 - side], each[side] != pair[side]
                 if same and differs and error[each] < error[pair]:
@@ -73,8 +75,8 @@ class Pairwise:
         return every[::thin], tracks[::thin]
 
     def miss(self, a: int, b: int, rows: Index, track: Index, apart: float) -> tuple[Array, Array]:
-        """(N, J) distance between camera b's rays, `apart` frames later, and those of `rows`; and its change
-        per frame.
+        """(N, J) distance between camera b's rays, `apart` frames later, and those of `rows`; and
+        its change per frame.
         """
         one, other = self.tracks[a], self.tracks[b]
         rays, speed, size = other.at(track, np.asarray(one.frame[rows] + apart, dtype=np.float64))
@@ -83,9 +85,7 @@ class Pairwise:
         return miss, np.einsum("njk,njk->nj", normal, speed) / size[:, None]
 
     def nearest(self, reach: float, step: float) -> "Pairwise":
-        """Return a copy with the shifts that fit best among those within `reach` frames, found camera after
-        camera.
-        """
+        """Return a copy with the best shifts within `reach` frames, found camera by camera."""
         V, shift = len(self.tracks), self.shift.copy()
         pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
         tried = np.arange(-reach, reach + step / 2, step)
@@ -112,7 +112,7 @@ class Pairwise:
         return replace(self, shift=shift + tried[place])
 
     def solved(self) -> tuple[Array, Array]:
-        """(V,) shifts in frames and their covariance (V, V), all pairs together."""
+        """(V,) shifts in frames and their covariance (V, V), estimated jointly from all pairs."""
         V, shift = len(self.tracks), self.shift.copy()
         pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
         block = block_frames(self.fps, max(float(np.ptp(each.frame)) for each in self.tracks))
@@ -154,8 +154,8 @@ class Pairwise:
 
 
 def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
-    """Values (N, J) minus their means over the time around, track by track: correlated errors are in these
-    means.
+    """Values (N, J) minus their local means over time, per track: this removes
+    correlated errors.
     """
     result = tuple(each.copy() for each in values)
     edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
@@ -167,7 +167,9 @@ def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, 
 
 
 def without_means(values: Array, known: Mask, width: float) -> Array:
-    """Values (T, ...) minus the means of the `known` ones over the time around: `width` steps, one sigma."""
+    """Values (T, ...) minus local means of the `known` ones, with a Gaussian window of `width`
+    steps.
+    """
     weight = gaussian_filter1d(known.astype(np.float64), width, axis=0, mode="constant")
     mean = gaussian_filter1d(np.where(known, values, 0.0), width, axis=0, mode="constant")
     return values - mean / np.maximum(weight, 1e-9)

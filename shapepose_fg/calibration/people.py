@@ -1,4 +1,4 @@
-"""The people from which cameras are adjusted: seen by several cameras, in frames that are apart in time."""
+"""People used for adjusting cameras: seen by several cameras, in frames separated in time."""
 
 from dataclasses import dataclass, replace
 
@@ -15,14 +15,14 @@ from shapepose_fg.setup_check.evidence import observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
 _LEAST_STEP_S = 0.1
-"""Minimum time between used frames, s: nearer ones have correlated errors of the detector (0.8)."""
+"""Minimum time between used frames, s: errors of nearer ones are correlated (0.8)."""
 _MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
-"""Maximum number of sightings; more of them, or of frames, cost time and add little, because errors within a
-second are correlated."""
+"""Maximum number of sightings; more of them, or of frames, cost time and add little information,
+because errors within a second are correlated."""
 _MIN_DEPTH_M = 0.3
 _WEAKEST_M = 0.15
-"""Largest standard deviation of a joint in its worst direction with which it is used, m."""
+"""Maximum standard deviation, m, of a used joint in its worst direction."""
 _NOISE = ObservationConfig()
 
 
@@ -35,20 +35,20 @@ class People(Rows):
     xy: Array
     """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
     sigma_px: Array
-    """(P, J, V) standard deviation of each detection per axis, pixels, as measured for the detector; NaN where
-    there is none."""
+    """(P, J, V) standard deviation of each detection per axis, pixels, as measured for the
+    detector; NaN without a detection."""
     points: Array
-    """(P, J, 3) where the cameras put the joints, metres; NaN where fewer than two saw them."""
+    """(P, J, 3) triangulated joints, metres; NaN with fewer than two views."""
 
     @property
     def seen(self) -> Mask:
-        """(P, J, V) which detections place a joint."""
+        """(P, J, V) mask of the detections of triangulated joints."""
         return np.asarray(np.isfinite(self.sigma_px) & np.isfinite(self.points[..., :1]))
 
 
 @dataclass(frozen=True)
 class Footage:
-    """The sightings of the cameras in the frames that are used."""
+    """The sightings of the cameras in the used frames."""
 
     sightings: Sightings
     """The people of single cameras, in distorted pixels."""
@@ -78,7 +78,7 @@ class Footage:
         return replace(self, sightings=self.sightings.rows(np.isin(self.sightings.frame, frames)))
 
     def undistorted(self, rig: Rig) -> Sightings:
-        """The sightings under the lenses of `rig`."""
+        """The sightings undistorted by the lenses of `rig`."""
         xy = self.sightings.xy.copy()
         for view, camera in enumerate(rig.cameras):
             here = self.sightings.view == view
@@ -101,8 +101,8 @@ class Footage:
 
 
 def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
-    """(P, J) which points are well determined in all directions, if views determine them across their rays by
-    `sigma_m`.
+    """(P, J) mask of points that are well determined in all directions, given standard deviations
+    `sigma_m` across the views' rays.
     """
     rays = points[:, :, None] - rig.centres
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -112,9 +112,10 @@ def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
 
 
 def missed_px(people: People, rig: Rig) -> Array:
-    """(P, J, V) distance of each detection from where the *other* cameras alone put the joint, pixels.
+    """(P, J, V) distance of each detection from the joint predicted by the *other* cameras only,
+    pixels.
 
-    NaN where fewer than two others see it. With only two cameras: from where both put it.
+    NaN if fewer than two others see it. With only two cameras, from the prediction by both.
     """
     missed = np.full(people.sigma_px.shape, np.nan)
     weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)

@@ -1,5 +1,5 @@
-"""Refines cameras with the people of a recording: association and adjustment in turn; validated on held-out
-frames.
+"""Refines cameras by the people of a recording: alternating association and adjustment; held-out
+validation.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.small import Problem
 
 _ROUNDS = 4
-"""Number of times that people are associated again with the cameras of the round before."""
+"""Number of rounds, each with people associated by the cameras of the round before."""
 _LEAST_PEOPLE = 10
 """Minimum number of people, one per frame, from which a camera is adjusted."""
 _SAME_PERSON = 2.5
@@ -32,11 +32,11 @@ _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
 """Shares of a detector's errors, and their time constants, s: measured on simulated recordings, whose detector
 has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
 _UNKNOWN = 0.8
-"""Ratio of posterior to prior standard deviation above which a parameter is not determined."""
+"""Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
 
 _BUMPED_DEG = 2.5
-"""Rotation above which a camera was bumped, degrees: its prior is then centred on the pose at which it sees the
-others' people."""
+"""Rotation, degrees, above which a camera was bumped: its prior is then centred at the pose that
+fits the others' people."""
 
 PARTS = {"turn": TURN, "move": MOVE, "focal": FOCAL, "centre": CENTRE, "lens": LENS}
 """Parameters of a camera that may change."""
@@ -49,30 +49,29 @@ class Refinement:
     """The result of refining a rig."""
 
     given: Rig
-    """The cameras of the user."""
+    """The given cameras."""
     adjusted: Adjusted
     """The cameras adjusted to the people."""
     freedom: Freedom
     """Prior standard deviations of the cameras' parameters."""
     before_px: float
-    """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
-    used, pixels; given cameras."""
+    """Median distance of a detection from the joint predicted by the other cameras only, on
+    held-out frames, pixels; with the given cameras."""
     after_px: float
-    """Median distance of a detection from where the other cameras alone put the joint, on frames that were not
-    used, pixels; cameras refined on the other half of the recording."""
+    """Median distance of a detection from the joint predicted by the other cameras only, on
+    held-out frames, pixels; with cameras refined on the other half of the recording."""
     counts: Index
     """(V,) number of people, one per frame, from which each camera was adjusted."""
     notes: tuple[str, ...] = field(default=())
-    """Notes on what motion does not determine, a sentence each."""
+    """Notes on parameters that motion does not determine, a sentence each."""
     missed_px: tuple[Array, Array] = (np.zeros((0, 1)), np.zeros((0, 1)))
-    """(N, V) how far detections on frames that were not used are from where the other cameras put the joint, with
-    the given cameras and the refined; NaN where unknown.
-    """
+    """(N, V) distances of detections on held-out frames from joints predicted by the other cameras,
+    with the given and the refined cameras; NaN if unknown."""
     stature_m: float = float("nan")
     """Median of the people's statures from their bones, in the adjusted cameras' metres."""
     probability: float = 1.0
-    """Probability that the given cameras are off, instead of a bias of the detector, which frames of the same
-    people share."""
+    """Probability that the given cameras are wrong, rather than the detector biased, with biases
+    common to frames of a person."""
 
     @property
     def better(self) -> bool:
@@ -81,7 +80,7 @@ class Refinement:
 
     @property
     def rig(self) -> Rig:
-        """The refined cameras where they are better, else the given ones."""
+        """The refined cameras if they are better, else the given ones."""
         return self.adjusted.rig if self.better else self.given
 
     def of_stature(self, stature_m: float) -> Rig:
@@ -137,9 +136,11 @@ def refine(
     reference: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Refinement:
-    """Refine the cameras of `rig`, with prior standard deviations `freedom`, from the people in `detections`.
+    """Refine the cameras of `rig`, with prior standard deviations `freedom`, from the people in
+    `detections`.
 
-    The scale is that of the given cameras' places. InputError where hardly anybody is seen by two cameras.
+    The scale is that of the given cameras. Raises InputError if too few people are seen by two
+    cameras.
     """
     freedom = Freedom() if freedom is None else freedom
     given, right, findings = put_right(detections, rig, frames)
@@ -173,19 +174,19 @@ def refine(
     notes = tuple(_undetermined(found[0], freedom, counts))
     sure = 1.0
     if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
-        order = [*range(6), 7, 8, 6]  # in which the check has the parameters
+        order = [*range(6), 7, 8, 6]  # order of parameters in the check
         sure = Problem.of(given).off(freedom.sigmas[order], reference)
     return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature, sure)
 
 
 def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
-    """The rig with cameras that point elsewhere, by degrees, rotated to where they see the others' people."""
+    """The rig with misaligned cameras, by degrees, rotated to fit the people of the others."""
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
     turned = {view for each in findings if each.kind in kinds for view in each.cameras}
     cameras = list(rig.cameras)
     for view in turned:
         camera = rig.cameras[view]
-        right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # hardly told from a turn
+        right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # similar to a rotation
         cTw = exp_so3(np.array([-down, right, 0.0])) @ found.cTw[view]
         if difference(cTw, camera.cTw)[0] > _BUMPED_DEG:
             new = (camera.name, camera.K, cTw, camera.image_size, camera.distortion.tolist(), camera.lens)
@@ -220,8 +221,8 @@ def _fitted(
 
 
 def dilution(time_s: Array) -> float:
-    """Number of correlated errors of a detection that count as one, in frames at `time_s` (T,): over time and
-    joints.
+    """Number of correlated errors of a detection, over time and joints, that count as one, for
+    frames at `time_s` (T,).
     """
     apart = np.abs(time_s[:, None] - time_s)
     alike = sum(share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS)

@@ -1,8 +1,8 @@
-"""Relative poses of two cameras, from tracks of people whose identity in the other picture is unknown.
+"""Relative poses of two cameras, from tracks of people without known correspondence.
 
-Any track of one camera may be the person of any track of the other at the same time: each such pair gives an
-essential matrix, and the one with which most tracks agree, over all frames, is taken (RANSAC over tracks; Nistér
-2004 for five joints in one track).
+Any track of one camera may be the person of any simultaneous track of the other: each such pair
+gives an essential matrix, and the one that most tracks agree with, over all frames, is chosen
+(RANSAC over tracks; Nistér 2004 for five joints in one track).
 """
 
 from dataclasses import dataclass
@@ -21,18 +21,18 @@ from shapepose_fg.setup_check.matching import MIN_JOINTS
 _LOOK_S = 0.2
 """Interval between compared frames, s: people's joints move by more than a detector's error."""
 _MOST_LOOKS = 80
-"""Maximum number of frames by which hypotheses are scored."""
+"""Maximum number of frames for scoring hypotheses."""
 _MOST_TRIED = 30
-"""Maximum number of pairs of tracks from which hypotheses are made; those with the longest common time."""
+"""Maximum number of pairs of tracks for hypotheses, those with the longest common time."""
 _JOINTS_A_TRY = 240
 _LEAST_TRY = 60
-"""Maximum and minimum number of joints of a pair of tracks from which a hypothesis is made."""
+"""Maximum and minimum number of joints of a pair of tracks for a hypothesis."""
 _RANSAC = 0.02
-"""Largest residual of an inlier, as a share of a person's size: a detector errs by 3 cm of 170."""
+"""Maximum residual of an inlier, as a share of a person's size: a detector errs by 3 cm of 170."""
 _GATE = 0.06
-"""Largest mean residual of tracks of one person, as a share of the person's size."""
+"""Maximum mean residual of tracks of one person, as a share of the person's size."""
 _CLIP = 0.15
-"""Maximum of a joint's residual in the mean; larger ones are of other people."""
+"""Limit of a joint's residual in the mean; larger ones are of other people."""
 _SAMPLES = 60
 """Number of samples of five joints per pair of tracks; two thirds of a person's joints are inliers in simulated
 recordings."""
@@ -40,8 +40,8 @@ _FINALISTS = 6
 """Number of hypotheses that are refined."""
 _STEPS = 8
 _DILUTION = 25.0
-"""Number of correlated errors of joints that count as one independent error: those of a person in one frame,
-and in frames that are near each other."""
+"""Number of correlated errors of joints that count as one independent error: of a person in one
+frame, and in frames close in time."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Relative:
     covariance: Array
     """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along t."""
     points: Array
-    """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN where not seen by both."""
+    """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN unless seen by both."""
 
 
 class _Together:
@@ -92,21 +92,23 @@ class _Together:
         order = np.argsort(-worth, kind="stable")
         kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
         for n in order[worth[order] > 0].tolist():
-            # Nobody's track is that of two people at once.
+            # A track cannot be two people at once.
             rival = ((a == a[n]) & self.alike[1][b[n], b]) | ((b == b[n]) & self.alike[0][a[n], a])
             kept[n] = not (kept & rival).any()
         return kept, float(worth[kept].sum() / max(self.possible, 1))
 
     def joints(self, kept: Mask) -> tuple[Array, Array, Array]:
-        """Rays (N, J, 3) of both cameras of the pairs of tracks that are `kept`, and sizes (N,)."""
+        """Rays (N, J, 3) of both cameras for the pairs of tracks that are `kept`, and
+        sizes (N,).
+        """
         rows = self.rows[kept[self.pair]]
         a, b = (rays[rows[:, n]] for n, rays in enumerate(self.rays))
         return a, b, np.sqrt(self.size[0][rows[:, 0]] * self.size[1][rows[:, 1]])
 
 
 def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
-    """Relative pose of the camera of `other` to that of `one`, whose rays are in their own frames; None where
-    too few people are seen by both at a time, or no pose fits.
+    """Relative pose of the camera of `other` to that of `one`, with rays in their own frames; None
+    if too few people are seen by both at once, or no pose fits.
     """
     frames = np.intersect1d(one.frame, other.frame)
     if len(frames) == 0:
@@ -151,7 +153,7 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
 
 
 def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | None:
-    """The pose of a hypothesis, refined in turn with the set of tracks that agree with it."""
+    """Pose of a hypothesis, refined alternately with the set of agreeing tracks."""
     kept, score = seen.chosen(seen.misses(E[None])[0])
     best: Relative | None = None
     for _ in range(4):
@@ -173,15 +175,17 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
 
 
 def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Return that of the four poses of an essential matrix which has most joints in front of both cameras."""
+    """Of the four poses of an essential matrix, the one with most joints in front of
+    both cameras.
+    """
     one, two, t = (np.asarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(E))
     ways = [(R, sign * t[:, 0]) for R, sign in product((one, two), (1.0, -1.0))]
     return max(ways, key=lambda way: int(_meeting(*way, a, b)[1].sum()))
 
 
 def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
-    """Intersections of rays (N, J, 3) of two cameras, in the frame of the first, and which are in front of
-    both.
+    """Intersections of rays (N, J, 3) of two cameras, in the frame of the first, and whether in
+    front of both.
     """
     back, centre = b @ R, -R.T @ t
     cosine, along_a, along_b = (a * back).sum(axis=-1), a @ centre, back @ centre
@@ -191,8 +195,8 @@ def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
 
 
 def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array, Array]:
-    """The pose with the least Sampson residuals (Cauchy) of rays a, b (N, J, 3) of people of `size` (N,) rad,
-    and its covariance as in `Relative`.
+    """The pose with minimum Sampson residuals (Cauchy) of rays a, b (N, J, 3) of people with `size`
+    (N,) rad, and its covariance as in `Relative`.
     """
     known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
     size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
@@ -221,7 +225,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
 
 
 def _crossed(a: Array, b: Array) -> Array:
-    """(N, 3) cross products; np.cross takes ten times as long."""
+    """(N, 3) cross products; ten times as fast as np.cross."""
     return np.stack([a[:, i] * b[:, k] - a[:, k] * b[:, i] for i, k in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
@@ -233,7 +237,7 @@ def _rows(tracks: Tracks, looks: Index) -> Index:
 
 
 def _at_once(rows: Index) -> Mask:
-    """(K, K) which tracks overlap in time, so that they are different people."""
+    """(K, K) whether tracks overlap in time, and so are different people."""
     there = (rows >= 0).astype(np.float64)
     return np.asarray(there @ there.T > 0)
 
@@ -250,7 +254,9 @@ def _misses(
     total: Array,
     count: Array,
 ) -> None:
-    """Sums into `total` (H, K) the mean misses of joints of pairs of rows (N, 2), their number into `count`."""
+    """Add to `total` (H, K) the mean residuals of joints over pairs of rows (N, 2), and to `count`
+    their number.
+    """
     plane, back = np.empty(3), np.empty(3)
     for h in range(len(E)):
         for n in range(len(rows)):

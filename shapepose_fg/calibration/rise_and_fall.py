@@ -1,8 +1,10 @@
-"""Time offsets of cameras with unknown poses: joints rise and fall at the same times in all of them.
+"""Time offsets of cameras with unknown poses: joints rise and fall at the same times in all of
+them.
 
-Each track of one camera may be the person of any track of the other: the vertical speeds of their joints, relative
-to the people's size, are correlated at all offsets, and improbable correlations are summed. People who walk or
-dance repeat themselves: among the best offsets, those are chosen at which one pose of the cameras fits.
+Each track of one camera may be the person of any track of the other: the vertical speeds of their
+joints, relative to the people's size, are correlated at all offsets, and correlations unlikely by
+chance are summed. As walking and dancing are periodic, the best offsets are tested for a common
+pose of the cameras.
 """
 
 from collections.abc import Callable
@@ -21,22 +23,22 @@ from shapepose_fg.core.arrays import Array, Index
 _STEP_S = 0.04
 """Interval between compared frames, s."""
 _FASTEST = 2.0
-"""Maximum speed of a rising joint, statures per second: faster ones have changed their person."""
+"""Maximum vertical speed of a joint, statures per second; faster ones are identity switches."""
 _BRISK_S = 0.5
-"""Duration above which changes are removed, s: a person who walks towards one camera sinks in its picture and
-rises in another's."""
+"""Time scale of the high-pass filter, s: a person who walks towards one camera sinks in its picture
+and rises in another's."""
 _LEAST_S = 1.0
 """Minimum common duration of two tracks, s."""
 _AROUND_S = 0.3
 """Distance below which two offsets are the same, s."""
 _LEAST_ALIKE = 0.1
-"""Minimum correlation that counts: that of different people is below."""
+"""Minimum correlation that is used; that of different people is lower."""
 _PEAKS, _PAIRS = 8, 3
 """Number of offsets per pair of cameras, or of groups of cameras, that are tested, and number of pairs that
 test them."""
 _SURE = 2.0
-"""Minimum of an offset's prominence times the score of the pose that fits (`Relative.score`): wrong ones stay
-below 1.6, four in five right ones are above, on Shelf and simulated."""
+"""Minimum of an offset's prominence times the score of the fitting pose (`Relative.score`): wrong
+ones are below 1.6, four in five correct ones above, on Shelf and in simulations."""
 _FITS_S = 5.0
 """Person-seconds below which a fit has a lower weight."""
 
@@ -44,10 +46,11 @@ _FITS_S = 5.0
 def offsets_without_poses(
     tracks: list[Tracks], fps: float, most_s: float, told: Callable[[], None] = lambda: None
 ) -> Array:
-    """(V,) shifts in frames: frame f of the first camera is frame f + shift of another, to a few frames.
+    """(V,) shifts in frames: frame f of the first camera is frame f + shift of another, to a few
+    frames.
 
-    `tracks` are in their cameras' own frames, y down. Cameras were started up to `most_s` apart. The cameras with
-    the most prominent offset are joined first, one or several at a time.
+    `tracks` are in their cameras' own frames, y down. Cameras were started up to `most_s` apart.
+    Groups of cameras are joined in order of the prominence of their offset.
     """
     step = max(1, round(_STEP_S * fps))
     parts = [_rises(each, step, fps) for each in tracks]
@@ -62,7 +65,7 @@ def offsets_without_poses(
     fits = dict[tuple[int, int, int], float]()
 
     def fit(a: int, b: int, apart: int) -> float:
-        """Score of the same people in two cameras, one of them `apart` steps later."""
+        """Score of the relative pose of two cameras, one of them `apart` steps later."""
         if (a, b, apart) not in fits:
             moved = replace(tracks[b], frame=tracks[b].frame - apart * step)
             found = relative(tracks[a], moved, fps)
@@ -116,15 +119,15 @@ class _Rises(NamedTuple):
     """Vertical speeds of the joints of one camera's tracks."""
 
     values: list[Array]
-    """Speeds (N, J) of each track, in parts of the person's size a frame; 0 where unknown."""
+    """Speeds (N, J) of each track, as shares of the person's size per frame; 0 if unknown."""
     begins: Index
-    """(K,) the number of each track's first sample."""
+    """(K,) index of each track's first sample."""
 
 
 def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
     """Vertical speeds of joints, one sample every `step` frames."""
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
-    known = np.abs(values) < _FASTEST / fps  # nor NaN
+    known = np.abs(values) < _FASTEST / fps  # false for NaN
     (values,) = fast_part((np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps)
     kept = np.flatnonzero(tracks.frame % step == 0)
     _, first = np.unique(tracks.track[kept], return_index=True)
@@ -133,9 +136,10 @@ def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
 
 
 def _add_likeness(worth: Array, a: _Rises, b: _Rises, least: int) -> None:
-    """Add to `worth` (2 L + 1,), at offsets -L to L of b against a, how improbable by chance tracks are alike.
+    """Add to `worth` (2 L + 1,), at offsets -L to L of b against a, the significance of the
+    similarity of tracks.
 
-    Tracks are compared where at least so many samples are common.
+    Tracks are compared if they have at least `least` common samples.
     """
     for one, begin_one in zip(a.values, a.begins, strict=True):
         for other, begin_other in zip(b.values, b.begins, strict=True):

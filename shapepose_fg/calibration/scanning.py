@@ -1,7 +1,7 @@
 """Compares two cameras at all time offsets, without association of people.
 
-Two rays to one joint lie in a plane with both cameras if they were taken at one time. For each person of one
-camera, the best fitting person of the other is used, so that no association is needed.
+Two rays to a joint at the same time are coplanar with both cameras. For each person of one camera,
+the best fitting person of the other is used, so that no association is needed.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,15 @@ from shapepose_fg.core.compiled import kernel
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
 
 _LEAST_SPREAD = 0.004
-"""Minimum spread of the residuals over offsets, as a share of people's size: less is noise of the detector."""
+"""Minimum spread of the residuals over offsets, as a share of people's size, for a detector's
+noise."""
 _ANCHORS = 150
 """Number of frames of one camera that are compared with those of another, at every offset."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The people of one camera in some frames, and of another in all frames."""
+    """People of one camera in some frames, and of another in all frames."""
 
     normal: Array
     """(A, J, 3) normals of the planes through both cameras and a joint."""
@@ -51,8 +52,8 @@ class Scan:
         return cls(normal, one.frame, rays_of(other, views), size, first, begin)
 
     def over(self, lags: Index, common: float) -> Array:
-        """(L,) mean residual of possible matches, as a share of people's size; NaN where too few frames are
-        common.
+        """(L,) mean residual of possible matches, as a share of people's size; NaN with too few
+        common frames.
         """
         cost, count = np.zeros(len(lags)), np.zeros(len(lags))
         normal, rays = np.ascontiguousarray(self.normal), np.ascontiguousarray(self.rays)
@@ -77,7 +78,9 @@ def _scan(
     cost: Array,
     count: Array,
 ) -> None:
-    """Sums into `cost` (L,), by how much the person of another camera that fits best misses, of `count` (L,)."""
+    """Add to `cost` (L,) the residual of the best fitting person of the other camera, and to
+    `count` (L,) the number.
+    """
     for n in range(len(lags)):
         for a in range(len(frame)):
             at = frame[a] + lags[n] - begin
@@ -106,16 +109,18 @@ def normals(rays: Array, views: Views, a: int, b: int) -> Array:
 
 
 def chosen(curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int) -> tuple[Array, Array]:
-    """(V,) shifts on the first camera's clock, and their prominence (V,).
+    """(V,) shifts relative to the first camera, and their prominence (V,).
 
-    Cameras are added one by one, the most prominent first, each where it fits all those before it: frame f of the
-    first camera is frame f + shift of another.
+    Cameras are added one by one in order of prominence, each at the offset that fits all those
+    before it: frame f of the first camera is frame f + shift of another.
     """
     step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
     half = len(lags) // 2
 
     def fit(one: int, other: int, apart: Index) -> Array:
-        """Fit of two cameras at offsets `apart`: standard deviations below the median of all offsets."""
+        """Fit of two cameras at offsets `apart`: standard deviations below the median over all
+        offsets.
+        """
         curve = curves[one, other] if one < other else curves[other, one][::-1]
         known = np.isfinite(curve)
         if known.sum() < 3:

@@ -1,8 +1,8 @@
-"""Time offsets of cameras with known poses, of any size, to a fraction of a frame, from people.
+"""Time offsets of any size between cameras with known poses, with subframe accuracy, from people.
 
-First all offsets between two cameras are scanned (`scanning`); then tracks are associated, and offsets between
-pairs of cameras refined (`pairwise`); then each camera is compared with the people that the others triangulate
-(`in_space`).
+First all offsets between two cameras are scanned (`scanning`); then tracks are associated, and
+offsets between pairs of cameras refined (`pairwise`); then each camera is compared with people
+triangulated by the others (`in_space`).
 """
 
 from collections.abc import Callable
@@ -31,15 +31,16 @@ _AROUND_S = 0.6
 _LEAST_SEEN = 50
 """Minimum number of people, one per frame, that a camera must see."""
 _SURE = 1.5
-"""Minimum prominence of the best offset among all, in their standard deviations: wrong ones stayed below 0.5,
-right ones of Shelf above 1.9."""
+"""Minimum prominence of the best offset over all others, in their standard deviations: wrong ones
+were below 0.5, correct ones on Shelf above 1.9."""
 _WORST_S = 0.05
-"""Largest standard deviation of an offset that is determined, s."""
+"""Maximum standard deviation of a determined offset, s."""
 _WIDER = 1.5
-"""Factor on standard deviations: without it 82 % of 95 % regions hold, Shelf among them; with it 92 %."""
+"""Factor on standard deviations: 95 % regions cover 82 % without it, and 92 % with it, Shelf
+included."""
 WHOLE_S, _END_S, _DRIFT_S = 180.0, 60.0, 2.0
-"""Duration that is used of a longer recording, s; duration at its end that is used to estimate drift, s; and
-the largest drift that is searched there, s."""
+"""Duration used of a longer recording, s; duration at its end for estimating drift, s; and the
+maximum drift searched for there, s."""
 
 
 @dataclass(frozen=True)
@@ -51,20 +52,21 @@ class Synchronised:
     sigma_s: Array
     """(V,) standard deviation of the offset, seconds; 0 for the first camera."""
     sure: Array
-    """(V,) prominence of the offset among all others, in their standard deviations."""
+    """(V,) prominence of the offset over all others, in their standard deviations."""
     drift: Array
-    """(V,) drift, seconds per second by which the camera falls behind; 0 in recordings of under four minutes."""
+    """(V,) drift, seconds per second that the camera falls behind; 0 in recordings of under four
+    minutes."""
     drift_sigma: Array
     """(V,) standard deviation of the drift."""
     middle_s: float
-    """Time at which the offset holds, on the camera's own clock, s."""
+    """Time for which the offset is stated, on the camera's own clock, s."""
 
     def at(self, time_s: Array | float) -> Array:
-        """(..., V) the times on the common clock of times (...,) on each camera's own."""
+        """(..., V) times on the common clock for times (...,) on each camera's own clock."""
         return self.of_views(np.asarray(time_s)[..., None])
 
     def of_views(self, time_s: Array) -> Array:
-        """(..., V) the times on the common clock of times (..., V), each on its camera's own."""
+        """(..., V) times on the common clock for times (..., V) on the cameras' own clocks."""
         return np.asarray(time_s + self.offset_s + self.drift * (time_s - self.middle_s))
 
     def as_dict(self, rig: Rig) -> dict[str, Any]:
@@ -101,10 +103,11 @@ def synchronise(
     most_s: float = 60.0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Synchronised:
-    """Estimate offsets, up to `most_s` between any two cameras, from what cameras with known poses saw in
+    """Estimate offsets, up to `most_s` between any two cameras with known poses, from people in
     `frames`.
 
-    In recordings of over four minutes drift is estimated, too. InputError where a camera sees nobody.
+    In recordings of over four minutes drift is also estimated. Raises InputError if a camera sees
+    too few people.
     """
     whole, end = round(WHOLE_S * fps), round(_END_S * fps)
     first = frames if len(frames) <= whole + end else frames[:whole]
@@ -130,7 +133,7 @@ def offsets(
     around_s: Array,
     progress: Callable[[int, int], None],
 ) -> tuple[Array, Array, Array]:
-    """Offsets (V,) within `most_s` of `around_s`, their standard deviations, and their prominence, from the
+    """Offsets (V,) within `most_s` of `around_s`, their standard deviations and prominence, from
     sightings in `frames`.
     """
     views = Views.of(rig)
@@ -138,7 +141,7 @@ def offsets(
         if (sightings.view == view).sum() < _LEAST_SEEN:
             raise InputError(f"camera {name}: too few people are seen to estimate the times of its frames")
     start = -np.rint(around_s * fps).astype(np.intp)
-    # Frames are counted on the clock of the first camera: at `shift` zero all clocks are the same.
+    # Frames are counted on the clock of the first camera: with `shift` zero all clocks agree.
     sightings = replace(sightings, frame=sightings.frame - start[sightings.view])
     pairs = list(combinations(range(len(rig)), 2))
     step = max(1, round(_STEP_S * fps))

@@ -14,20 +14,20 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, median_of, rays_of
 
 _SAME = 0.08
-"""Median motion of a person's joints between frames, as a share of the person's size, below which it is one
-track."""
+"""Maximum median motion of a person's joints between frames of a track, as a share of the person's
+size."""
 _SHORTEST_S = 0.4
 """Minimum duration of a track, s."""
 _SMOOTH_S = 0.05
 """Standard deviation of the smoothing kernel of tracks, s."""
 FAST_S = 1.0
-"""Duration above which changes are removed from residuals, s: errors of detectors and of cameras are
+"""Time scale above which changes are removed from residuals, s: errors of detectors and cameras are
 correlated."""
 _BLOCK_S = 1.0
-"""Duration within which errors are one correlated error, s."""
+"""Duration within which errors count as one correlated error, s."""
 
 _LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25
-"""Minimum share of known values around a frame, and minimum share of their spread in time."""
+"""Minimum share of known values around a frame, and minimum share of their temporal spread."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ class Tracks:
 
 @dataclass(frozen=True)
 class OneClock:
-    """Sightings of cameras that were started at different times, on one clock."""
+    """Sightings of cameras with different start times, on one clock."""
 
     skeleton: Skeleton
     """The detector's joints."""
     sightings: Sightings
     """Sightings; `frame` counts on the common clock, from 0."""
     frames: range
-    """Frames of the common clock in which two or more cameras run."""
+    """Frames of the common clock in which two or more cameras record."""
 
     def at(self, frames: Iterable[int]) -> Sightings:
         """The sightings in some frames."""
@@ -105,7 +105,8 @@ class OneClock:
 
 
 def on_one_clock(sightings: Sightings, following: Index, shift: Array, skeleton: Skeleton) -> OneClock:
-    """The sightings on the common clock: frame t of it is frame t + shift[v] of camera v, interpolated linearly.
+    """The sightings on the common clock: frame t of it is frame t + shift[v] of camera v,
+    interpolated linearly.
 
     `following` (S,) is the sighting of the same person in the next frame (`next_of`).
     """
@@ -141,7 +142,7 @@ def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -
 
 
 def _followed(seen: Sightings) -> list[Index]:
-    """Rows of each track, by frames; one frame may be missing between two."""
+    """Rows of each track, ordered by frame; single missing frames are bridged."""
     open_, done = list[list[int]](), list[list[int]]()
     order = np.argsort(seen.frame, kind="stable")
     frames, starts = np.unique(seen.frame[order], return_index=True)
@@ -162,17 +163,19 @@ def _followed(seen: Sightings) -> list[Index]:
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:
-    """`lines` of directions (N, J, 3) at rising frames (N,), in every frame from the first to the last."""
+    """`lines` of directions (N, J, 3) at ascending frames (N,), for every frame from the first to
+    the last.
+    """
     full = np.full((frame[-1] - frame[0] + 1, *rays.shape[1:]), np.nan)
     full[frame - frame[0]] = rays
     return lines(full, width)
 
 
 def lines(values: Array, width: float) -> tuple[Array, Array]:
-    """Values (T, J, 3) and their change per step: lines through the known values around each, within `width`
-    steps.
+    """Local linear regression of values (T, J, 3), and their change per step, in a Gaussian window
+    of `width` steps.
 
-    Means would belong to another time beside gaps. NaN where little is known around.
+    Plain means would be biased in time beside gaps. NaN if too little is known around.
     """
     known = np.isfinite(values[..., :1])
     apart = np.arange(-np.ceil(3 * width), np.ceil(3 * width) + 1)
@@ -189,7 +192,7 @@ def lines(values: Array, width: float) -> tuple[Array, Array]:
 
 
 def block_frames(fps: float, lasts: float) -> float:
-    """Number of frames whose errors are one correlated error; fewer in recordings of few seconds, `lasts`
+    """Number of frames that count as one correlated error; fewer in short recordings of `lasts`
     frames.
     """
     return max(1.0, min(_BLOCK_S * fps, lasts / 12))

@@ -1,4 +1,6 @@
-"""Calibrates cameras that were started at different times: rough offsets, then poses and offsets in turn."""
+"""Calibrates cameras with different start times: rough offsets, then poses and offsets
+alternately.
+"""
 
 from collections.abc import Callable
 
@@ -29,10 +31,10 @@ def calibrate_unsynchronised(
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Calibrated, Synchronised]:
-    """Estimate the poses of the cameras of `rig`, as `calibrate` does, and their start times, up to `most_s`
-    apart.
+    """Estimate the poses of the cameras of `rig`, as `calibrate` does, and their start times, up to
+    `most_s` apart.
 
-    Undetermined where the people do not determine poses or offsets.
+    Raises Undetermined if the people do not determine poses or offsets.
     """
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]

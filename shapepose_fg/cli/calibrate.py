@@ -1,4 +1,4 @@
-"""The command `calibrate`: poses of cameras from walking people."""
+"""The command `calibrate`: estimates camera poses from walking people."""
 
 import json
 import tempfile
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
 _CAMERAS = "Prior knowledge"
 _FILE_OFF, _GUESS_OFF = 0.02, 0.2
-"""Prior standard deviations of focal lengths from a calibration, and from a field of view, as shares of them."""
+"""Relative prior standard deviations of focal lengths from a calibration, and from a field of view."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensOptions:
-    """2D detections, and the lenses of the cameras."""
+    """Options: 2D detections, and the lenses of the cameras."""
 
     detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
@@ -56,7 +56,7 @@ class LensOptions:
     without: str | None = option(INPUT, "Leave out these cameras.", metavar="A,B")
 
     def rig(self) -> "Rig":
-        """The cameras without poses; InputError where their lenses are unknown."""
+        """The cameras without poses; InputError if their lenses are unknown."""
         from shapepose_fg.core.camera import choose
         from shapepose_fg.io.calibration import read_rig
         from shapepose_fg.io.lenses import lenses_of
@@ -97,9 +97,9 @@ def calibrate(
 ) -> None:
     """Estimate camera poses from the people in the recording; lenses must be known or guessed.
 
-    Film a minute: cameras still, each sharing part of its picture with another; two or more people who walk
-    through all views, near and far, arms raised at times, not on one line. Exit code 1 where that does not
-    determine the cameras; nothing is written then.
+    Film for a minute with fixed cameras whose views overlap. Two or more people walk through all
+    views, near and far, not along one line, and move their arms. Exit code 1 if this does not
+    determine the cameras; then nothing is written.
     """
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
     from shapepose_fg.calibration.levelling import Measured
@@ -144,7 +144,7 @@ def calibrate(
             rig=found.rig,
             points=people.points,
             frame=people.frame,
-            # Moments of one clock that was found begin at 0.
+            # Frame sets of an estimated clock start at time 0.
             time_s=known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps,
             skeleton=recording.skeleton,
             heads=heads,
@@ -178,7 +178,7 @@ _CAPTION = (
 
 
 def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """The cameras with standard deviations: headings, and each camera's figures."""
+    """The cameras with standard deviations: headings, and the values of each camera."""
     heads = ["people", "shared", "x y z, m", "rotation ± °", "position ± mm", "halves, °"] + ["focal, px"] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
@@ -191,7 +191,7 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
-    """Scale, up and fit, a line each."""
+    """Scale, up axis and fit, one line each."""
     world = found.world
     if distances:
         whose = f"{' '.join(distances)}; the median stature of the people is {world.stature_m:.2f} m"

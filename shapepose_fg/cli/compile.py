@@ -1,4 +1,4 @@
-"""The command `compile`: compiles everything ahead of the first run."""
+"""The command `compile`: compiles all kernels ahead of the first run."""
 
 import time
 from importlib import import_module
@@ -9,9 +9,10 @@ from shapepose_fg.core.errors import InputError
 
 
 def compile_kernels() -> None:
-    """Compile for this machine what the first run would, for images of containers and for services.
+    """Compile for this machine what the first run would compile, for container images and services.
 
-    It is kept below NUMBA_CACHE_DIR, or in the user's cache; with NUMBA_CPU_NAME=generic it fits other processors.
+    The result is stored below NUMBA_CACHE_DIR, or in the user's cache. With NUMBA_CPU_NAME=generic
+    it works on other processors.
     """
     from shapepose_fg.core.compiled import KERNELS
     from shapepose_fg.core.compiling import compile_beside
@@ -25,7 +26,7 @@ def compile_kernels() -> None:
             import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
     start, missing = time.perf_counter(), [each for each in KERNELS.values() if not each.is_kept]
     compile_beside(missing)
-    for each in missing:  # what no other process could compile
+    for each in missing:  # kernels that the other processes could not compile
         if not each.is_kept:
             each.load()
     if lost := sum(not each.is_kept for each in KERNELS.values()):

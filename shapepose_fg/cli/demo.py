@@ -1,4 +1,4 @@
-"""The demo: the built-in scene, reconstructed and compared with the truth."""
+"""The command `demo`: reconstructs the built-in scene and compares the result with the truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Demo:
     """The reconstruction."""
 
     def tables(self) -> RenderableType:
-        """The comparison with the truth, for a terminal."""
+        """The comparison with the truth, as tables for a terminal."""
         people, truth = self.people, self.scene.keypoints
         metrics, matches = joint_metrics(people, truth), match_people(people.frame, people.joints, truth)
         error_m = people.joints[matches.row] - truth[matches.frame, matches.person]
@@ -69,7 +69,7 @@ class Demo:
         return Group(*(Padding(_table(title, rows), (1, 0, 0, 2)) for title, rows in tables.items()))
 
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
-        """Write people.npz with the other files of a result, and the report; returns notes for the user."""
+        """Write all files of the result, and the report; returns notes for the user."""
         self.people.save(folder)
         told = [
             f"{folder / 'people.npz'}  joints, covariances and bodies",
@@ -85,7 +85,7 @@ class Demo:
 
 
 def run_demo(progress: Callable[[int, int], None] | None = None) -> Demo:
-    """Simulate what a detector sees of the built-in scene, and reconstruct it."""
+    """Simulate detections of the built-in scene, and reconstruct it."""
     scene = built_in_scene()
     detections = simulate(scene)
     times = FrameTimes.from_fps(scene.fps, len(scene))
@@ -94,7 +94,7 @@ def run_demo(progress: Callable[[int, int], None] | None = None) -> Demo:
 
 
 def _table(title: str, rows: dict[str, tuple[str, str]]) -> Table:
-    """Names, figures, and their meanings."""
+    """A table of names, values, and their meanings."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
     table.show_header = False
     table.add_column()

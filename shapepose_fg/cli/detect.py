@@ -1,4 +1,6 @@
-"""The command `detect`: 2D detections in videos or pictures of cameras, calibrated or not."""
+"""The command `detect`: computes 2D detections in videos or pictures of calibrated or uncalibrated
+cameras.
+"""
 
 import shlex
 import time
@@ -35,7 +37,7 @@ _NETWORK = "Network"
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
-    """The network that detects, and how it is executed."""
+    """Options: the detection network, and how it is executed."""
 
     network: str | None = option(
         _NETWORK, "ONNX file, TOML file of a network, or name of a downloaded network.", metavar="FILE|NAME"
@@ -56,7 +58,7 @@ class NetworkOptions:
     device: str = option(RUN, "Device of onnxruntime: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
 
     def load(self) -> "Network":
-        """The network, downloaded if requested; InputError where options contradict each other."""
+        """The network, downloaded if requested; InputError if options contradict each other."""
         from shapepose_fg.detection2d.download import named_file
         from shapepose_fg.detection2d.opening import open_network
 
@@ -83,7 +85,7 @@ class NetworkOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockOptions:
-    """Times of the pictures."""
+    """Options: times of the pictures."""
 
     fps: list[str] | None = option(
         TIME, "Frame rate, Hz, if the files do not contain it.", metavar="RATE|CAMERA=RATE"
@@ -105,8 +107,9 @@ def detect(
 ) -> None:
     """Detect people's joints in videos or pictures, for `reconstruct`: by RTMPose, or another network in ONNX.
 
-    Pictures of rolled cameras are turned upright first; the calibration knows how. Without one the cameras are
-    called as their videos, for `calibrate`. A run that is stopped goes on where it was when it is started again.
+    With a calibration, pictures of rolled cameras are rotated upright first. Without one, cameras
+    are named after their videos, for `calibrate`. An interrupted run continues when the same
+    command is started again.
     """
     if project is not None:
         from shapepose_fg.io.pose2sim_project import footage_of
@@ -131,7 +134,8 @@ def detect(
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)
     note(*concluded)
     clocks = clocks_of(footage, clock.fps or [], clock.start or [], rig.names)
-    # Pictures of one number belong together; when videos began is known only where somebody says it.
+    # Pictures with the same number belong together. Start times of videos are known only if the
+    # user gives them.
     timed = clock.start is not None or all(each.path.is_dir() for each in footage)
     moments = align(*clocks) if timed else own_frames(*clocks)
     span = frame_range(clock.frames, len(moments))
@@ -157,7 +161,7 @@ def detect(
 
 
 def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "RenderableType":
-    """Number of detections in each camera's pictures, and time that it took."""
+    """Number of detections in each camera's pictures, and the time taken."""
     rows = []
     for view, each in enumerate(run.cameras):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - unreadable[view]
@@ -172,11 +176,11 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
 
 
 def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network") -> str:
-    """The next command, as a line to copy into any shell."""
+    """The next command, as a line that can be copied into any shell."""
     output = run.output
     if cameras.calibration is None:
         folder, sizes = output.resolve(), {each.camera.name: each.footage.size for each in run.cameras}
-        # A phone sees 65 degrees along the longer side of a video.
+        # A phone has a field of view of 65 degrees along the longer side of a video.
         wide = {name: "65" if width >= height else "40" for name, (width, height) in sizes.items()}
         fields = list(wide.values())[:1] if len(set(wide.values())) == 1 else [f"{n}={d}" for n, d in wide.items()]
         words = ["shapepose-fg", "calibrate", "--detections", folder, "--focal"]

@@ -1,4 +1,4 @@
-"""The command `explain`: explains why a joint of a result is where it is."""
+"""The command `explain`: explains which measurements determine a joint of a result."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,9 @@ def explain(
     ),
     as_json: bool = json_option(),
 ) -> None:
-    """Explain why a joint is where it is: the shares of cameras, body and motion, and what is unusual."""
+    """Explain why a joint is where it is: the shares of cameras, body and motion, and any problems
+    found.
+    """
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.core.result_files import results_folder
     from shapepose_fg.io.detections.reading import read_detections
@@ -49,7 +51,7 @@ def explain(
 
 
 def _screen(found: "Explanation") -> "RenderableType":
-    """Sentences, and a line per camera."""
+    """Sentences, and a table with a line per camera."""
     from rich.console import Group
     from rich.text import Text
 

@@ -23,7 +23,9 @@ def export(
         RESULT, "Longest gap that is filled in amass and bvh, seconds.", 0.2, metavar="SECONDS"
     ),
 ) -> None:
-    """Write a result for others: shapepose-fg export RESULTS amass trc c3d bvh glb csv parquet mcap rrd."""
+    """Write a result in formats of other programs: shapepose-fg export RESULTS amass trc c3d bvh
+    glb csv parquet mcap rrd.
+    """
     from shapepose_fg.io.export.markers import MarkerSet
     from shapepose_fg.io.export.registry import FORMATS, chosen, export_result
 

@@ -1,4 +1,6 @@
-"""Options and output that `calibrate`, `refine-calibration` and `synchronise` share: estimated time offsets."""
+"""Options and output shared by `calibrate`, `refine-calibration` and `synchronise`: estimated time
+offsets.
+"""
 
 import math
 import tempfile
@@ -16,11 +18,11 @@ if TYPE_CHECKING:
     from shapepose_fg.io.detections.people import DeclaredJoints
 
 MOST_S = 60.0
-"""Largest offset between cameras that were started by hand, where the user gives none, s."""
+"""Default maximum offset between cameras that were started by hand, s."""
 
 
 def report_option() -> Any:
-    """The option for a page with pictures."""
+    """The option for an HTML report with drawings."""
     return option(RESULT, "Page for the browser with cameras and people in 3D: FILE.html.")
 
 
@@ -32,10 +34,11 @@ def found_clocks(
     most: float,
     frames: str | None = None,
 ) -> "tuple[Synchronised, Array]":
-    """Offsets of cameras with known poses, up to `most` seconds apart, and (T, V) times of the frames, seconds on
-    a common clock; NaN for frames that a camera lacks.
+    """Offsets of cameras with known poses, up to `most` seconds apart, and (T, V) times of the
+    frames, seconds on a common clock; NaN for missing frames.
 
-    Their rate is `fps`, without it that of times.csv beside; InputError where there is none.
+    Their rate is `fps`, by default that of times.csv beside the detections; InputError if there is
+    none.
     """
     from shapepose_fg.calibration.synchronisation import synchronise
     from shapepose_fg.core.frame_times import rate_of
@@ -53,7 +56,7 @@ def found_clocks(
 
 
 def check_most(most: float) -> None:
-    """Refuse an invalid largest offset."""
+    """InputError for an invalid maximum offset."""
     if not 0 < most <= 600:
         raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
 

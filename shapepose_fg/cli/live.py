@@ -1,4 +1,4 @@
-"""The command `live`: online reconstruction from detections as they come in."""
+"""The command `live`: online reconstruction from detections as they arrive."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -30,10 +30,11 @@ def live(
 ) -> None:
     """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines of people.
 
-    In: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people". Out: "now" after each
-    frame, "settled" when its people are refined. Ends with the input; an invalid line is left out with
-    a note. A socket listens on this machine only, unless another is named (tcp://0.0.0.0:PORT); .mcap holds ROS 2
-    messages. `rerun` starts that viewer, rerun+http://HOST:9876/proxy is one that runs.
+    Input: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people".
+    Output: "now" after each frame, and "settled" when its people have been refined. The command
+    ends with the input; invalid lines are skipped with a note. A socket accepts connections from
+    this machine only, unless an address is given (tcp://0.0.0.0:PORT). An .mcap file has ROS 2
+    messages. `rerun` starts the viewer; rerun+http://HOST:9876/proxy connects to a running one.
     """
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.io.skeleton_file import find_skeleton
@@ -79,7 +80,9 @@ def live(
 
 
 def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]) -> "Said | None":
-    """Print changes of cameras' statuses since the `last` printed one; returns the last one now."""
+    """Print changes of the cameras' statuses since `last`, the last printed ones; returns the
+    current ones.
+    """
     events = people.said()
     if len(events) == 0 or events[-1] is last:
         return last

@@ -43,7 +43,8 @@ from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError, failure
 from shapepose_fg.core.storage.output_folder import prepare_output
 
-# Everything else is imported inside the commands: `--help` must not wait for GTSAM and Numba.
+# All other modules are imported inside the commands, so that `--help` does not wait for GTSAM and
+# Numba.
 
 app = typer.Typer(
     name="shapepose-fg",
@@ -67,7 +68,7 @@ app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 _MOVED = {"--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
 """Removed options, and their replacements."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
-"""The exception of typer for a wrong command line; versions keep the class in different places."""
+"""typer's exception for an invalid command line; its place differs between versions."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -84,8 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; {cure}")
     except InputError as error:
         code = _fail(str(error))
-    except BrokenPipeError:  # the reader of our output, such as `head`, has had enough
-        # Or Python would complain at exit that it cannot flush.
+    except BrokenPipeError:  # the reader of our output, such as `head`, has ended
+        # Otherwise Python reports at exit that it cannot flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     except (OSError, MemoryError, RuntimeError) as error:
@@ -110,7 +111,7 @@ def evaluate_shelf_command(
     ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, a text file.", REQUIRED),
     as_json: bool = json_option(),
 ) -> None:
-    """PCP per limb and actor, MPJPE and recall on the Shelf recording."""
+    """Compute PCP per limb and actor, MPJPE and recall on the Shelf recording."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.evaluation.shelf import evaluate_shelf
     from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
@@ -161,7 +162,7 @@ def config(preset: Preset = preset_option(Preset.ACCURATE)) -> None:
 
 @app.command(rich_help_panel=_TRY)
 def version() -> None:
-    """Print the versions of this program and of what it stands on."""
+    """Print the versions of this program and of the packages that it uses."""
     from shapepose_fg.core.provenance import versions
 
     for name, number in versions().items():

@@ -1,4 +1,4 @@
-"""Options that several commands share, in groups, and the parsing of ranges of frames and sizes."""
+"""Options that several commands share, in groups; parses ranges of frames, and sizes."""
 
 import inspect
 import re
@@ -31,7 +31,9 @@ REQUIRED: Any = MISSING
 
 
 def option(group: str, text: str, default: Any = None, *names: str, **more: Any) -> Any:
-    """An option under a heading, with its help: the default of a `grouped` command's parameter, or of a field."""
+    """Declare an option under the heading `group`, with its help text: used as the default of a
+    parameter of a `grouped` command, or of a field.
+    """
     shown = isinstance(default, str | int | float | Path) and not isinstance(default, bool)
     how: dict[str, Any] = {"show_default": shown, "help": text, "rich_help_panel": group}
     return field(default=default, metadata={"typer": typer.Option(*names, **how | more)})
@@ -43,7 +45,7 @@ def argument(metavar: str, text: str) -> Any:
 
 
 class Preset(StrEnum):
-    """Named sets of settings."""
+    """Named sets of settings (presets)."""
 
     ACCURATE = "accurate"
     FAST = "fast"
@@ -62,7 +64,7 @@ class Preset(StrEnum):
 
 
 def preset_option(default: Preset | None) -> Any:
-    """The option for a preset."""
+    """The option `--preset`."""
     return option(
         RESULT,
         "Settings: accurate (default); fast (solves about every third frame); paper (the method as published).",
@@ -71,7 +73,7 @@ def preset_option(default: Preset | None) -> Any:
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`command` for typer: each field of a dataclass among its parameters becomes an option."""
+    """Convert `command` for typer: each field of a parameter that is a dataclass becomes an option."""
     hints, parameters = get_type_hints(command), list[inspect.Parameter]()
     taken: dict[str, list[str]] = {}
 
@@ -103,7 +105,7 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def frames_option() -> Any:
-    """The option for frames of a recording, or of a result."""
+    """The option for frames of a recording or of a result."""
     return option(TIME, "Range of frames, A to B-1; either may be left out.", metavar="A:B")
 
 
@@ -129,7 +131,7 @@ class RunOptions:
     restart: bool = option(RUN, "Start again, and delete the interrupted run in --output.", False, "--restart")
 
     def check(self) -> None:
-        """Refuse options that contradict each other."""
+        """InputError if options contradict each other."""
         check_workers(self.workers)
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
@@ -156,7 +158,7 @@ class CameraOptions:
     without: str | None = option(INPUT, "Leave out these cameras.", metavar="A,B")
 
     def rig(self) -> "Rig":
-        """The cameras; InputError where they cannot be used."""
+        """The cameras; InputError if they cannot be used."""
         from shapepose_fg.io.calibration import read_rig
 
         if self.calibration is None:
@@ -169,14 +171,14 @@ class CameraOptions:
         return found
 
     def chosen(self, names: Sequence[str]) -> list[str]:
-        """The wanted cameras among those of videos, which no calibration names."""
+        """Of camera names from videos (without a calibration), those that the user wants."""
         from shapepose_fg.core.camera import choose
 
         with naming("--cameras, --without"):
             return choose(names, names_of(self.cameras), names_of(self.without) or ())
 
     def said(self) -> dict[str, object]:
-        """The options about the calibration, for the next command."""
+        """The options about the calibration, to be repeated in the next command."""
         names = ("up", "unit", "image_size", "cameras", "without")
         return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
 
@@ -191,14 +193,16 @@ class DetectionOptions(CameraOptions):
     )
 
     def rig(self) -> "Rig":
-        """The cameras; InputError where they cannot be used, or are fewer than two."""
+        """The cameras; InputError if they cannot be used, or if there are fewer than two."""
         found = super().rig()
         if len(found) < 2:
             raise InputError(f"{self.calibration}: at least 2 cameras are needed, got {len(found)}")
         return found
 
     def still_rig(self, what: str) -> "Rig":
-        """The cameras, for `what` requires fixed cameras; InputError where one moves."""
+        """The cameras, which must be fixed; InputError if one moves. `what` names the command or
+        step that requires it.
+        """
         found = self.rig()
         moving = next((camera.name for camera in found.cameras if camera.carrier), None)
         if moving is not None:
@@ -209,24 +213,26 @@ class DetectionOptions(CameraOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Located(DetectionOptions):
-    """Cameras and detections whose paths are known."""
+    """Cameras and detections with known paths."""
 
     source: "Pose2SimProject | None" = None
-    """The project that they belong to; None where there is none."""
+    """The project to which they belong; None if there is none."""
 
     @property
     def joints(self) -> "str | DeclaredJoints | None":
-        """The detector's joints as the user states, else as the project does."""
+        """The detector's joints as given by the user, otherwise by the project."""
         return self.skeleton or (None if self.source is None else self.source.joints)
 
     def rate(self, given: "RateOptions") -> "RateOptions":
-        """Times of frames as the user states, else as the project does."""
+        """Times of frames as given by the user, otherwise by the project."""
         if self.source is None or given.fps is not None or given.timestamps is not None:
             return given
         return replace(given, fps=self.source.fps)
 
     def given(self) -> dict[str, object]:
-        """Options of the next command for the same detections and joints, the calibration left out."""
+        """Options to be repeated in the next command for the same detections and joints, without
+        the calibration.
+        """
         if self.source is None:
             return {"--detections": self.detections, "--skeleton": self.skeleton}
         return {"--project": self.source.folder, "--skeleton": self.skeleton}
@@ -240,7 +246,9 @@ class ProjectOptions(DetectionOptions):
     project: Path | None = option(INPUT, "Pose2Sim project: use its cameras, detections and frame rate.")
 
     def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
-        """The options with the paths of a project, and the project; `tell` receives its notes."""
+        """The options with the missing paths filled in from the project, and the project; `tell`
+        receives its notes.
+        """
         if self.project is None:
             return self, None
         from shapepose_fg.io.pose2sim_project import read_pose2sim_project
@@ -251,7 +259,7 @@ class ProjectOptions(DetectionOptions):
         return replace(self, calibration=calibration, detections=detections), source
 
     def located(self) -> Located:
-        """The options with known paths; InputError where one is missing."""
+        """The options with known paths; InputError if one is missing."""
         whole, source = self.completed()
         refuse_missing({"--calibration": whole.calibration, "--detections": whole.detections})
         given = {each.name: getattr(whole, each.name) for each in fields(DetectionOptions)}
@@ -275,7 +283,7 @@ class TimeOptions:
         kept: Path,
         own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes | None]":
-        """The recording, and the times of its frames where they are known (`read_recording`); notes are
+        """The recording, and the times of its frames, None if unknown (`read_recording`); notes are
         printed.
         """
         from shapepose_fg.io.recording import read_recording
@@ -302,7 +310,7 @@ class RateOptions(TimeOptions):
         kept: Path,
         own_frames: bool = False,
     ) -> "tuple[DetectionTable, FrameTimes, range]":
-        """The recording, its times, 30 frames a second where they are unknown, and the frames to use."""
+        """The recording, its times (30 frames a second if unknown), and the frames to use."""
         from shapepose_fg.core.frame_times import FrameTimes
 
         recording, times = self.read(detections, skeleton, rig, kept, own_frames)
@@ -311,13 +319,13 @@ class RateOptions(TimeOptions):
         return recording, FrameTimes.assumed(count) if times is None else times, span
 
     def given(self) -> dict[str, object]:
-        """Options of the next command for the same times and frames."""
+        """Options to be repeated in the next command for the same times and frames."""
         return {"--fps": self.fps, "--timestamps": self.timestamps, "--frames": self.frames}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResultOptions:
-    """A saved result, and how it is read."""
+    """Options: a saved result, and how it is read."""
 
     results: Path = argument("RESULTS", "Folder of a reconstruction.")
     fps: float | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
@@ -325,33 +333,33 @@ class ResultOptions:
     body: Path | None = option(INPUT, "Body model of the result, if its file has moved.")
 
     def how(self) -> dict[str, Any]:
-        """Arguments of the functions that read it."""
+        """Keyword arguments of the functions that read it."""
         check_fps(self.fps)
         return {"fps": self.fps, "up": self.up}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TakeOptions(ResultOptions):
-    """A part of a saved result."""
+    """Options: a part of a saved result."""
 
     frames: str | None = frames_option()
     person: list[int] | None = option(RESULT, "Use only this person; may be repeated.")
     seen_only: bool = option(RESULT, "Leave out joints without a detection in that frame.", False, "--seen-only")
 
     def how(self) -> dict[str, Any]:
-        """Arguments of the functions that read it."""
+        """Keyword arguments of the functions that read it."""
         persons, frames = tuple(self.person) if self.person else None, result_frames(self.frames)
         return super().how() | {"seen_only": self.seen_only, "frames": frames, "persons": persons}
 
 
 def next_reconstruct(options: Mapping[str, object]) -> str:
-    """A line to copy: `reconstruct` with the options that have values."""
+    """A command line to copy: `reconstruct` with those `options` that have values."""
     words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 
 
 def refuse_missing(places: Mapping[str, Path | None]) -> None:
-    """InputError where one of the options, by their names, has no value, and no project has it."""
+    """InputError if one of the options, by name, has no value from the user or from a project."""
     missing = [name for name, place in places.items() if place is None]
     if missing:
         listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
@@ -359,12 +367,12 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
 
 
 def names_of(text: str | None) -> list[str] | None:
-    """Names of cameras, separated by commas; None where no text is given."""
+    """Names of cameras, separated by commas; None if no text is given."""
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def picture_size(text: str | None) -> tuple[int, int] | None:
-    """Width and height of `WIDTHxHEIGHT`; None where it is left out."""
+    """Width and height of `WIDTHxHEIGHT`; None if no text is given."""
     if text is None:
         return None
     match = re.fullmatch(r"\s*(\d{1,9})\s*[x×,]\s*(\d{1,9})\s*", text)
@@ -374,19 +382,19 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
 
 
 def check_fps(fps: float | None) -> None:
-    """Refuse an invalid frame rate."""
+    """InputError for an invalid frame rate."""
     if fps is not None and not 0.01 <= fps <= 1e5:
         raise InputError(f"--fps {fps:g}: must be 0.01 to 100000 Hz, such as 25")
 
 
 def check_workers(workers: int | None) -> None:
-    """Refuse an invalid number of processes."""
+    """InputError for an invalid number of processes."""
     if workers is not None and not 1 <= workers <= 64:
         raise InputError(f"--workers {workers}: must be 1 to 64; leave it out to use as many as are useful")
 
 
 def result_frames(text: str | None) -> range | None:
-    """Frames that `A:B` selects of a saved result, whose last is not known yet; None for all."""
+    """Frames selected by `A:B` from a saved result with an unknown last frame; None for all."""
     if text is None:
         return None
     start, stop = ends(text)
@@ -397,8 +405,8 @@ def result_frames(text: str | None) -> range | None:
 
 
 def frame_range(text: str | None, count: int, first: int = 0) -> range:
-    """Frames that `A:B` selects of a recording of `count` frames: half-open, either end optional; all from the
-    `first` on where it is None.
+    """Frames selected by `A:B` from a recording of `count` frames: half-open, either end may be
+    left out. For None, all frames from `first` on.
     """
     start, stop = (first, count) if text is None else ends(text)
     found = range(start, count if stop is None else stop)
@@ -410,7 +418,7 @@ def frame_range(text: str | None, count: int, first: int = 0) -> range:
 
 
 def ends(text: str) -> tuple[int, int | None]:
-    """Both ends of `A:B`; the second is None where it is left out."""
+    """Both ends of `A:B`; the second is None if it is left out."""
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
     if match is None:
         raise InputError(f"--frames {text}: must be A:B with two frame numbers, such as 0:100")

@@ -1,4 +1,4 @@
-"""The command `overlay`: draws a result over the videos or pictures that it was made from."""
+"""The command `overlay`: draws a result over its videos or pictures."""
 
 import re
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn:
-    """What is drawn, and its size."""
+    """Options: what is drawn, and its size."""
 
     cameras: str | None = option(DRAW, "Use only these cameras.", metavar="A,B")
     without: str | None = option(DRAW, "Leave out these cameras.", metavar="A,B")
@@ -56,11 +56,11 @@ def overlay(
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay."),
 ) -> None:
-    """Draw a result over the videos or pictures that it was made from: mp4, or still pictures.
+    """Draw a result over the videos or pictures from which it was made: as mp4, or still pictures.
 
-    Each person has a colour. Dots are joints that were seen, dark rings joints that were inferred; squares are 2D
-    detections that were used, red crosses those that were not. Without --videos, those are drawn on that were
-    detected in.
+    Each person has a colour. Dots are joints that were detected, dark rings joints that were
+    inferred; squares are 2D detections that were used, red crosses those that were not. By default,
+    the videos are those in which `detect` ran.
     """
     if not 160 <= drawn.width <= 7680:
         raise InputError(f"--width {drawn.width}: must be 160 to 7680 pixels")
@@ -102,7 +102,7 @@ def overlay(
 
 
 def _cameras(text: str, rig: "Rig") -> list[str]:
-    """The wanted cameras."""
+    """Names of the wanted cameras."""
     names = names_of(text) or []
     for name in names:
         if name not in rig.names:
@@ -114,12 +114,12 @@ def _cameras(text: str, rig: "Rig") -> list[str]:
 
 def _fps(run: Mapping[str, Any]) -> float:
     """Frame rate of the new video, Hz."""
-    rate = run.get("time", {}).get("fps")  # a number where it is said (`check_run`)
+    rate = run.get("time", {}).get("fps")  # it is a number if present (`check_run`)
     return float(rate) if rate is not None and 0.1 <= rate <= 1000 else ASSUMED_FPS
 
 
 def _stills(text: str, length: int) -> list[int]:
-    """The frames of which still pictures are wanted."""
+    """Numbers of the frames for still pictures."""
     words = re.split(r"[,\s]+", text.strip())
     if not all(re.fullmatch(r"\d{1,9}", word) and int(word) < length for word in words):
         raise InputError(f"--stills {text}: must be frames 0 to {length - 1}, such as 0,50")

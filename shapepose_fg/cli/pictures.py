@@ -1,4 +1,4 @@
-"""Options for the cameras' videos or pictures, and the footage behind them."""
+"""Options for the cameras' videos or pictures, and the opened footage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions:
-    """The cameras' videos or pictures."""
+    """Options: the cameras' videos or pictures."""
 
     videos: list[str] | None = option(
         INPUT,
@@ -34,7 +34,7 @@ class PictureOptions:
     )
 
     def named(self, rig: "Rig") -> list[str]:
-        """The cameras whose videos are given one by one; all where none is."""
+        """The cameras with individually given videos; all cameras if there are none."""
         names = {each.partition("=")[0].strip() for each in self.videos or [] if "=" in each}
         return [name for name in rig.names if name in names] or list(rig.names)
 
@@ -45,7 +45,7 @@ class PictureOptions:
         return list(names_of_footage(self.videos or []))
 
     def opened(self, names: Sequence[str]) -> "dict[str, Footage]":
-        """The videos or pictures of every camera, decoded once."""
+        """The footage of each camera; videos are decoded once."""
         from shapepose_fg.io.footage.places import find_footage
 
         given = self.videos or []
@@ -61,8 +61,8 @@ class PictureOptions:
         drawn: Sequence[str],
         detections: Path | None = None,
     ) -> "list[tuple[CameraFootage, Footage]]":
-        """The pictures of the result in `results`, whose run.json is `run`, for the cameras `drawn`
-        (`pictures_of`).
+        """The pictures of the cameras `drawn` for the result in `results`; `run` is the content of
+        its run.json (see `pictures_of`).
         """
         from shapepose_fg.io.footage.placement import FOOTAGE
         from shapepose_fg.io.recording import read_moments
@@ -78,7 +78,7 @@ class PictureOptions:
 
 
 def opened(name: str, path: Path) -> "Footage":
-    """A camera's video or pictures, decoded once with a progress bar; notes are printed."""
+    """A camera's footage; a video is decoded once, with a progress bar. Notes are printed."""
     from shapepose_fg.io.footage.footage import open_footage
 
     with progress(f"reading {name}") as done:

@@ -1,4 +1,4 @@
-"""The command `refine-calibration`: better cameras from the people of a recording."""
+"""The command `refine-calibration`: refines cameras by the people of a recording."""
 
 import json
 import tempfile
@@ -29,7 +29,7 @@ _CAMERAS = "Prior uncertainty"
 
 @dataclass(frozen=True, kw_only=True)
 class FreedomOptions:
-    """Prior standard deviations of the cameras from the values in the file."""
+    """Options: prior standard deviations of the cameras around the given calibration."""
 
     off_degrees: float = option(_CAMERAS, "Prior sigma of rotations, degrees.", 1.0)
     off_cm: float = option(_CAMERAS, "Prior sigma of positions, centimetres.", 2.0)
@@ -57,7 +57,8 @@ def refine_calibration(
 ) -> None:
     """Refine camera poses, and lenses if requested, from the people in a recording.
 
-    The rig is tried on frames that it was not refined by; where it does not fit them better it is left as it was.
+    The refined rig is tested on held-out frames. If it does not fit them better, the given rig is
+    written.
     """
     from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.refinement import refine
@@ -121,14 +122,14 @@ def refine_calibration(
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=lines[0]))
         print("\n".join(lines[1:]))
         print(f"{output}: {form}")
-        # Our own file says axis, unit and size itself.
+        # Our own rig file defines axis, unit and picture sizes itself.
         options = {"--calibration": output} | seen.given()
         options |= {} if form == "rig file" else seen.said()
         print(next_reconstruct(options | rate.given() | ({} if seen.source else {"--output": "results"})))
 
 
 def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """Changes by camera: headings, and each camera's figures."""
+    """Changes by camera: headings, and the values of each camera."""
     change, sigma = found.change(), found.sigma()
     parts = {"turn": "rotation, °", "move": "position, mm"} | ({"focal": "focal, %"} if may.focal else {})
     parts |= {"centre": "centre, px"} if may.centre else {}
@@ -141,7 +142,7 @@ def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[
 
 
 def _words(found: "Refinement", may: FreedomOptions) -> list[str]:
-    """The table's caption, and whether cameras are better."""
+    """The table's caption, and whether the refined cameras are better."""
     scale = (
         "the distances between the cameras are kept"
         if may.stature is None

@@ -28,7 +28,8 @@ def check_calibration(
 ) -> None:
     """Check whether cameras and detections fit: turned, exchanged or late cameras, wrong units, in words.
 
-    Exit code 1 where something looks wrong, 0 where nothing does. Of pictures the sizes are compared.
+    Exit code 1 if something looks wrong, otherwise 0. Of videos and pictures, only the sizes are
+    compared.
     """
     from shapepose_fg.cli.setup_table import setup_report
     from shapepose_fg.io.footage.placement import FOOTAGE

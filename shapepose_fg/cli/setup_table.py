@@ -1,4 +1,6 @@
-"""The check of a set-up on a terminal of 80 columns: sentences, a row for each camera, how pairs agree."""
+"""Shows the set-up check on a terminal of 80 columns: sentences, a row for each camera, and the
+agreement of camera pairs.
+"""
 
 from collections.abc import Sequence
 
@@ -10,11 +12,12 @@ from shapepose_fg.cli.terminal import table
 from shapepose_fg.setup_check.report import CameraFigures, CameraUse, PairFigures, SetupReport
 
 _WIDE = 12
-"""Longest name of a camera that is written out; of a longer one the end is, which tells cameras apart."""
+"""Maximum length of a camera's name; of longer names only the end is shown, which usually differs
+between cameras."""
 
 
 def setup_report(report: SetupReport) -> RenderableType:
-    """All of a report."""
+    """The complete report."""
     parts: list[RenderableType] = [_sentences(report), *(Text(f"{each}.", style="dim") for each in report.notes)]
     parts += [Text(), _cameras(report.cameras)]
     if len(report.cameras) > 2:
@@ -47,7 +50,7 @@ def use_table(uses: Sequence[CameraUse]) -> RenderableType:
 
 
 def _sentences(report: SetupReport) -> RenderableType:
-    """What is wrong, a paragraph each."""
+    """The findings, one paragraph each."""
     if len(report.warnings) == 0:
         return Text(f"No problems were found in the {report.frames} checked frames.", style="green")
     listed = Table.grid(padding=(0, 1))
@@ -59,7 +62,7 @@ def _sentences(report: SetupReport) -> RenderableType:
 
 
 def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
-    """How each camera fits."""
+    """A row for each camera, with its agreement with the others."""
     return table(
         ("camera", "people", "shared", "error px", "mm", "left out px", "mm", "fits", "late"),
         (
@@ -86,7 +89,9 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
 
 
 def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> RenderableType:
-    """How pairs of cameras agree: the share of the people that both see who fit."""
+    """Agreement of camera pairs: of the people seen by both cameras, the share with matching
+    positions.
+    """
     of = {(pair.first, pair.second): pair for pair in pairs}
     return table(
         ("agree", *(_short(each.camera) for each in cameras[1:])),
@@ -109,12 +114,12 @@ def _cell(pair: PairFigures) -> Text:
 
 
 def _share(part: float, more: str = "") -> Text:
-    """A share that stands out where it is small."""
+    """A share, highlighted if it is small."""
     return Text(f"{100 * part:.0f} %{more}", style="" if part > 0.5 else "yellow")
 
 
 def _short(name: str) -> str:
-    """A camera's name, its end where it is long."""
+    """A camera's name; only the end if it is long."""
     return name if len(name) <= _WIDE else f"…{name[1 - _WIDE :]}"
 
 
@@ -123,7 +128,7 @@ def _both(median: float | None, high: float | None) -> str:
 
 
 def _two(value: float | None) -> str:
-    """A figure with two digits."""
+    """A value with two significant digits."""
     if value is None:
         return "-"
     return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"

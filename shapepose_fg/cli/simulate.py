@@ -1,4 +1,4 @@
-"""The command `simulate`: a recording with known truth, as files."""
+"""The command `simulate`: writes a simulated recording with known truth."""
 
 import re
 import time
@@ -48,7 +48,9 @@ def simulate(
     ),
     workers: int | None = workers_option(),
 ) -> None:
-    """Simulate a recording with known truth: cameras, 2D detections, and people.npz to compare with."""
+    """Simulate a recording with known truth: cameras, 2D detections, and the true people as
+    people.npz.
+    """
     if format not in ("association", "openpose"):
         raise InputError(f"--format {format}: must be association or openpose")
     if scene.seed < 0:

@@ -1,4 +1,4 @@
-"""Ctrl-C and requests to end: the program stops, prints a sentence, and keeps what is done."""
+"""Handles Ctrl-C and SIGTERM: the program stops, prints a sentence, and saves finished work."""
 
 import signal
 import sys
@@ -11,7 +11,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(BaseException):
-    """The user, or the system, asks the program to end; no `Exception`, so that nothing catches it."""
+    """Request by the user or the system to end the program. It is not an `Exception`, so that
+    handlers of errors do not catch it.
+    """
 
     def __init__(self, number: int, message: str = "") -> None:
         super().__init__(message)
@@ -22,16 +24,18 @@ class Stopped(BaseException):
 
     @property
     def exit_code(self) -> int:
-        """The exit code that shells use for a program that was ended by this signal."""
+        """Exit code for termination by this signal, as in shells."""
         return 128 + self.number
 
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Inside the block a signal raises `Stopped`, once: a second one does not disturb the clean-up.
+    """Inside the block, the first signal raises `Stopped`; further ones are ignored, so that they
+    do not interrupt the clean-up.
 
-    Signals that the parent process ignores stay ignored; in other threads than the main one nothing changes. Where
-    Python cannot pass an exception on (a finaliser was running), the signal comes again a moment later.
+    Signals that the parent process ignores stay ignored; outside the main thread nothing changes.
+    If Python cannot propagate the exception (because a finaliser is running), the signal is sent
+    again a moment later.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

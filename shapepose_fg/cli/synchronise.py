@@ -1,4 +1,4 @@
-"""The command `synchronise`: start times of cameras from people, and synchronised detections."""
+"""The command `synchronise`: estimates start times of cameras from people."""
 
 import json
 import shlex
@@ -32,7 +32,7 @@ def synchronise(
 ) -> None:
     """Estimate start times of cameras with known poses from the people in the recording, to milliseconds.
 
-    Exit code 1 where motion does not determine a camera's offset; nothing is written then.
+    Exit code 1 if motion does not determine a camera's offset; then nothing is written.
     """
     from shapepose_fg.io.timestamps import write_timestamps
 

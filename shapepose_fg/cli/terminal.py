@@ -15,16 +15,17 @@ if TYPE_CHECKING:
 
 
 def use_any_streams() -> None:
-    """Make stdout and stderr accept any text: closed ones discard it, unsupported letters are escaped.
+    """Make stdout and stderr accept any text: closed streams discard it, unsupported characters are
+    escaped.
 
-    A closed descriptor is opened on nothing; otherwise the next opened file would get its number, and messages of
-    libraries would be written into it.
+    A closed file descriptor is opened on the null device; otherwise the next opened file would get
+    its number, and messages of libraries would be written to that file.
     """
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -36,10 +37,10 @@ def use_any_streams() -> None:
 
 
 class _Stripped:
-    """A stream without control sequences, which names of files and keys may contain.
+    """A stream that removes control sequences, which file names and keys may contain.
 
-    Only plain text goes through it. Rich's consoles strip their text themselves and write colours and bars to the
-    stream beneath: they ask for it by this attribute, and `console` below hands it over.
+    Only plain text is written to it. Rich's consoles strip their text themselves, and write colours
+    and bars to the underlying stream, which `console` passes to them.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -54,7 +55,7 @@ class _Stripped:
 
 
 def _beneath(stream: Any) -> Any:
-    """The stream beneath our own streams and those of Rich."""
+    """The underlying stream of our own streams and of those of Rich."""
     while hasattr(stream, "rich_proxied_file"):
         stream = stream.rich_proxied_file
     return stream
@@ -64,12 +65,14 @@ _OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u206
 
 
 def printable(text: str) -> str:
-    """The text without control characters, except for ends of lines and tabs, and without changes of direction."""
+    """The text without control characters (except line ends and tabs) and without bidirectional
+    control characters.
+    """
     return _OBEYED.sub("", text)
 
 
 def console(*, stderr: bool = False) -> "Console":
-    """A console on stdout or stderr that strips what is printed on it; text is no markup."""
+    """A console on stdout or stderr that strips control characters; text is not parsed as markup."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -82,14 +85,16 @@ def console(*, stderr: bool = False) -> "Console":
 
 
 def show(content: "RenderableType") -> None:
-    """Print on stdout; with colours on a terminal only. Text is no markup: names and paths are in it."""
+    """Print on stdout; colours only on a terminal. Text is not parsed as markup, because it
+    contains names and paths.
+    """
     console().print(content)
 
 
 def table(
     heads: Sequence[str], rows: Iterable[Sequence[Any]], *, left: int = 1, caption: str = ""
 ) -> "RenderableType":
-    """Rows under headings, the first `left` columns to the left, and a caption under them."""
+    """A table: headings, rows (the first `left` columns left-aligned), and a caption below."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
@@ -103,21 +108,21 @@ def table(
 
 
 def say(what: str, message: str, style: str) -> None:
-    """Print on stderr, in one paragraph that begins with `what`."""
+    """Print on stderr, as one paragraph that begins with `what`."""
     from rich.text import Text
 
-    on = console(stderr=True) if _shown is None else _shown.console  # above the bars
+    on = console(stderr=True) if _shown is None else _shown.console  # above the progress bars
     on.print(Text.assemble((f"{what}: ", style), message), soft_wrap=True)
 
 
 def note(*messages: str) -> None:
-    """Print notes on stderr, each in one line."""
+    """Print notes on stderr, one line each."""
     for message in messages:
         say("note", message, "bold")
 
 
 def warn(message: str) -> None:
-    """Print a warning on stderr, in one paragraph."""
+    """Print a warning on stderr, as one paragraph."""
     say("warning", message, "bold yellow")
 
 
@@ -129,7 +134,7 @@ class _Noted(logging.Handler):
 
 
 def note_log() -> None:
-    """Print what the package logs as notes: work that takes long once."""
+    """Print the package's log messages as notes, such as those on compiling."""
     logger = logging.getLogger("shapepose_fg")
     if len(logger.handlers) == 0:
         logger.addHandler(_Noted(logging.INFO))
@@ -137,14 +142,14 @@ def note_log() -> None:
 
 
 _shown: "Progress | None" = None
-"""Bars that are shown at present."""
+"""Progress bars that are currently shown."""
 
 
 @contextmanager
 def bars(unit: str = "") -> Iterator["Progress"]:
-    """Progress bars on stderr while the block runs; nothing is shown where that is not a terminal.
+    """Progress bars on stderr while the block runs; none if stderr is not a terminal.
 
-    Whatever ends the block, the bars are taken away and the cursor is back.
+    The bars are removed and the cursor is restored however the block ends.
     """
     global _shown
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -178,13 +183,13 @@ def _is_terminal(on: "Console") -> bool:
 
 
 _EVERY_S = 15.0
-"""Interval between lines of progress where stderr is no terminal, s."""
+"""Interval between lines of progress if stderr is not a terminal, s."""
 
 
 @contextmanager
 def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """A function that is called with the number of finished items and of all: a bar on a terminal, else lines
-    of text.
+    """A function to be called with the number of finished items and the total number; shows a bar
+    on a terminal, otherwise lines of text.
     """
     begin = last = time.monotonic()
 

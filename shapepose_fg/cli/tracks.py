@@ -35,8 +35,8 @@ def people_over_time(
 ) -> None:
     """List the people of a result over time, or correct identities: shapepose-fg tracks RESULTS merge 3 9.
 
-    Without a command all people are listed. The result as it was before the first correction stays in
-    RESULTS/uncorrected, and `undo` takes corrections back one by one.
+    Without a command, all people are listed. The original result stays in RESULTS/uncorrected, and
+    `undo` takes corrections back one by one.
     """
     context.obj = results
     if context.invoked_subcommand is None:
@@ -72,7 +72,7 @@ New = Annotated[int | None, typer.Option(help="Number of the new person; by defa
 
 @tracks.command("split")
 def split_person(context: typer.Context, person: Person, frame: From, new: New = None) -> None:
-    """Split A at FRAME: from there on it is a new person."""
+    """Split A at FRAME: from this frame on, A is a new person."""
     _correct(context, "split", person, other=new, frame=frame)
 
 
@@ -107,7 +107,7 @@ def undo_correction(context: typer.Context) -> None:
 
 
 def _tracks_table(results: Path) -> "RenderableType":
-    """All people of a result, and the corrections."""
+    """Table of all people of a result, and the corrections."""
     from rich.console import Group
     from rich.padding import Padding
 
@@ -121,7 +121,7 @@ def _tracks_table(results: Path) -> "RenderableType":
         listed = list_saved_tracks(opened, _body_of(run))
 
     def or_dash(value: float, text: str) -> str:
-        return "-" if value != value else text.format(value)  # NaN
+        return "-" if value != value else text.format(value)  # NaN is shown as "-"
 
     people = table(
         "person frames rows gaps stature seen confidence walked".split(),
@@ -150,7 +150,7 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
-    """The body model of a result; None where its file is missing."""
+    """The body model of a result; None if its file is missing."""
     from shapepose_fg.io.solved_setup import body_of
 
     try:
@@ -160,7 +160,7 @@ def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
 
 
 def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
-    """Make one correction, and print its effect."""
+    """Apply one correction, and print its effect."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.corrections import correct
     from shapepose_fg.tracking.edits import Action, Edit, free_number
@@ -182,8 +182,8 @@ def _correct(context: typer.Context, action: str, person: int, **more: int | Non
 
 
 def _renew_report(folder: Path) -> None:
-    """Write the page of a corrected result again, if there is one, and set its exports aside, which are out of
-    date.
+    """Write the report of a corrected result again, if there is one, and rename its exports, which
+    are out of date.
     """
     from shapepose_fg.viz.report.writing import REPORT, report_of
 
@@ -199,7 +199,8 @@ def _renew_report(folder: Path) -> None:
 
 
 def _solver(folder: Path) -> "Solve | None":
-    """Function that solves rows of the result in `folder` again; None where the result lacks what it needs.
+    """Function that solves rows of the result in `folder` again; None if required files are
+    missing.
 
     Without identities every row is solved separately.
     """

@@ -1,4 +1,4 @@
-"""The command `train-fitter`: weights of the learned fitter for the user's own body model."""
+"""The command `train-fitter`: trains the learned fitter for the user's body model."""
 
 import time
 from pathlib import Path
@@ -9,9 +9,10 @@ from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.output_folder import prepare_output
 
 _DRAWN = 30_000
-"""Number of random poses where no recorded ones are given."""
+"""Number of random poses if no recorded ones are given."""
 _WORSE = 1.1
-"""Ratio of the error to the plain optimiser's above which weights, which take half its time, are useless."""
+"""Ratio of the error to that of the plain optimiser above which weights are rejected (the learned
+fitter takes half the time)."""
 
 
 @grouped
@@ -27,9 +28,10 @@ def train_fitter(
     batch: int = option(RUN, "Number of people in a batch.", 256, min=16),
     seed: int = option(RUN, "Random seed.", 0),
 ) -> None:
-    """Train the body fitter for a body model of yours; whatever has this --body then uses it.
+    """Train the body fitter for your own body model; all commands with this --body then use it.
 
-    It begins with the weights that ship with the package, and is compared with the plain optimiser at the end.
+    Training starts from the built-in weights. At the end, the result is compared with the plain
+    optimiser.
     """
     torch = optional("torch", "train")
     from shapepose_fg.body.fitting.weights import FitterWeights, adapted_file, fingerprint

@@ -22,7 +22,9 @@ def view(
     connect: str | None = option(RUN, "Address of a running viewer: rerun+http://HOST:9876/proxy.", metavar="URL"),
     statistics: bool = option(RUN, "Keep rerun's setting of usage statistics.", False, "--statistics"),
 ) -> None:
-    """Show a result in the rerun viewer: people, cameras, and what was used of what they saw, on a timeline."""
+    """Show a result in the rerun viewer: people, cameras, and used and unused detections, on a
+    timeline.
+    """
     from shapepose_fg.io.export import rerun_app
     from shapepose_fg.io.export.registry import Job, read_take
     from shapepose_fg.io.export.rerun_log import log_pictures, log_take
@@ -46,7 +48,7 @@ def view(
 
 
 def _pictures(results: Path, take: "Take", pictures: PictureOptions) -> "list[tuple[CameraFootage, Footage]]":
-    """The cameras' videos or pictures: of all, or of those that are given one by one."""
+    """The cameras' videos or pictures: of all cameras, or of those that are given individually."""
     if take.rig is None:
         raise InputError("--videos: cameras.json is missing beside the result, and pictures need it")
     return pictures.of_result(results, take.people.run, take.rig, pictures.named(take.rig))

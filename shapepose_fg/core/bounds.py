@@ -26,7 +26,9 @@ RepeatsOrNone = Annotated[int, Interval(ge=0, le=100)]
 
 
 class Settings:
-    """Base of dataclasses whose fields have bounds. ValueError names a field whose value is out of bounds."""
+    """Base class of dataclasses with bounds on fields. ValueError names a field if its value is out
+    of bounds.
+    """
 
     def __post_init__(self) -> None:
         for name, interval in _intervals(type(self)).items():

@@ -143,7 +143,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras in a fixed order, in one world whose unit is the metre and whose up axis is known."""
+    """Cameras in a fixed order, in a common world with a known up axis; metres."""
 
     cameras: tuple[Camera, ...]
     """The V cameras; a view is an index into them."""

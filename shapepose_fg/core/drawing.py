@@ -9,8 +9,8 @@ from shapepose_fg.core.skeleton import BODY_25
 PALETTE = ("#3f7fb8", "#e0962f", "#2f9e80", "#c06c9c", "#6cb6dd", "#c8623f", "#7d70b8", "#a8a03c")
 """Colours after Okabe and Ito, distinguishable with every kind of colour vision."""
 CELL_M = 0.02
-"""Edge of the grid cells of which `thinned` keeps one vertex each, m: a finger's width, invisible across a
-room."""
+"""Edge length of the grid cells in each of which `thinned` keeps one vertex, m: a finger's width,
+invisible at room distance."""
 
 
 def colour_of(person: int) -> tuple[float, float, float]:

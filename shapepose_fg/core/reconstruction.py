@@ -55,7 +55,7 @@ class Known(IntEnum):
     MOTION = 3
     """Without a detection and without a body: interpolated by the motion model from other frames."""
     WEAK = 4
-    """Fewer than two such views: a joint that one view saw, or whose detections have a low
+    """Fewer than two such views: a joint that only one view detected, or detections with a low
     probability. Body and motion model contribute considerably to its position."""
 
     @classmethod

@@ -138,8 +138,8 @@ class Skeleton:
 
     @property
     def anchor(self) -> tuple[int, ...]:
-        """The joints that determine the position of a person: the root joint, or the two of which
-        it is the midpoint.
+        """Joints that determine the position of a person: the root joint; if it is a computed
+        midpoint, its two joints.
         """
         return next(((first, second) for joint, first, second in self.middles if joint == self.root), (self.root,))
 

@@ -21,8 +21,8 @@ class Trust:
     left_out: tuple[Spell, ...] = ()
     """Views and intervals that are left out, because they contradict other views that agree."""
     doubted: tuple[Spell, ...] = ()
-    """Views and intervals of which some are wrong, but it is unknown which: rows that depend on
-    them are not `ok`."""
+    """Views and intervals that contradict each other, without evidence which are wrong; rows that
+    depend on them are not `ok`."""
 
     def dark(self, frame: int) -> tuple[int, ...]:
         """The views that are left out of a frame."""

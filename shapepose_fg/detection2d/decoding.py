@@ -89,8 +89,8 @@ def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Ind
 
 
 def between_cells(maps: Real, which: Index, row: Index, column: Index) -> tuple[Array, Array]:
-    """Places (N, 2) and heights (N,) of maxima of `maps` (M, H, W), refined between the cells
-    `which`, `row`, `column` (N,), none of which is at an edge.
+    """Sub-cell positions (N, 2) and heights (N,) of maxima of `maps` (M, H, W) at the cells
+    `which`, `row`, `column` (N,). None of these cells is at an edge.
     """
     centre = maps[which, row, column].astype(np.float64)
     x, rise_x = _vertex(maps[which, row, column - 1], centre, maps[which, row, column + 1])
@@ -114,7 +114,7 @@ def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
 def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: Index) -> Array:
     """(E,) mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
 
-    `limb` (E,) is the field of each line. 0 where too few points along the line support it.
+    `limb` (E,) is the field of each line. 0 if too few points along the line support the limb.
     """
     height, width = fields.shape[1:]
     along = end - start

@@ -19,7 +19,7 @@ _MOST_FIELDS = 2**20
 _LONGEST = 2**31
 """Size of a field, bytes, exclusive; protobuf's own limit."""
 _FIXED_BYTES = {1: 8, 5: 4}
-"""Lengths of the wire types that have a fixed one."""
+"""Lengths, bytes, of protobuf's wire types with a fixed length."""
 
 _MESSAGES: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},

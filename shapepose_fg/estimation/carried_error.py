@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factors import kernel_weight
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array
@@ -13,6 +12,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
+    information_by_view,
     inverses,
     linearise,
     observation_sigmas,
@@ -56,19 +56,14 @@ def goes_with_poses(
     carried, points = views.carried, np.nan_to_num(evidence.points)
     assert carried is not None
     found = np.zeros((*points.shape[:2], carried.wTb.shape[1], 3, 6))
-    _, _, slope = views.project(points)
-    used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
-    sigma = np.where(used, sigmas, 1.0)
-    off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / sigma
-    weight = np.where(used, kernel_weight(config.robust_kernel, off) / sigma**2, 0.0)
-    slope = np.where(used[..., None, None], slope, 0.0)
-    of_views = np.einsum("njv,njvki,njvkl->njil", weight, slope, slope)
+    by_view = information_by_view(evidence, sigmas, views, config)
+    of_views = by_view.sum(axis=2)
     least = _NOTHING * np.eye(3)
     total = inverses(of_views + body.information + least)
     whole = np.maximum(np.trace(of_views.sum(axis=1), axis1=1, axis2=2), 1e-9)
     for number in range(carried.wTb.shape[1]):
         on = carried.carrier == number
-        own = np.einsum("njv,njvki,njvkl->njil", weight[..., on], slope[..., on, :, :], slope[..., on, :, :])
+        own = by_view[:, :, on].sum(axis=2)
         share = np.trace(own.sum(axis=1), axis1=1, axis2=2) / whole
         gain = total @ (own + share[:, None, None, None] * (body.information + least))
         R, t = carried.wTb[:, number, :3, :3], carried.wTb[:, number, :3, 3]

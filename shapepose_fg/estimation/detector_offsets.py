@@ -23,11 +23,14 @@ _MAX_SIGMA_M = 0.03
 
 @dataclass(frozen=True)
 class OffsetConfig(Settings):
-    """Whether, and from what, the difference between the detector's joints and the body's is learnt."""
+    """Whether, and from what, the difference between the detector's joints and the body's is learnt, and how large
+    the detector's errors are (`noise_law`).
+    """
 
     source: str = "recording"
-    """"recording": learnt from the recording itself; "none": there is none; else a file that holds offsets:
-    the run.json of another recording by the same detector, or what `KeypointOffsets.save` wrote."""
+    """"recording": learnt from the recording itself; "none": there is none, and errors are the usual ones; else
+    a file that holds offsets: the run.json of another recording by the same detector, from which the errors are
+    taken, too, or what `KeypointOffsets.save` wrote."""
     frames: Annotated[int, Interval(ge=1, le=10000)] = 30
     """Frames, spread over the whole recording, that offsets are learnt from."""
     replaced: ClassVar[dict[str, str]] = dict.fromkeys(

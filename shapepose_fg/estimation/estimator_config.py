@@ -11,6 +11,7 @@ from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Repeats, Sett
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
+from shapepose_fg.estimation.noise_law import NoiseLaw
 
 
 @dataclass(frozen=True)
@@ -91,3 +92,5 @@ class EstimatorConfig:
     """How joints move."""
     joints: tuple[str, ...] = BODY_25.joints
     """What the detector calls its joints: motion, sigmas and limbs go by them."""
+    noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
+    """How far the detector's joints lie from the true ones, for covariances; weights are `observations`'."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Interval
 
-from factors import DEFAULT_WIDTH_SIGMA, KernelName
+from factors import DEFAULT_WIDTH_SIGMA, KernelName, kernel_weight
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
@@ -218,6 +218,17 @@ def linearise(
         inlier, residual, information, gradient,
     )  # fmt: skip
     return ViewEvidence(points, inlier, residual, information, gradient)
+
+
+def information_by_view(evidence: ViewEvidence, sigmas: Array, views: Views, config: ObservationConfig) -> Array:
+    """(N, J, V, 3, 3) what each observation says of its joint, robust weight included, 1/m²; zero for others."""
+    _, _, slope = views.project(np.nan_to_num(evidence.points))
+    used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
+    sigma = np.where(used, sigmas, 1.0)
+    off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / sigma
+    weight = np.where(used, kernel_weight(config.robust_kernel, off) / sigma**2, 0.0)
+    slope = np.where(used[..., None, None], slope, 0.0)
+    return weight[..., None, None] * slope.mT @ slope
 
 
 def mean_confidence(observations: Observations, inlier: Mask) -> Array:

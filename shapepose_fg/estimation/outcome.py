@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
@@ -23,6 +24,7 @@ from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
+    information_by_view,
     inverses,
     linearise,
     mean_confidence,
@@ -30,6 +32,7 @@ from shapepose_fg.estimation.linearisation import (
     weakest_sigma,
 )
 from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.noise_law import core_sigma_m, variance_ratio
 from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import State
@@ -136,30 +139,34 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
 
 
 def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
-    """Covariances (N, J, 3, 3) with all doubts: over time as calibrated, frame by frame of the detections.
+    """Covariances (N, J, 3, 3) with all doubts, as large as the detector's errors make them.
 
     `covariance` is that of the graph, errors that last in it; `final` what the views say around the joints `X`.
+    Those of rows that stand alone are no smaller than the graph's.
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
-    calibration = Calibration.load(joints)
-    of_body = np.nan_to_num(squared_distance(body, state.joints, covariance))
-    association = association_spread(rows, state.sigmas, final, body, state.views, state.config.observations)
+    config, alone = state.config.observations, np.ones(len(X), dtype=bool)
+    for person in state.people:
+        alone[person.rows] = not person.temporal
+    sigma_m = core_sigma_m(rows.confidence, config) * config.scatter(joints)[:, None]
+    by_view = information_by_view(final, state.sigmas, state.views, config)
+    ratio = variance_ratio(state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information)
+    widened = ratio[..., None, None] * covariance
+    of_body = np.nan_to_num(squared_distance(body, state.joints, widened))
+    association = association_spread(rows, state.sigmas, final, body, state.views, config)
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
     exchange = exchange_spread(state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints))
-    alone = np.ones(len(X), dtype=bool)
     for person in state.people:
         mine, times_s = person.rows, person.times_s
-        alone[mine] = not person.temporal
         association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
             clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
-    clues = Clues(rows.frame, X, count, covariance, of_body, association, draft, exchange)
-    return np.where(
-        alone[:, None, None, None],
-        covariance + calibration.association * association,
-        calibration.covariance(clues),
-    )
+    clues = Clues(rows.frame, X, count, widened, of_body, association, draft, exchange)
+    found = Calibration.load(joints).covariance(clues)
+    single = alone[:, None] & np.isfinite(found).all(axis=(-2, -1))
+    found[single] = covariance[single] + raise_eigenvalues(found[single] - covariance[single], 0.0)
+    return found
 
 
 def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:

@@ -57,7 +57,7 @@ class Matches:
     person: Index
     """(M,) index of the person in the truth."""
     duplicated: Index
-    """Rows of further predictions of people who are matched with another one: duplicates."""
+    """Rows of additional predictions of people who are already matched: duplicates."""
     invented: Index
     """Rows of predictions that are near no person: false positives."""
     missed: Index

@@ -52,11 +52,12 @@ class ShelfScore:
     limbs_all: NDArray[np.int64]
     """(3, 10) number of annotated limbs, by actor and limb."""
     mpjpe_mm: float
-    """Mean distance of the joints of people who were found (mean joint distance under 0.5 m), millimetres."""
+    """Mean distance of joints from the annotation, millimetres, over people who were found (mean
+    joint distance under 0.5 m)."""
     recall: float
     """Share of the actors' annotated joints with a prediction within 0.2 m."""
     people_found: int
-    """Number of annotated people with a prediction whose mean joint distance is under 0.5 m."""
+    """Number of annotated people with a prediction at a mean joint distance under 0.5 m."""
     people: int
     """Number of annotated people who were scored: the actors, in the scored frames."""
     frames: int

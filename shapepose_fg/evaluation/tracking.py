@@ -39,7 +39,8 @@ class IdentityMetrics:
     """Result of `identity_metrics`, over all frames."""
 
     true_positives: int
-    """IDTP: number of rows of the person to whom their identity is assigned for the whole recording."""
+    """IDTP: number of rows that belong to the person assigned to their identity for the whole
+    recording."""
     rows: int
     """Number of rows in the scored frames that have a joint."""
     people_true: int
@@ -68,7 +69,7 @@ class MotionScore:
     acceleration_error: float
     """Mean length of the difference between a joint's acceleration and the true one, m/s²."""
     fast_wrist_error_mm: float
-    """Median error of the wrists whose truth is faster than 1.5 m/s, millimetres."""
+    """Median error of wrists with a true speed above 1.5 m/s, millimetres."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,8 @@ def joints_by_frame(people: Reconstruction) -> Array:
 def acceleration_errors(placed: Array, truth: Array, follows: Mask, fps: float) -> Array:
     """(T - 2, P, J) error of second differences, m/s², of `placed` and `truth` (T, P, J, 3), metres.
 
-    NaN where one of the three frames does not follow (T, P) the one before.
+    `follows` (T, P) marks frames that directly follow the previous row; NaN if one of the three
+    frames does not.
     """
     error = placed - truth
     second = (error[2:] - 2 * error[1:-1] + error[:-2]) * fps**2
@@ -260,7 +262,7 @@ def frames_unseen(seen: Mask, frame: Whole, identity: Whole) -> NDArray:
     """(N, J) number of consecutive frames, the current one included, in which a joint of an
     identity has not been `seen` (N, J).
 
-    The count starts again where the identity has no row in the frame before.
+    The count restarts if the identity has no row in the previous frame.
     """
     order = np.lexsort((frame, identity))
     seen, frame, identity = seen[order], frame[order], identity[order]

@@ -130,7 +130,7 @@ class _Text:
                 raise self.refuse(error.msg, error.pos) from None
             except InputError:
                 raise
-            except (ValueError, RecursionError) as error:  # an integer of 5,000 digits, or 10,000 open brackets
+            except (ValueError, RecursionError) as error:  # of 5,000 digits, or 10,000 open brackets
                 raise InputError(f"{self._path}: cannot be read as JSON ({error}); write the file again") from None
             number = isinstance(value, int | float) and end >= len(self._left) - len("e-")
             if number and self._more():  # the number may continue

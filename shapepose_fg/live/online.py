@@ -24,6 +24,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.estimation.doubt import mirrored_spread
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import JUMP_S, CommonClock
 from shapepose_fg.live.filtering import Filter
@@ -115,9 +116,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """`skeleton` are the detector's joints; `lag_s` is the delay of the refined people.
 
         `workers` is the number of processes for refinement; with 1 it runs within `push`, in a
-        fixed order, so that the same frames give the same bytes. Offsets of the detector's joints
-        are read from `config.offsets.source` if it is a file. Raises ValueError for fewer than two
-        cameras, or a lag outside 0.1 to 2 seconds.
+        fixed order, so that the same frames give the same bytes. Offsets of the detector's joints,
+        and its noise law, are read from `config.offsets.source` if it is a file. Raises ValueError
+        for fewer than two cameras, or a lag outside 0.1 to 2 seconds.
         """
         config = PipelineConfig() if config is None else config
         if len(rig) < 2:
@@ -128,13 +129,16 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             raise ValueError("live reconstruction tracks people over time; leave config.temporal at true")
         rounds = min(config.windows.again_over_time, _ROUNDS)
         config = replace(config, windows=replace(config.windows, again_over_time=rounds))
+        source, noise = config.offsets.source, NoiseLaw.shipped()
+        if source not in ("none", "recording"):
+            noise = NoiseLaw.load(source)
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
-            if config.offsets.source not in ("none", "recording"):
-                fitter = fitter.with_keypoint_offsets(KeypointOffsets.load(config.offsets.source))
+            if source not in ("none", "recording"):
+                fitter = fitter.with_keypoint_offsets(KeypointOffsets.load(source))
         check_fitter(fitter)
         self.rig, self.lag_s = rig, lag_s
-        setup = Setup(rig, skeleton, config, fitter)
+        setup = Setup(rig, skeleton, config, fitter, noise=noise)
         self._setup, self._config, self._id = setup, config, setup_id(rig, skeleton, config, lag_s)
         self._filter = Filter(setup.engine(Notebook()).tracker, config.stitching)
         self._motion = MotionModel.load(skeleton.joints, config.motion, config.law)

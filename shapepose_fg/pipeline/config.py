@@ -120,7 +120,7 @@ class PipelineConfig(Settings):
     body: BodyConfig = field(default_factory=BodyConfig)
     """Stage II: how bodies are fitted."""
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
-    """Stage II: offsets of the detector's joints from the body's."""
+    """Stage II: offsets of the detector's joints from the body's, and the detector's errors."""
     temporal: bool = True
     """Whether people are tracked over time: identities, motion, one shape a person. If not, every frame is
     independent."""

@@ -1,4 +1,4 @@
-"""Offsets of a detector's joints from those of the body, estimated from frames spread over a recording."""
+"""What is learnt of a detector from frames spread over a recording: offsets of its joints, and its noise law."""
 
 from dataclasses import fields, replace
 
@@ -8,7 +8,7 @@ from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
-from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.frame_times import FrameTimes
@@ -18,13 +18,20 @@ from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.estimation.detector_offsets import confident_targets, spread_frames
+from shapepose_fg.estimation.noise_law import NoiseLaw, Residuals
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
+from shapepose_fg.proposal.people_2d import whole_people
 from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
-_OFFSETS = "keypoint-offsets"
-"""The name under which a run stores them."""
+_OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
+"""The names under which a run stores them."""
+NOISE_FRAMES = 60
+"""Maximum number of frames from which the noise law is learnt; shorter recordings keep what ships."""
+_ENOUGH = 10_000
+"""Number of detections of 2D people that are enough for it: crowds have them in a dozen frames."""
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 def estimate_offsets(
@@ -64,6 +71,50 @@ def kept_offsets(
     if offsets is not None:
         kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
     return offsets
+
+
+def kept_noise(
+    kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
+) -> NoiseLaw:
+    """The noise law that a run stored when it began; `noise_of` where it has none."""
+    if len(kept.names(_NOISE)) > 0:
+        with naming(kept.place(_NOISE), ANEW):
+            return NoiseLaw.from_dict({name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS})
+    noise = noise_of(setup, frames, times, book)
+    if noise != NoiseLaw.shipped():
+        kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
+    return noise
+
+
+def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook) -> NoiseLaw:
+    """The noise law of the detector, from where the offsets come; what ships in recordings of few frames."""
+    source = setup.config.offsets.source
+    if source not in ("none", "recording"):
+        return NoiseLaw.load(source)
+    count = len(detections) - detections.first
+    if source == "none" or count < NOISE_FRAMES:
+        return NoiseLaw.shipped()
+    chosen, every = list[Observations](), list[Observations]()
+    with book.stage("noise"):
+        stage, time_s = (
+            StageOne(setup.skeleton, setup.config.candidates, setup.config.proposals, Notebook()),
+            times.of_views(len(setup.rig)),
+        )
+        frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
+        # Wherever this ends, its frames are spread over the whole recording.
+        for frame in frames[np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")].tolist():
+            found = detections[frame]
+            people = stage(found, setup.rig.at(time_s[frame]))
+            people = replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))
+            whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
+            chosen.append(people)
+            every.append(whole)
+            learnt += int(whole.seen.sum())
+            if learnt >= _ENOUGH:
+                break
+        rows, whole = Observations.concatenate(chosen), Observations.concatenate(every)
+        views, config = Views.of(setup.rig, rows.time_s), setup.config.observations
+        return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
 
 
 def offsets_of(

@@ -30,7 +30,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.keyframes import keyframes
 from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
-from shapepose_fg.pipeline.offsets import kept_offsets
+from shapepose_fg.pipeline.offsets import kept_noise, kept_offsets
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.setup import Setup
@@ -168,6 +168,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     offsets = kept_offsets(kept, setup, detections, times, book)
     if offsets is not None:
         setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
+    setup = replace(setup, noise=kept_noise(kept, setup, detections, times, book))
     parts = Parts(kept)
     parts.check(skeleton.joints, rig.names, frames, times.frame_s)
     done = parts.notes().frames
@@ -214,7 +215,10 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         made = {name_of(function): notes.factors.get(name_of(function), (0, 0)) for function in functions}
         counts = {name: {"made": count, "inactive": idle} for name, (count, idle) in made.items()}
         more |= {"extra_factors": counts}
-    more |= {"keypoint_offsets": None if offsets is None else offsets.as_dict()}
+    more |= {
+        "keypoint_offsets": None if offsets is None else offsets.as_dict(),
+        "noise_law": setup.noise.as_dict(),
+    }
     return result.with_run(**_summary(notes, config, frames, result), **more)
 
 

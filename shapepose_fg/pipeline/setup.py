@@ -18,6 +18,7 @@ from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -52,11 +53,14 @@ class Setup:
     """Fits bodies."""
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
+    noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
+    """How far the detector's joints lie from the true ones."""
     estimator: EstimatorConfig = field(init=False)
     """The settings of stage II, with the motion model: other processes need not know its name."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "estimator", replace(self.config.estimator, joints=self.skeleton.joints))
+        estimator = replace(self.config.estimator, joints=self.skeleton.joints, noise=self.noise)
+        object.__setattr__(self, "estimator", estimator)
 
     def solve(self, span: Span) -> Part:
         """Solve one window, in any process: the rows of its own frames, by frame and person, and notes on them."""

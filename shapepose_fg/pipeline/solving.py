@@ -1,7 +1,7 @@
 """Solves rows of a result again from their own observations: after corrections by hand, and for their graphs."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.window_graph import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
@@ -40,6 +41,8 @@ class Solver:
     """The settings."""
     fitter: BodyFitter
     """Fits bodies; it knows where the detector puts its joints (`run["keypoint_offsets"]`)."""
+    noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
+    """How far the detector's joints lie from the true ones (`run["noise_law"]`)."""
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, run_file: Path = Path("run.json")) -> "Solver":
@@ -52,7 +55,8 @@ class Solver:
         offsets = None if told is None else KeypointOffsets.read(told, run_file)
         model = BodyModel.default() if body is None else BodyModel.load(Path(str(body)))
         fitter = make_fitter(config.body, model.with_keypoints(tuple(people.joint_names.tolist())), config.law)
-        return cls(rig, config, fitter if offsets is None else fitter.with_keypoint_offsets(offsets))
+        fitter = fitter if offsets is None else fitter.with_keypoint_offsets(offsets)
+        return cls(rig, config, fitter, NoiseLaw.read(people.run, run_file))
 
     @classmethod
     def read(cls, folder: Path, people: Reconstruction) -> "Solver":
@@ -129,7 +133,7 @@ def _solved(
         raise ValueError("rows without observations cannot be solved again; reconstruct the recording again")
     config, rig = solver.config, solver.rig
     _check_rows(rows, over_time=config.temporal)
-    settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()))
+    settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()), noise=solver.noise)
     for own, segment in _windows(rows, config):
         if frame is not None and frame not in own:
             continue

@@ -6,6 +6,11 @@ from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 
+LEAST_JOINTS = 4
+"""Minimum number of joints by which a 2D person is known to be that of a person in 3D."""
+_MOST_OF = 0.6
+"""Minimum share of the person's detections in the view that are of this 2D person."""
+
 
 def without_repeats(found: Detections) -> tuple[Detections, Index]:
     """The detections without duplicates, and the index of each in `found`.
@@ -44,6 +49,27 @@ def group_people(found: Detections) -> list[Index]:
     chains = np.arange(count), np.full(count, -1), np.arange(count)
     groups = _group(pairs[np.argsort(-affinity, kind="stable")], joint, *chains, has, order, stop)
     return np.split(order, stop[: groups - 1]) if count > 0 else []
+
+
+def whole_people(chosen: Index, found: Detections) -> Index:
+    """All detections (N, J, V) of the 2D people whose detections N people have, `chosen` (N, J, V); -1 for none.
+
+    A joint of which a person has another detection, or another person this one, is left out: there the groups, not
+    the detector, are wrong.
+    """
+    group, groups = np.empty(len(found), dtype=np.intp), group_people(found)
+    for number, rows in enumerate(groups):
+        group[rows] = number
+    whole = np.full(chosen.shape, -1, dtype=np.intp)
+    for row, view in np.ndindex(len(chosen), chosen.shape[2]):
+        own = chosen[row, :, view]
+        number, count = np.unique(group[own[own >= 0]], return_counts=True)
+        if count.max(initial=0) >= max(LEAST_JOINTS, _MOST_OF * count.sum()):
+            rows = groups[number[count.argmax()]]
+            whole[row, found.joint[rows], view] = rows
+    taken = np.bincount(chosen[chosen >= 0], minlength=len(found) + 1)
+    theirs = np.where(chosen == whole, taken[whole] > 1, (taken[whole] > 0) | (chosen >= 0))
+    return np.where(theirs, -1, whole)
 
 
 @kernel("i2 i1 i1 i1 i1 b2 i1 i1")

@@ -41,7 +41,7 @@ _PACES = np.array([0.15, 0.45, 0.75, 1.0])
 
 
 def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
-    """Clips of people who stand and gesture, of subjects other than `without`."""
+    """Indices of clips of people who stand and gesture, by subjects other than `without`."""
     return [
         index
         for index, action, plan in _clips(mocap, 90, without)
@@ -50,7 +50,7 @@ def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
 
 
 def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
-    """Clips of people who walk straight on, of subjects other than `without`."""
+    """Indices of clips of people who walk straight, by subjects other than `without`."""
     found = []
     for index, action, plan in _clips(mocap, 60, without):
         if "walk" in action and "uneven" not in action and mocap.tiers[index] <= 0:
@@ -62,7 +62,9 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
 
 
 def _clips(mocap: Mocap, frames: int, without: frozenset[str]) -> Iterator[tuple[int, str, Array]]:
-    """Clips of at least this many frames, their actions, and the pelvis' positions (T, 2) over the floor."""
+    """Clips of at least `frames` frames, with their actions, and the pelvis' positions (T, 2) on
+    the floor.
+    """
     for index, (subject, action) in enumerate(zip(mocap.subjects, mocap.actions, strict=True)):
         if subject not in without and mocap.lengths[index] >= frames:
             start = int(mocap.arrays["seq_start"][index])
@@ -71,13 +73,13 @@ def _clips(mocap: Mocap, frames: int, without: frozenset[str]) -> Iterator[tuple
 
 
 def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
-    """`clip` from frame `start` for `frames` frames, again from its beginning where it ends, by a crossfade."""
+    """`clip` from frame `start` on, looped to `frames` frames with a crossfade at the end."""
     seam = min(max(2, round(_SEAM_S * clip.fps)), len(clip) // 3)
     share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
     share = share**2 * (3 - 2 * share)
     head, tail = clip.between(0, seam), clip.between(len(clip) - seam, len(clip))
     rotations, pelvis = clip.rotations[:-seam].copy(), clip.pelvis[:-seam].copy()
-    # The last frames melt into the first ones, which the loop then need not show by themselves.
+    # The last frames are blended into the first ones, and not repeated.
     rotations[:seam] = blend(tail.rotations, head.rotations, share)
     pelvis[:seam] = tail.pelvis + share[:, None] * (head.pelvis - tail.pelvis)
     index = (start + np.arange(frames)) % len(pelvis)
@@ -96,15 +98,15 @@ def stand(body: BodyModel, betas: Array, clip: Clip, frames: int, fps: float, st
 def walk_along(
     body: BodyModel, betas: Array, clip: Clip, path: Array, heading: Array, *, fps: float, start: float = 0.0
 ) -> Performance:
-    """The walk of `clip` along `path` (T, 2) facing `heading` (T,), by a body of shape `betas` (10,).
+    """The walk of `clip` along `path` (T, 2) with `heading` (T,), by a body of shape `betas` (10,).
 
-    The recorded steps are repeated and laid along the path, as many as its length needs: a slower person than the
-    recorded one takes slower steps. `start` is the share of the loop of steps at which the walk begins.
+    The recorded steps are looped along the path, as many as its length needs, so that a slower
+    person takes slower steps. `start` is the phase of the loop at which the walk begins, 0 to 1.
     """
     cycle, gain = _cycle(perform(body, betas, clip.resampled(fps)))
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])[: len(path)]
     count = len(cycle)
-    # Nobody's steps stop dead: below a quarter of the recorded speed the feet go on in place.
+    # Steps do not stop abruptly: below a quarter of the recorded speed the feet continue in place.
     floor = 0.25 * gain / count
     advance = np.maximum(np.diff(way, prepend=0.0), 0.0)
     advance[1:] = np.maximum(advance[1:], floor)
@@ -120,7 +122,9 @@ def walk_along(
 
 
 def _cycle(walk: Performance) -> tuple[Performance, float]:
-    """Double steps of a straight walk that can be repeated, without the motion along +x; and its length."""
+    """A loop of double steps from a straight walk, without the motion along +x; and its
+    length, m.
+    """
     count = len(walk)
     way = walk.joints[-1, 0, :2] - walk.joints[0, 0, :2]
     walk = walk.moved(np.zeros(2), -float(np.arctan2(way[1], way[0])))
@@ -128,7 +132,7 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     features = (walk.joints - walk.joints[:, :1]).reshape(count, -1)
     first, last = np.arange(seam, count // 2), np.arange(count // 2, count)
     gap = np.linalg.norm(features[first][:, None] - features[last][None], axis=-1)
-    # A shorter loop shows its seam more often: prefer the longer of two that close equally well.
+    # A shorter loop repeats its seam more often: prefer the longer of two that close equally well.
     begin, end = np.unravel_index(np.argmin(comparable(gap - 0.002 * (last[None] - first[:, None]))), gap.shape)
     begin, end = int(first[begin]), int(last[end])
     share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
@@ -144,7 +148,7 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
 
 
 Way = tuple[Array, Array]
-"""Positions (T, 2), metres, and headings (T,), radians from the x axis towards y without whole turns, of a
+"""Positions (T, 2), metres, and headings (T,), radians from the x axis towards y, unwrapped, of a
 walker."""
 
 
@@ -158,13 +162,15 @@ def way_through(
     distance_m: Array,
     half_room_m: float,
 ) -> Way:
-    """A path from wall to wall and back, past points `others` (T, K, 2) at `distance_m` (K,) or a little more."""
+    """A path from wall to wall and back, with distance `distance_m` (K,) or a little more from
+    `others` (T, K, 2).
+    """
     ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
     return max(ways, key=lambda way: comparable(_way_worth(way, others, distance_m)))
 
 
 def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
-    """Score of a path: first that it touches no one, then that it is close."""
+    """Score of a path: mainly no contact, then closeness."""
     if others.shape[1] == 0 or len(way[0]) == 0:
         return 0.0
     room = (np.linalg.norm(others - way[0][:, None], axis=-1) - distance_m).min(axis=1)
@@ -174,7 +180,9 @@ def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
 def _walk(
     others: Array, frames: int, rng: np.random.Generator, fps: float, speed: float, distance: Array, half: float
 ) -> Way:
-    """One random path: each decision takes the turn and pace whose next two seconds are best (dynamic window)."""
+    """One random path: each decision takes the best turn and pace for the next two seconds (dynamic
+    window).
+    """
     hold = max(1, round(_DECISION_S * fps))
     xy, heading, pace = _way_start(others, rng, half)
     goal = _way_goal(xy, rng, half)
@@ -189,7 +197,7 @@ def _walk(
         cost += 2.0 * np.linalg.norm(options[:, -1] - goal, axis=-1)
         cost += 60.0 * np.maximum(np.abs(options) - half, 0.0).sum(axis=(1, 2))
         apart_x, apart_y = (options[..., None, axis] - others[ahead, :, axis] for axis in (0, 1))
-        gaps = np.sqrt(apart_x**2 + apart_y**2)  # most of the time goes here: five times as fast as norm
+        gaps = np.sqrt(apart_x**2 + apart_y**2)  # dominates the run time; norm is five times slower
         cost += 200.0 * (np.maximum(distance + 0.08 - gaps, 0.0) ** 2).sum(axis=(1, 2))
         best = int(np.argmin(comparable(cost)))
         rate, pace = float(turns[best]), float(paces[best])
@@ -202,14 +210,16 @@ def _walk(
 
 
 def _arcs(xy: Array, heading: float, turns: Array, speeds: Array) -> Array:
-    """Positions (C, H, 2) along the horizon for C turns and speeds; turns last for at most 0.8 s."""
+    """Positions (C, H, 2) along the horizon for C turning rates and speeds; turns last at most 0.8
+    s.
+    """
     step = np.diff(_HORIZON_S, prepend=0.0)
     angle = heading + turns[:, None] * np.minimum(_HORIZON_S - step / 2, 0.8)
     return xy + np.cumsum(along(angle) * (speeds[:, None] * step)[..., None], axis=1)
 
 
 def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array, float, float]:
-    """A free position, the heading towards the middle, and the first pace."""
+    """A free position, a heading towards the centre, and the initial pace."""
     spots = rng.uniform(-0.95 * half, 0.95 * half, (64, 2))
     if others.size > 0:
         early = others[: max(1, min(len(others), 20)) : 4]
@@ -219,6 +229,6 @@ def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Ar
 
 
 def _way_goal(xy: Array, rng: np.random.Generator, half: float) -> Array:
-    """A place near the wall across the room."""
+    """A random goal near the opposite wall."""
     angle = np.arctan2(-xy[1], -xy[0]) + rng.uniform(-0.9, 0.9)
     return rng.uniform(0.75, 0.95) * half * along(angle)

@@ -1,8 +1,9 @@
-"""Candidates of a simulated detector: errors that are correlated over time, false ones, part affinities.
+"""Candidates of a simulated detector: temporally correlated errors, false candidates, part
+affinities.
 
-A detector's errors in one frame continue in the next. The processes are stationary and run frame by frame from the
-first one; each frame has its own generator, made of the seed and the frame's number, so that skipping frames
-leaves the later ones as they are. Affinities are high inside a person, and where another's limb passes close by.
+The processes are stationary and advance frame by frame from the first one. Each frame has its own
+generator, seeded by seed and frame number, so that skipped frames do not change later ones.
+Affinities are high within a person, and where another person's limb passes close by.
 """
 
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ class NoiseProcess:
         self._state: Array | None = None
 
     def next(self, frame: int) -> Array:
-        """(7, V, P, 25) for `frame`; to be called for every frame, in order."""
+        """(7, V, P, 25) values for `frame`; must be called for every frame, in order."""
         fresh = np.random.default_rng([self._seed, frame, 0]).standard_normal(self._shape)
         fresh[:2] = fresh[:2] @ self._mix[0]
         fresh[self.CONFIDENCE] = fresh[self.CONFIDENCE] @ self._mix[1]
@@ -52,25 +53,27 @@ class NoiseProcess:
 
 @dataclass(frozen=True)
 class FalseCandidates(Rows):
-    """The false candidates of the present frame: F of them."""
+    """The F false candidates of the current frame."""
 
     view: Index
     person: Index
     """(F,) index of the person that it moves with; -1 for none."""
     anchor: Index
-    """(F,) joint to which it keeps its distance."""
+    """(F,) joint relative to which it is fixed."""
     joint: Index
-    """(F,) joint that it claims to be."""
+    """(F,) joint that it is reported as."""
     offset: Array
-    """(F, 2) from the anchor in metres, or a place as a share of the image."""
+    """(F, 2) offset from the anchor, metres, or position as a share of the image."""
     rank: Array
-    """(F,) probability of a lower confidence."""
+    """(F,) quantile of its confidence."""
     stays: Array
-    """(F,) probability to be there in the next frame."""
+    """(F,) probability of persisting to the next frame."""
 
 
 class FalseCandidateProcess:
-    """False candidates: some move with a person, some stay in place; some flicker, some last."""
+    """False candidates: some move with a person, some are static; some last one frame,
+    some longer.
+    """
 
     def __init__(
         self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int, rate: float
@@ -78,16 +81,16 @@ class FalseCandidateProcess:
         self._views, self._people, self._statistics, self._seed = views, people, statistics, seed
         near, far = statistics.false_near * people * views * rate, statistics.false_far * views * rate
         share, seconds = statistics.false_memory.T
-        # A group's share over its members.
+        # The share of a group, divided by its members.
         claims = statistics.false_joints[JOINT_GROUP] / np.bincount(JOINT_GROUP)[JOINT_GROUP]
         self._claims = claims / claims.sum()
         self._stays = np.append(np.exp(-1.0 / (fps * seconds)), 0.0)
-        # Of those that are there at any time: born as often as they go.
+        # Expected numbers present at any time; births balance deaths.
         self._present = np.append(share, max(1.0 - share.sum(), 0.0))[:, None] * np.array([near, far])
         self._present_now: FalseCandidates | None = None
 
     def next(self, frame: int) -> FalseCandidates:
-        """The false candidates of `frame`; to be called for every frame, in order."""
+        """The false candidates of `frame`; must be called for every frame, in order."""
         rng = np.random.default_rng([self._seed, frame, 1])
         if self._present_now is None:
             self._present_now = self._born(rng, self._present)
@@ -98,7 +101,7 @@ class FalseCandidateProcess:
         return self._present_now
 
     def _born(self, rng: np.random.Generator, rate: Array) -> FalseCandidates:
-        """Poisson counts of `rate` (3, 2): by duration, near people and far from them."""
+        """Draw new ones with Poisson `rate` (3, 2): by duration, near people and elsewhere."""
         kind = np.repeat(np.arange(6), rng.poisson(rate).ravel())
         stays, far = self._stays[kind // 2], kind % 2 == 1
         count = len(kind)
@@ -131,16 +134,17 @@ _LEAST_LENGTH_PX = 8.0
 
 @dataclass(frozen=True)
 class Candidates(Rows):
-    """D candidates while they are generated."""
+    """D candidates during generation."""
 
     view: Index
     joint: Index
     xy: Array
     confidence: Array
     owner: Mask
-    """(D, P) people whose joint a candidate is; none where it is false, two where two joints merged."""
+    """(D, P) people to whom a candidate belongs; none if it is false, two if two joints merged."""
     reach_px: Array
-    """(D,) distance to a better candidate of the same joint below which it is not separate, pixels."""
+    """(D,) distance to a better candidate of the same joint below which this one is suppressed,
+    pixels."""
 
 
 def affinities(
@@ -153,12 +157,12 @@ def affinities(
     wrong: float,
     rng: np.random.Generator,
 ) -> tuple[Index, Array]:
-    """Pairs (E, 2) of D candidates and their affinities (E,), those above 0.
+    """Pairs (E, 2) of D candidates with positive affinities (E,).
 
-    `true_xy` (V, P, 25, 2) are the true joints, `captors` (2, V, P, 25) the people in front of a missed joint who
-    captured it, or did not. A right pair's affinity correlates with the lower of its confidences. A wrong pair's
-    correlates with the detour: the distance of its wrong end from the right one, in limb lengths. `doubt` and
-    `wrong` are settings of `DetectorConfig`.
+    `true_xy` (V, P, 25, 2) are the true joints, `captors` (2, V, P, 25) the people in front of a
+    missed joint who captured it, or did not. The affinity of a correct pair is correlated with the
+    lower of its confidences; that of a wrong pair with the detour, the distance of its wrong end
+    from the correct one in limb lengths. `doubt` and `wrong` are settings of `DetectorConfig`.
     """
     view, joint, owner = found.view, found.joint, found.owner
     first, second, limb = _pairs(view, joint, len(true_xy))
@@ -189,7 +193,7 @@ def affinities(
 
 
 def _pairs(view: Index, joint: Index, views: int) -> tuple[Index, Index, Index]:
-    """All pairs (E,), (E,) of candidates of one view that a limb joins, and the limb (E,)."""
+    """All pairs (E,), (E,) of candidates of a view at the ends of a limb, and the limb (E,)."""
     label = view * 25 + joint
     order = np.argsort(label, kind="stable")
     count = np.bincount(label, minlength=views * 25)
@@ -204,7 +208,9 @@ def _pairs(view: Index, joint: Index, views: int) -> tuple[Index, Index, Index]:
 
 
 def _detour(found: Candidates, near: Index, far: Index, true_xy: Array) -> Array:
-    """(E,) distance of candidates `far` from that joint of the owners of `near`, in limb lengths, or inf."""
+    """(E,) distance of candidates `far` from the true joint of the owners of `near`, in limb
+    lengths; inf for none.
+    """
     if found.owner.shape[1] == 0:
         return np.full(len(near), np.inf)
     view, owner = found.view[near], found.owner[near]

@@ -1,4 +1,4 @@
-"""Choices that are independent of the processor's rounding."""
+"""Choices that do not depend on the processor's rounding."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,8 +9,8 @@ _DECIMALS = 9
 
 
 def comparable(values: ArrayLike) -> Array:
-    """Values rounded for comparisons: those that differ by a processor's rounding only become equal.
+    """Values rounded for comparisons, so that those that differ only by rounding become equal.
 
-    Periodic or symmetrical motions give many such values. Of equal ones the first is chosen.
+    Periodic or symmetric motions give many ties, of which the first is then chosen.
     """
     return np.round(np.asarray(values, dtype=np.float64), _DECIMALS)

@@ -1,8 +1,9 @@
-"""A simulated detector with realistic errors: from true joints to 2D joint candidates and part affinities.
+"""A simulated detector with realistic errors: 2D joint candidates and part affinities from true
+joints.
 
-Its distributions were measured on real detections (`detector_statistics.py`, docs/simulation.md). A joint has a
-quality that is correlated over time: at the low end it is missed, above that its quality is its confidence, and
-its error has the size that errors of this confidence have.
+Its distributions were measured on real detections (`detector_statistics.py`, docs/simulation.md). A
+joint has a temporally correlated quality: at the low end it is missed; otherwise the quality gives
+the confidence, and the error is drawn with the size measured for this confidence.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,41 +38,43 @@ from shapepose_fg.simulation.visibility import (
 
 _MIRROR = np.array(BODY_25.mirror)
 _MIRROR_APART_M = 0.12
-"""Minimum distance between left and right in the image at which they are swapped, m."""
+"""Minimum distance between left and right joint, projected, for a swap, m."""
 _LARGEST_ERROR_M = 0.25
-"""Largest error that was measured, m; beyond it there is a miss and a false candidate."""
+"""Maximum measured error, m; larger ones count as a miss and a false candidate."""
 
 _HIDDEN, _SEEN = 0.3, 0.7
 """Visible fraction below (above) which a joint counts as occluded (visible); linear in between."""
 _HALF_LOST, _WHOLLY_LOST = 1.96, 2.80
-"""Increases of the probit at which half, and four fifths, of the joints are missed of which one in 40 is missed
-otherwise."""
+"""Increases in the probit of a miss that raise the miss rate from 1 in 40 to one half, and to four
+fifths."""
 _NEAR_M = 0.5
 """Distance from a person's joint within which false candidates were counted as that person's, m."""
 
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """Size of the detector's errors: 1 is as measured, 0 none, 2 twice as much."""
+    """Levels of the detector's errors: 1 as measured, 0 none, 2 double."""
 
     noise: float = 1.0
-    """Size of the errors of position."""
+    """Level of position errors."""
     misses: float = 1.0
-    """Share of the joints that are not reported, up to all of them."""
+    """Level of the share of missed joints."""
     doubt: float = 1.0
-    """Deviation of confidences, and of affinities of right pairs, from 1."""
+    """Level of the deviation from 1 of confidences, and of affinities of correct pairs."""
     false_candidates: float = 1.0
-    """Number of false candidates."""
+    """Level of the number of false candidates."""
     swaps: float = 1.0
-    """Share of the joints that get the name of their mirror."""
+    """Level of the share of left-right swapped joints."""
     captures: float = 1.0
-    """Share of the missed joints behind another person whose neighbours are joined to that person's joint."""
+    """Level of the share of missed, occluded joints whose neighbours are linked to the occluding
+    person's joint."""
     merging: float = 1.0
-    """Distance at which two people's same joints become one candidate."""
+    """Level of the distance at which the same joint of two people becomes one candidate."""
     wrong_affinities: float = 1.0
-    """Share of the wrong pairs that get an affinity."""
+    """Level of the share of wrong pairs with an affinity."""
     offsets: KeypointOffsets | None = None
-    """Offsets of its joints from those of the body: every detector has its own skeleton. None: no offsets."""
+    """Offsets of its joints from those of the body, as detectors differ in their skeletons. None:
+    no offsets."""
     statistics: DetectorStatistics = field(default_factory=measured, repr=False)
     """The measured distributions."""
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
@@ -87,13 +90,13 @@ class DetectorConfig:
 
     @classmethod
     def perfect(cls) -> "DetectorConfig":
-        """A detector that reports every joint in the image at its true place, with confidence 1, and nothing
-        else.
+        """A detector that reports every joint in the image at its true position, with confidence 1,
+        and nothing else.
         """
         return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def as_dict(self) -> dict[str, Any]:
-        """The settings as plain values, for the record of a run; the statistics are named by their provenance."""
+        """The settings as plain values, for run.json; the statistics by their provenance."""
         knobs = {name: getattr(self, name) for name in _KNOBS}
         knobs |= {"offsets": None if self.offsets is None else self.offsets.as_dict()}
         return knobs | {"statistics": self.statistics.provenance, "visibility": asdict(self.visibility)}
@@ -111,13 +114,14 @@ def simulate(
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Recording:
-    """Detect everybody in `scene`; the same seed gives the same bytes.
+    """Detect all people in `scene`; equal seeds give equal bytes.
 
-    `frames` picks rising frame numbers, all by default. Errors are correlated over time, so that the detector also
-    runs through the frames before and between them, without visibility: every frame is the same as in the whole
-    recording. After a cut the errors start again, in their stationary distribution. `workers` processes compute
-    visibility, which is most of the work (1: this process); they change no byte. `progress` is called with the
-    number of finished frames, and of all.
+    `frames` selects ascending frame numbers, by default all. As errors are temporally correlated,
+    the detector also runs through skipped frames, without visibility, so that every frame is the
+    same as in the whole recording. After a cut the errors are redrawn from their stationary
+    distribution. `workers` processes compute visibility, which is most of the work (1: this
+    process), without changing the result. `progress` is called with the number of finished frames,
+    and of all.
     """
     config = DetectorConfig() if config is None else config
     scene = scene if config.offsets is None else scene.with_keypoint_offsets(config.offsets)
@@ -145,14 +149,16 @@ class Detector:
     """A detector for one recording, frame after frame; its errors are correlated over time."""
 
     def __init__(self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0) -> None:
-        """Detect `people` people with the cameras of `rig`, `fps` frames a second."""
+        """A detector for `people` people seen by the cameras of `rig` at `fps` frames
+        per second.
+        """
         self._rig, self._config, self._table, self._seed = rig, config, config.statistics, seed
         given = (len(rig), people, fps, config.statistics, seed)
         self._noise, self._false = NoiseProcess(*given), FalseCandidateProcess(*given, config.false_candidates)
         self._frame = 0
 
     def skip_to(self, frame: int) -> None:
-        """Advance the errors until `frame` is the next one; ValueError if it has passed."""
+        """Advance the errors until `frame` is next; raises ValueError if it has passed."""
         if frame < self._frame:
             raise ValueError(
                 f"frames must be requested in order: frame {frame} was requested, but {self._frame} is next"
@@ -192,7 +198,7 @@ class Detector:
         noise: Array,
         rng: np.random.Generator,
     ) -> tuple[Candidates, Mask]:
-        """The reported joints of people, each with its error; and their mask (V, P, 25)."""
+        """The reported joints of people with their errors, and their mask (V, P, 25)."""
         table, config, sizes = self._table, self._config, self._rig.image_sizes
         seen = seen_from_the_front(visibility.seen, joints, self._rig.centres, table.facing)
         seen = np.clip((seen - _HIDDEN) / (_SEEN - _HIDDEN), 0.0, 1.0)
@@ -225,7 +231,7 @@ class Detector:
             owner=owner,
             reach_px=self._reach_px(ndtr(noise[NoiseProcess.SCALE, reported]), sizes[view, 1]),
         )
-        in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # of which the share of duplicates was measured
+        in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # the measured share refers to visible joints
         found = Candidates.concatenate([found, self._duplicates(found, in_sight, px_a_metre, rng)])
         inside = np.all((found.xy >= 0) & (found.xy <= sizes[found.view] - 1), axis=1)
         return found.rows(inside), reported
@@ -233,7 +239,7 @@ class Detector:
     def _duplicates(
         self, found: Candidates, swap_rank: Array, px_a_metre: Array, rng: np.random.Generator
     ) -> Candidates:
-        """False candidates under the mirror's name of joints that are found under their own."""
+        """False duplicates of detected joints, reported as the mirrored joint."""
         table, swaps = self._table, self._config.swaps
         low, high = swaps * table.swap, swaps * (table.swap + table.double)
         those = (swap_rank >= low) & (swap_rank < high)
@@ -250,8 +256,10 @@ class Detector:
         )
 
     def _worse(self, visibility: Visibility, seen: Array, noise: Array) -> Array:
-        """Increase (V, P, 25) of the probit of a miss for people who are buried behind others, or lost."""
-        # What its own body hides is no worse off when others hide the rest.
+        """Increase (V, P, 25) of the probit of a miss for people who are largely
+        occluded, or lost.
+        """
+        # Self-occluded joints are not affected by other people's occlusions.
         table, behind = self._table, visibility.hidden_by >= 0
         share = (behind & (visibility.seen < 0.5)).mean(axis=-1, keepdims=True)
         buried = np.interp(share, table.buried_share, table.buried) * np.where(behind, 1.0, seen)
@@ -264,12 +272,13 @@ class Detector:
     def _sigma_px(
         self, confidence: Array, seen: Array, hidden_as: Index, px_a_metre: Array, scale: Array
     ) -> Array:
-        """Standard deviations (D,) of the errors of reported joints, px; `scale` (D,), normal, makes the tails
-        heavier.
+        """Standard deviations (D,) of the errors of reported joints, px; `scale` (D,), normal,
+        gives heavier tails.
         """
         table = self._table
         floor_m = table.floor_px / table.size_px_a_metre
-        # What the grid adds is part of the measured sigma; people of other sizes get it anew.
+        # The measured sigma includes the grid's contribution, which is replaced for people of other
+        # sizes.
         own_m = np.sqrt(np.maximum(table.sigma_m**2 - floor_m**2, (0.3 * table.sigma_m) ** 2))
         log_sigma, tail = (
             np.stack([np.interp(confidence, table.knots, row) for row in rows])
@@ -282,7 +291,9 @@ class Detector:
     def _captors(
         self, reported: Mask, true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
     ) -> Index:
-        """(2, V, P, 25) people in front of a missed joint who captured it (`affinities`), or did not; -1: none."""
+        """(2, V, P, 25) person in front of a missed joint who captured it (`affinities`), or did
+        not; -1 for none.
+        """
         table = self._table
         view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
         front = visibility.hidden_by[view, person, joint]
@@ -296,15 +307,15 @@ class Detector:
         return captors
 
     def _invented(self, false: FalseCandidates, true_xy: Array, depth: Array) -> Candidates:
-        """The false candidates of this frame, at their present positions."""
+        """The false candidates of this frame at their current positions."""
         table, focal_px = self._table, self._rig.focal_px
         near = false.person >= 0
         size = self._rig.image_sizes[false.view]
         xy = false.offset * (size - 1)
         at = false.view[near], false.person[near], false.anchor[near]
         xy[near] = true_xy[at] + false.offset[near] * (focal_px[at[0]] / depth[at])[:, None]
-        there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # NaN behind a camera compares false
-        # The others stay in the background: a person before it covers them.
+        there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # false for NaN behind a camera
+        # Static ones are in the background: people in front of them occlude them.
         gap_px = np.linalg.norm(true_xy[false.view] - xy[:, None, None], axis=-1)
         gap_m = (gap_px * depth[false.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
         there &= near | (gap_m > _NEAR_M * focal_px[false.view])
@@ -320,8 +331,8 @@ class Detector:
         return found.rows(there)
 
     def _reach_px(self, probability: Array, height_px: Array) -> Array:
-        """Distance (D,) to a better candidate of the joint within which one is lost: logistic, relative to the
-        image's size.
+        """Distance (D,), px, to a better candidate within which one is suppressed: logistic,
+        relative to the image's size.
         """
         table, drawn = self._table, np.clip(probability, 1e-6, 1 - 1e-6)
         reach = table.merge_px + table.merge_width_px * np.log(drawn / (1 - drawn))
@@ -329,14 +340,17 @@ class Detector:
 
 
 def _merge(found: Candidates) -> Candidates:
-    """Keep of near candidates of one joint and view the most confident, which then belongs to all of them."""
+    """Keep the most confident of near candidates of a joint and view; it then belongs to the owners
+    of all.
+    """
     if len(found.view) == 0 or found.reach_px.max() <= 0:
         return found
     label = found.view * len(BODY_25) + found.joint
     order = np.lexsort((-found.confidence, label))
     found, label = found.rows(order), label[order]
     winner = np.full(len(label), -1)
-    # Candidates of one label stand together, the best first: compare each with those one place before, two, ...
+    # Candidates of a label are adjacent, best first: compare each with the one before it, two
+    # before it, ...
     for step in range(1, int(np.bincount(label).max())):
         better, worse = np.arange(len(label) - step), np.arange(step, len(label))
         near = np.linalg.norm(found.xy[better] - found.xy[worse], axis=1) < found.reach_px[worse]
@@ -344,7 +358,7 @@ def _merge(found: Candidates) -> Candidates:
         winner[worse[near]] = better[near]
     lost = winner >= 0
     owner = found.owner.copy()
-    for index in np.flatnonzero(lost)[::-1]:  # few; the worst first, so that theirs is handed up
+    for index in np.flatnonzero(lost)[::-1]:  # few; worst first, so that owners propagate
         owner[winner[index]] |= owner[index]
     return replace(found, owner=owner).rows(~lost)
 

@@ -1,6 +1,7 @@
-"""Errors of a real detector, as tables measured on the Shelf recording (docs/simulation.md).
+"""Error statistics of a real detector, as tables measured on the Shelf recording
+(docs/simulation.md).
 
-The code that measures is `simulation/measurement` of commit 77ab725.
+The measurement code is `simulation/measurement` of commit 77ab725.
 """
 
 from dataclasses import dataclass
@@ -32,16 +33,17 @@ class DetectorStatistics:
     levels: Array
     """(K,) probabilities at which quantiles are given, 0 to 1."""
     miss: Array
-    """(G, 3) share of the joints that are not reported, of people who stand free and are not lost."""
+    """(G, 3) share of missed joints, for people neither occluded nor lost."""
     buried_share: Array
-    """(B,) shares of a person's joints in a view that other people hide."""
+    """(B,) shares of a person's joints in a view that are occluded by other people."""
     buried: Array
-    """(B,) increase of a miss's, and decrease of a confidence's, standard normal (probit) at these shares."""
+    """(B,) increase of the probit of a miss, and decrease of that of the confidence, at these
+    shares."""
     lost: Array
-    """(2,) share of the people in a view half, or four fifths, of whose joints are missed though nobody hides
-    them."""
+    """(2,) share of people in a view with half, or four fifths, of the joints missed without
+    occlusion."""
     lost_memory: Array
-    """(2, 2) share and time constant in seconds of a fast and a slow part of such losses."""
+    """(2, 2) share and time constant, s, of a fast and a slow component of such losses."""
     lost_correlation: Array
     """(25, 25) correlation of losses between a person's joints."""
     confidence: Array
@@ -51,7 +53,7 @@ class DetectorStatistics:
     sigma_m: Array
     """(3, N) sigma of each image coordinate, as a length on a person of median size, from the error's median."""
     tail: Array
-    """(3, N) standard deviation of the logarithm of a sigma that changes: it makes tails heavier than Gaussian."""
+    """(3, N) standard deviation of log-sigma, which makes the tails heavier than Gaussian."""
     joint_scale: Array
     """(G, 2) factors on sigma along x and y of the image."""
     floor_px: float
@@ -70,43 +72,44 @@ class DetectorStatistics:
     confidence_correlation: Array
     """(25, 25) correlation between the confidences of a person's joints in one view."""
     swap: float
-    """Share of the joints apart from their mirror that are reported as the mirror."""
+    """Share of joints, distant from their mirrored joint, that are reported as the mirrored one."""
     double: float
     """Share of these joints that are reported under both names."""
     double_m: float
     """Standard deviation of each coordinate of the distance between the two, m."""
     double_confidence: Array
-    """(K,) quantiles of the confidence of the one with the wrong name."""
+    """(K,) quantiles of the confidence of the wrongly named one."""
     capture_gap_m: Array
-    """(B,) distances from a hidden joint to the same joint of the person who hides it, m."""
+    """(B,) distances from an occluded joint to the same joint of the occluding person, m."""
     capture: Array
-    """(B,) share of the missed joints that are found there."""
+    """(B,) share of the missed joints that are captured there."""
     merge_px: float
-    """Distance at which two people's same joints are found as one in half the cases, at `merge_height_px`."""
+    """Distance, px at `merge_height_px`, at which the same joint of two people is merged in half
+    the cases."""
     merge_width_px: float
     """Width of that transition, pixels."""
     merge_height_px: float
-    """Height of the images in which that was measured, pixels."""
+    """Image height of that measurement, pixels."""
     false_near: float
-    """Number of false candidates near a person, per person and view, without duplicates of joints."""
+    """Number of false candidates near each person per view, without duplicates of joints."""
     false_far: float
     """Number of false candidates elsewhere, per view."""
     false_near_m: Array
-    """(K,) quantiles of the distance of those near a person to the next joint, m."""
+    """(K,) quantiles of the distance of those near a person from the nearest joint, m."""
     false_joints: Array
-    """(G,) share of the false candidates that claim to be each joint."""
+    """(G,) share of the false candidates reported as each joint."""
     false_near_confidence: Array
     """(K,) quantiles of the confidence of false candidates near a person."""
     false_far_confidence: Array
     """(K,) quantiles of the confidence of false candidates elsewhere."""
     false_memory: Array
-    """(2, 2) share and time constant in seconds of a short and a long duration of false candidates."""
+    """(2, 2) share and time constant, s, of short-lived and long-lived false candidates."""
     affinity_right: Array
-    """(14, K) quantiles of the affinity of right pairs, by limb."""
+    """(14, K) quantiles of the affinity of correct pairs, by limb."""
     affinity_right_confidence: Array
-    """(14, K) quantiles of the lower of their confidences."""
+    """(14, K) quantiles of the lower confidence of correct pairs."""
     affinity_correlation: float
-    """Correlation of the ranks of affinity and lower confidence of right pairs."""
+    """Rank correlation of affinity and lower confidence of correct pairs."""
     detours: Array
     """(B,) lower edges of classes of wrong pairs: distance of the wrong end, in limb lengths."""
     affinity_wrong_share: Array
@@ -122,7 +125,7 @@ class DetectorStatistics:
 
     @classmethod
     def read(cls, path: Path) -> "DetectorStatistics":
-        """Read a file like the shipped one, with an entry for each field."""
+        """Read a file in the format of the package's, with an entry for each field."""
         content = read_json(path)
         tables: dict[str, Any] = {name: content[name] for name in cls.__dataclass_fields__}
         for name, table in tables.items():
@@ -140,7 +143,7 @@ class DetectorStatistics:
         return first + (second - first) * part
 
     def probability(self, table: Array, value: Array) -> Array:
-        """The inverse of `quantile`: the probability of less than `value` (...,), tables (..., K)."""
+        """Inverse of `quantile`: probability of values below `value` (...,), tables (..., K)."""
         at = np.clip((value[..., None] >= table).sum(axis=-1) - 1, 0, len(self.levels) - 2)
         low = np.take_along_axis(table, at[..., None], axis=-1)[..., 0]
         high = np.take_along_axis(table, at[..., None] + 1, axis=-1)[..., 0]
@@ -150,5 +153,5 @@ class DetectorStatistics:
 
 @cache
 def measured() -> DetectorStatistics:
-    """The shipped file, read once."""
+    """The statistics of the package, read once."""
     return DetectorStatistics.read(_FILE)

@@ -1,4 +1,6 @@
-"""Scenes by name, their truth as a result, and simulated recordings as files for this program and any other."""
+"""Scenes by name, their ground truth as a result, and simulated recordings as files in common
+formats.
+"""
 
 import os
 from pathlib import Path
@@ -21,10 +23,10 @@ Format = Literal["association", "openpose"]
 """Formats of simulated detections."""
 
 NAMES = ("demo", *SEQUENCES)
-"""The built-in scene, and the interaction sequences that are made of recorded motions."""
+"""Names of scenes: the built-in one, and the interaction sequences from recorded motions."""
 
 _OPENPOSE = "openpose"
-"""The folder of OpenPose's folders."""
+"""Folder of the detections in OpenPose's format."""
 _MOCAP = Path("data") / "cmu_mocap" / "cmu_smpl24.npz"
 """Path of the recorded motions inside the folder of real recordings."""
 
@@ -41,11 +43,12 @@ def named_scene(
     config: SequenceConfig | None = None,
     fps: float | None = None,
 ) -> Scene:
-    """The scene called `name`; InputError, one sentence, where an option is wrong or the motions are missing.
+    """The scene called `name`. Raises InputError if an option is wrong or the motions are missing.
 
-    `people` and `seed` are for the built-in scene, which has 60 frames, or `frames` if that is more. A sequence is
-    defined by its name, or by `config`; where only its first `frames` are wanted (0: all) the later segments are
-    not made. `fps` are frames a second, by default 25 of the built-in scene and 30 of a sequence.
+    `people` and `seed` apply to the built-in scene, which has 60 frames, or `frames` if that is
+    more. A sequence is defined by its name, or by `config`; `frames` limits it to its first frames
+    (0: all), without generating later segments. `fps` is the frame rate, by default 25 Hz for the
+    built-in scene and 30 Hz for a sequence.
     """
     if name not in NAMES:
         raise InputError(f"{name}: must be one of {' '.join(NAMES)}")
@@ -69,10 +72,10 @@ def named_scene(
 
 
 def truth_of(scene: Scene) -> Reconstruction:
-    """Everybody in every frame of `scene`, row by row as `person` 0 to P - 1, frame 0 first.
+    """Ground truth of all people in all frames of `scene`; `person` 0 to P - 1, sorted by frame.
 
-    Joints and bodies are exact: covariances are zero and confidences one. Velocities and how joints are known are
-    missing, because visibility is unknown.
+    Joints and bodies are exact: covariances are zero and confidences one. Velocities, and how
+    joints are known, are missing, because the scene has no visibility.
     """
     T, P = scene.motion.transl.shape[:2]
     N = T * P
@@ -93,7 +96,7 @@ def truth_of(scene: Scene) -> Reconstruction:
 
 
 def check_output(scene: Scene, folder: Path, format: Format) -> None:
-    """InputError where `write_simulated` could not write into `folder`: before the work, not after."""
+    """Raise InputError, before any work, if `write_simulated` could not write into `folder`."""
     if format == "openpose":
         refuse_leftovers(scene.rig, folder / _OPENPOSE)
 
@@ -101,12 +104,12 @@ def check_output(scene: Scene, folder: Path, format: Format) -> None:
 def write_simulated(
     scene: Scene, detections: DetectionSequence, folder: Path, format: Format, **run: Any
 ) -> dict[str, Path]:
-    """Write cameras, detections and truth of a simulated recording into `folder`; returns a description of the
-    files.
+    """Write cameras, detections and ground truth of a simulated recording into `folder`; returns
+    the paths by content.
 
-    `rig.json`; `calibration.json` and `detection/<camera>.txt`, or `openpose/<camera>/`; and `truth/people.npz`,
-    in a folder of its own so that a reconstruction that is saved into the same folder does not replace it. `run`
-    goes into `truth/run.json`, with the frame rate and the cuts: first frames of what follows one.
+    `rig.json`; `calibration.json` and `detection/<camera>.txt`, or `openpose/<camera>/`; and
+    `truth/people.npz`, in a separate folder so that a reconstruction saved to `folder` does not
+    replace it. `truth/run.json` has `run`, the frame rate, and the cuts: first frames after each.
     """
     write_rig(scene.rig, folder / "rig.json")
     if format == "association":
@@ -122,7 +125,9 @@ def write_simulated(
 
 
 def _motions(path: Path | None) -> Path:
-    """The file of recorded motions, if it is where it is said or usually is."""
+    """The file of recorded motions: `path`, or its usual location. Raises InputError if it is
+    missing.
+    """
     if path is not None:
         return path
     path = Path(os.environ.get("SHAPEPOSE_DATA", Path("..") / "shared")) / _MOCAP

@@ -1,7 +1,7 @@
-"""Converts puppets to poses: from positions of pelvis, hands and feet to SMPL's joint rotations.
+"""Inverse kinematics of puppets: SMPL's joint rotations from pelvis, hands and feet.
 
-A `Puppet` has the ends of the body's limbs; legs and arms are two-bone chains and are solved in closed form. All
-of it is batched over frames, for one person at a time.
+Legs and arms of a `Puppet` are two-bone chains, solved in closed form. All is batched over frames,
+for one person at a time.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
 _KNEE_HINGE = np.array([1.0, 0.0, 0.0])
 _ELBOW_HINGE = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
 _REACH = 0.995
-"""Largest extension of a limb, as a share of its length: its bend keeps the side on which the joint lies."""
+"""Maximum extension of a limb, as a share of its length; keeps the direction of its
+bend defined."""
 
 
 @dataclass(frozen=True)
@@ -32,22 +33,22 @@ class Puppet:
     heading: Array
     """(T,) heading of the pelvis, from the x axis towards the y axis."""
     lean: Array
-    """(T, 3) angles of the trunk, summed over its three joints: forward, twist to the left, towards the right,
-    rad."""
+    """(T, 3) angles of the trunk, summed over its three joints: forward, twist to the left, to the
+    right, rad."""
     ankles: Array
     """(T, 2, 3) ankle joints, left and right."""
     foot_heading: Array
     """(T, 2) headings of the feet."""
     foot_pitch: Array
-    """(T, 2) pitch of the feet: heel above toes."""
+    """(T, 2) pitch of the feet, rad; positive with the heel above the toes."""
     wrists: Array
-    """(T, 2, 3) wrist joints, left and right, where `reach` is 1."""
+    """(T, 2, 3) wrist joints, left and right, used where `reach` is 1."""
     reach: Array
     """(T, 2) 1 where the wrist follows `wrists`, 0 where the arm swings freely."""
     swing: Array
     """(T, 2) distance of a free hand in front of its resting place, metres."""
     gaze: Array
-    """(T, 3) point that the head turns to."""
+    """(T, 3) point that the head faces."""
 
 
 def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
@@ -88,7 +89,8 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         above = target[:, 2] - position[:, shoulder, 2]
         grow(collar, turned_about("z", sign * 0.35 * np.clip(above / 0.4, 0.0, 1.0)))
         grow(shoulder)
-        # Elbows point backward under hanging arms and outward under raised ones: never along the arm.
+        # Elbows point backwards under hanging arms and outwards under raised ones: never along the
+        # arm.
         raised = np.clip((above + 0.35) / 0.5, 0.0, 1.0)[:, None]
         pole = (1 - raised) * (0.4 * sign, -0.5, -1.0) + raised * (sign, -0.6, -0.3)
         pole = np.einsum("tij,tj->ti", turned[:, SPINE[2]], pole)
@@ -102,7 +104,7 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
 
 
 def _facing(heading: Array) -> Array:
-    """World from body (T, 3, 3) of a body (y up, facing +z) that stands upright in a world with z up."""
+    """World from body (T, 3, 3) for an upright body (y up, facing +z) in a world with z up."""
     return turned_about("z", heading + np.pi / 2) @ turned_about("x", np.full(1, np.pi / 2))
 
 
@@ -112,7 +114,7 @@ def turned_about(axis: str, angle: Array) -> Array:
 
 
 def _turn_head(turned: Array, position: Array, gaze: Array) -> None:
-    """Turn neck and head, half each, towards `gaze` (T, 3), as far as a neck goes."""
+    """Rotate neck and head, half each, towards `gaze` (T, 3), within the range of a neck."""
     chest = turned[:, SPINE[2]]
     sight = np.einsum("tji,tj->ti", chest, gaze - position[:, HEAD])
     yaw = np.clip(np.arctan2(sight[:, 0], sight[:, 2]), -1.0, 1.0)
@@ -123,14 +125,16 @@ def _turn_head(turned: Array, position: Array, gaze: Array) -> None:
 
 
 def _hand_target(puppet: Puppet, turned: Array, position: Array, bones: Array, side: int) -> Array:
-    """Target of a wrist (T, 3): its own, or hanging beside the hip and swinging, or between the two."""
+    """Target of a wrist (T, 3): a blend of its own target and the position of a hanging, swinging
+    arm.
+    """
     shoulder, elbow, wrist = ARMS[side][1:]
     length = np.linalg.norm(bones[elbow]) + np.linalg.norm(bones[wrist])
     sign = (1.0, -1.0)[side]
     swing = puppet.swing[:, side]
     out, front = np.full_like(swing, 0.16 * sign), 0.04 + swing
     down = -np.sqrt(np.maximum((0.965 * length) ** 2 - out**2 - front**2, (0.5 * length) ** 2))
-    upright = _facing(puppet.heading)  # arms hang by gravity, whatever the trunk does
+    upright = _facing(puppet.heading)  # arms hang vertically
     twist = _facing(puppet.heading + puppet.lean[:, 1] * 0.5)
     hanging = np.einsum("tij,tj->ti", twist, np.stack([out, np.zeros_like(out), front], axis=1))
     hanging += upright[:, :, 1] * down[:, None] + position[:, shoulder]
@@ -147,10 +151,11 @@ def _two_bones(
     pole: Array,
     hinge: Array,
 ) -> None:
-    """Turn the first two joints of `chain` so that the third reaches `target` (T, 3), as far as it can.
+    """Rotate the first two joints of `chain` so that the third reaches `target` (T, 3), as far as
+    possible.
 
-    The middle joint goes to the side of `pole` (T, 3), and bends about `hinge` (3,), an axis of the
-    T-pose about which a positive angle bends the limb.
+    The middle joint bends towards `pole` (T, 3), about `hinge` (3,), an axis in the T-pose about
+    which a positive angle bends the limb.
     """
     first, middle, last = chain
     upper, lower = np.linalg.norm(bones[middle]), np.linalg.norm(bones[last])

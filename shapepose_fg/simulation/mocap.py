@@ -1,9 +1,10 @@
-"""Recorded motions in SMPL's pose structure: one .npz of clips, read whole and checked.
+"""Recorded motions in SMPL's pose structure: one .npz of clips, read and validated.
 
-Arrays of the file, for N frames, S clips, K pairs: `poses` (N, 24, 3) local axis-angle rotations relative to
-SMPL's T-pose, y up, row 0 the global orientation; `trans` (N, 3) the pelvis' place (not SMPL's `transl`);
-`seq_start`, `seq_len`, `fps`, `names`, `subject`, `action`, `tier`, `wrist_valid`, `toe_valid`, `leg_m`,
-`floor_y` (S,); `pairs` (K, 2) clips of two people together; `parents` (24,).
+Arrays of the file, for N frames, S clips, K pairs: `poses` (N, 24, 3) local axis-angle rotations
+relative to SMPL's T-pose, y up, row 0 the global orientation; `trans` (N, 3) the pelvis' position
+(not SMPL's `transl`); `seq_start`, `seq_len`, `fps`, `names`, `subject`, `action`, `tier`,
+`wrist_valid`, `toe_valid`, `leg_m`, `floor_y` (S,); `pairs` (K, 2) clips of two people together;
+`parents` (24,).
 """
 
 from collections.abc import Iterator
@@ -24,52 +25,54 @@ _OF_CLIP = "seq_start seq_len fps names subject action tier wrist_valid toe_vali
 _ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
 _ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
 _GLITCH_RAD_S = np.radians(900.0)
-"""Angular speed above which a marker has jumped, rad/s: no joint of a walker or dancer turns faster."""
+"""Angular speed, rad/s, above which a marker has jumped; joints of walkers and dancers
+are slower."""
 
 COLLARS, SHOULDERS, *_ = zip(*ARMS, strict=True)
-"""Left and right in SMPL's order."""
+"""Left and right collar, and shoulder, as indices of SMPL's joints."""
 _SETTING = np.radians(30.0)
-"""Elevation of the arm up to which only the glenohumeral joint turns (Inman, Saunders and Abbott 1944)."""
+"""Elevation of the arm, rad, below which only the glenohumeral joint moves (Inman, Saunders and
+Abbott 1944)."""
 _RISE = 0.2
-"""Elevation of the clavicle for each radian of the arm's beyond `_SETTING`: 30 degrees with the arm overhead.
-
-Overhead, a third of the arm's elevation is the shoulder blade's (1:2), and half of that the clavicle's; the other
-half, at the outer end of the clavicle, hardly moves the shoulder's centre, and SMPL's tree has no joint for it.
-"""
+"""Elevation of the clavicle per elevation of the arm beyond `_SETTING`: 30 degrees with the arm
+overhead. There, a third of the arm's elevation is due to the scapula (1:2), and half of that to the
+clavicle; the other half, at the outer end of the clavicle, hardly moves the shoulder's centre, and
+SMPL's tree has no joint for it."""
 _REST = np.radians(60.0)
-"""Elevation of the arm at which the collar is as in the T-pose: body files' T-poses are made by turning the
-arms of a body that stands with arms half raised, and its collars stay."""
+"""Elevation of the arm, rad, at which the collar is as in the T-pose: T-poses of body files are
+made from bodies with half raised arms by rotating the arms only."""
 _SWEEP = 0.22
-"""Rotation of the collar, rad, forward when the raised arm points forward, and back when it points back."""
+"""Rotation of the collar, rad, forwards if the raised arm points forwards, and backwards if it
+points back."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Consecutive frames of one recorded person."""
+    """Consecutive frames of a recorded person."""
 
     name: str
     """Subject, trial and segment, as "60_01#0"."""
     subject: str
     """Identifier of the recorded person."""
     action: str
-    """Action, in words."""
+    """Action in words."""
     rotations: Array
     """(T, 24, 3, 3) local rotations in SMPL's structure, y up."""
     pelvis: Array
-    """(T, 3) place of the pelvis, y up, metres."""
+    """(T, 3) position of the pelvis, y up, metres."""
     fps: float
-    """Frames a second."""
+    """Frame rate, Hz."""
     leg_m: float
-    """Length of the recorded leg."""
+    """Length of the recorded leg, m."""
     floor_y: float
-    """Height of the floor."""
+    """Height of the floor, m."""
     wrist_valid: bool
     """Whether the wrists were recorded."""
     toe_valid: bool
     """Whether the toes were recorded."""
 
     def __len__(self) -> int:
-        """Count of frames, T."""
+        """Number of frames, T."""
         return len(self.pelvis)
 
     def between(self, start: int, stop: int) -> "Clip":
@@ -77,7 +80,7 @@ class Clip:
         return replace(self, rotations=self.rotations[start:stop], pelvis=self.pelvis[start:stop])
 
     def resampled(self, fps: float) -> "Clip":
-        """Return the motion at another rate: rotations by slerp, places linearly."""
+        """Return the motion at another frame rate: rotations by slerp, positions linearly."""
         if fps == self.fps or len(self) < 2:
             return replace(self, fps=fps)
         time = np.arange(int(np.floor((len(self) - 1) * fps / self.fps + 1e-9)) + 1) * self.fps / fps
@@ -90,7 +93,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Mocap:
-    """A file of recorded motions; clips are read when asked for."""
+    """A file of recorded motions; clips are extracted on demand."""
 
     names: tuple[str, ...]
     """(S,) names of the clips."""
@@ -101,19 +104,19 @@ class Mocap:
     lengths: NDArray[np.int64]
     """(S,) numbers of frames."""
     tiers: NDArray[np.int64]
-    """(S,) closeness to the recording: 0 its own skeleton, 1 and 2 retargeted."""
+    """(S,) processing of the clip: 0 with its own skeleton, 1 and 2 retargeted."""
     pairs: tuple[tuple[int, int], ...]
-    """Clips of two people together: same frames, common origin."""
+    """Clips of two people together, with the same frames and a common origin."""
     arrays: dict[str, NDArray]
     """The arrays of the file."""
 
     def __len__(self) -> int:
-        """Count of clips, S."""
+        """Number of clips, S."""
         return len(self.names)
 
     @classmethod
     def load(cls, path: str | Path) -> "Mocap":
-        """The recordings in `path` (.npz); InputError where it cannot be used."""
+        """Read the recordings in `path` (.npz); raises InputError if it is unusable."""
         arrays = read_npz(Path(path), _ARRAYS, "copy the recorded motions again")
         for problem in _problems(arrays):
             raise InputError(f"{path}: {problem}")
@@ -123,7 +126,7 @@ class Mocap:
         return cls(names, subjects, actions, lengths, tiers, pairs, arrays)
 
     def clip(self, index: int) -> Clip:
-        """Clip `index`, glitches of single markers bridged."""
+        """Clip `index`, with glitches of single markers interpolated."""
         own = {name: self.arrays[name][index].item() for name in _OF_CLIP}
         frames = slice(int(own["seq_start"]), int(own["seq_start"]) + int(self.lengths[index]))
         vectors, fps = self.arrays["poses"][frames].astype(np.float64), float(own["fps"])
@@ -135,14 +138,14 @@ class Mocap:
 
 
 def blend(first: Array, second: Array, share: Array) -> Array:
-    """Rotations (T, J, 3, 3) on the way from `first` to `second`, `share` (T,) of it: slerp."""
+    """Interpolate rotations (T, J, 3, 3) from `first` to `second` by `share` (T,): slerp."""
     step = Rotation.from_matrix((np.swapaxes(first, -1, -2) @ second).reshape(-1, 3, 3)).as_rotvec()
     step = step.reshape(*first.shape[:2], 3) * share[:, None, None]
     return first @ Rotation.from_rotvec(step.reshape(-1, 3)).as_matrix().reshape(first.shape)
 
 
 def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]:
-    """Bridge the frames around a joint that jumps from one frame to the next, all joints together."""
+    """Interpolate all joints over frames in which any joint jumps."""
     if len(pelvis) < 3:
         return rotations, pelvis
     trace = np.einsum("tjab,tjab->tj", rotations[:-1], rotations[1:])  # of R^T R': 1 + 2 cos
@@ -166,7 +169,7 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
 
 
 def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
-    """Problems of the file, with cures."""
+    """Problems of the file with cures."""
     missing = [name for name in _ARRAYS if name not in arrays]
     if missing:
         yield f"array {missing[0]!r} is missing; give motions in SMPL's structure"
@@ -191,11 +194,12 @@ def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
 
 
 def shoulder_rhythm(rotations: Array) -> Array:
-    """Local rotations (T, 24, 3, 3) with collars that follow the arms; collars that came with them are dropped.
+    """Local rotations (T, 24, 3, 3) with collars computed from the arms, replacing the given
+    collars.
 
-    The collar rises and sweeps with the upper arm's direction in the chest's frame (scapulohumeral rhythm);
-    the shoulder turns back by as much, so the upper arm's rotation in the chest's frame, and with it in the
-    world, is exactly what it was.
+    The collar rises and sweeps with the upper arm's direction in the chest's frame (scapulohumeral
+    rhythm); the shoulder is rotated back by as much, so that the upper arm's rotation in the world
+    is unchanged.
     """
     adapted = rotations.copy()
     for side, (collar, shoulder) in enumerate(zip(COLLARS, SHOULDERS, strict=True)):
@@ -209,7 +213,9 @@ def shoulder_rhythm(rotations: Array) -> Array:
 
 
 def _collar(along: Array, sign: float) -> Array:
-    """Rotation (T, 3, 3) of the collar when the upper arm points `along` (T, 3) in the chest's frame."""
+    """Rotation (T, 3, 3) of the collar for upper arms in directions `along` (T, 3) in the chest's
+    frame.
+    """
     elevation = np.arccos(np.clip(-along[:, 1], -1.0, 1.0))  # 0 hanging, pi overhead
     rise = _RISE * (_ramp(elevation - _SETTING) - _ramp(np.array([_REST - _SETTING])))
     raised = np.sin(np.clip(elevation, 0.0, np.pi / 2)) ** 2
@@ -218,5 +224,7 @@ def _collar(along: Array, sign: float) -> Array:
 
 
 def _ramp(angle: Array) -> Array:
-    """0 below 0 and `angle` above it, rounded over a tenth of a radian: the collar does not start with a jerk."""
+    """Smooth ramp: 0 below 0 and `angle` above, rounded over 0.1 rad, so that the collar starts
+    gently.
+    """
     return 0.05 * np.logaddexp(0.0, angle / 0.05)

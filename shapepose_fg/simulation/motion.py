@@ -1,7 +1,8 @@
-"""Synthetic motions of people who dance, walk and stand close to each other, from footsteps and reaching hands.
+"""Synthetic motions of people who dance, walk and stand close together, from footsteps and hand
+targets.
 
-No recorded motion is needed: each role defines pelvis, hands and gaze (a `Puppet`), and `limbs.pose` converts that
-to SMPL's parameters. World z up, floor at z = 0, metres, radians.
+No recorded motion is needed: each role defines pelvis, hands and gaze (a `Puppet`), which
+`limbs.pose` converts to SMPL's parameters. World z up, floor at z = 0, metres, radians.
 """
 
 from collections.abc import Callable
@@ -15,16 +16,18 @@ from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.simulation.limbs import LEGS, Puppet, pose
 
 COUPLE, LOOP, WAVER = np.array([[-0.15, 0.0], [1.05, 0.0], [0.92, -0.1]])
-"""Positions in a group of the couple's middle, of the walker's loop, and of the person who waves, metres."""
+"""Positions in a group of the couple's centre, of the walker's loop, and of the waving person,
+metres."""
 _PADDING_S = 3.0
-"""Duration for which paths are defined before the first and after the last frame, s, for the next steps."""
+"""Duration for which paths are defined before the first and after the last frame, s, for adjacent
+steps."""
 _STANCE = 0.6
-"""Share of a stride in which a foot stands."""
+"""Share of a stride for which a foot stands."""
 _WIDTH_M = 0.19
 """Distance between the feet, m."""
 Path = Callable[[Array], tuple[Array, Array]]
-"""Function from times (...,), seconds, to the pelvis over the floor: positions (..., 2), metres; headings
-(...,), radians without jumps of a whole turn."""
+"""Function from times (...,), seconds, to the pelvis on the floor: positions (..., 2), metres;
+headings (...,), radians, unwrapped."""
 
 
 @dataclass(frozen=True)
@@ -42,30 +45,32 @@ class Motion(Table):
 
     @classmethod
     def still(cls, betas: Array, frames: int = 1) -> "Motion":
-        """People of shapes `betas` (P, 10) in the T-pose, not shifted."""
+        """People of shapes `betas` (P, 10) in the T-pose, without translation."""
         people = len(betas)
         return cls(betas, *(np.zeros((frames, people, *shape)) for shape in ((3,), (23, 3), (3,))))
 
 
 class Build:
-    """The measures of a body that a role needs, metres."""
+    """Dimensions of a body that a role needs, metres."""
 
     def __init__(self, rest: Array, floor: float):
-        """`rest` (24, 3) are the joints in the T-pose, y up, facing +z; `floor` is y of the soles there."""
+        """`rest` (24, 3) are the joints in the T-pose, y up, facing +z; `floor` is the y of the
+        soles.
+        """
         self.rest, self.floor = rest, floor
         self.pelvis_m, self.ankle_m, self.shoulder_m = (float(rest[joint, 1] - floor) for joint in (0, 7, 16))
         """Heights of these joints of an upright body, metres."""
         hip, knee, ankle = rest[list(LEGS[0])]
         self.leg_m = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
-        """Length of thigh and shank together."""
+        """Length of thigh and shank together, metres."""
 
 
 def close_motion(betas: Array, builds: list[Build], frames: int, fps: float, rng: np.random.Generator) -> Motion:
-    """People of shapes `betas` (P, 10) in close motion, in groups of four: a couple dances, one walks through, one
-    waves.
+    """People of shapes `betas` (P, 10) in close motion, in groups of four: a couple dances, one
+    walks through, one waves.
 
-    The first four are in the middle of the room, each further four in a corner of their own; remaining people fill
-    the first roles, and a person who would dance alone waves.
+    The first group is in the centre of the room, each further one in a corner of its own. The last
+    group may be incomplete and has the first roles; a single person waves.
     """
     time = np.arange(frames) / fps
     puppets: list[Puppet] = []
@@ -86,7 +91,9 @@ def close_motion(betas: Array, builds: list[Build], frames: int, fps: float, rng
 
 
 def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generator) -> list[Puppet]:
-    """Two people who face each other, hold both hands and turn around each other; one pair of hands goes up."""
+    """Two people who face each other, hold both hands and rotate about each other, with one pair of
+    hands raised.
+    """
     turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 1.1)  # rad/s
     beat = rng.uniform(1.0, 1.15)  # s
     start = rng.uniform(-0.2, 0.2)
@@ -120,7 +127,8 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
     puppets = []
     for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):
         away = np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
-        # Seen by who faces the middle from the far end, `across` is on the right; for the other on the left.
+        # For the person at the far end, facing the centre, `across` is to the right; for the other
+        # to the left.
         hands = held if sign < 0 else held[::-1]
         wrists = np.stack([hand + 0.07 * away for hand in hands], axis=1)
         xy, _ = path_of(-sign)(time)
@@ -143,7 +151,9 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
 
 
 def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> Puppet:
-    """A person who walks on a long loop around `centre` (2,), past the others, swinging the arms."""
+    """A person who walks on a long loop around `centre` (2,), past the others, with
+    swinging arms.
+    """
     speed = rng.uniform(1.0, 1.2)  # m/s
     half_axes = np.array([0.62, 1.15])
     lap = 2 * np.pi * np.sqrt((half_axes**2).mean()) / speed
@@ -171,7 +181,9 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
 
 
 def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator) -> Puppet:
-    """A person who stays at `spot` (2,): waves with the right hand, then crouches and reaches down."""
+    """A person who stays at `spot` (2,): waves with the right hand, then crouches and
+    reaches down.
+    """
     clock = time + rng.uniform(-0.1, 0.1)
     waving, crouching = _bump(clock, -0.4, 1.75, period=2.8), _bump(clock, 1.2, 1.55, period=2.8)
 
@@ -202,9 +214,9 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
 def _puppet(
     build: Build, time: Array, path: Path, *, stride_s: float, phase: float, dip: Array, **upper: Array
 ) -> Puppet:
-    """Put a body on the footsteps of `path`, its pelvis `dip` (T,) metres lower than upright.
+    """A puppet with footsteps along `path`, and the pelvis `dip` (T,) metres lower than upright.
 
-    `upper` is what `Puppet` takes for trunk, hands and eyes.
+    `upper` are fields of `Puppet` for trunk, hands and gaze.
     """
     end = (time[-1] if len(time) else 0.0) + _PADDING_S
     feet, lift, foot_heading, pitch, ahead = _footsteps(
@@ -212,19 +224,19 @@ def _puppet(
     )
     xy, heading = path(time)
     ankles = np.concatenate([feet, (build.ankle_m + lift)[..., None]], axis=-1)
-    # Nobody walks on stretched legs: the pelvis is low enough for both feet, softly.
+    # Legs are never fully stretched: the pelvis is low enough for both feet, smoothly.
     aside = np.linalg.norm(feet - xy[:, None], axis=-1) - 0.5 * 0.16
     drop = np.sqrt(np.maximum((0.985 * build.leg_m) ** 2 - np.maximum(aside, 0.0) ** 2, 0.1))
     allowed = (ankles[..., 2] + drop).min(axis=1) + (build.pelvis_m - build.rest[1, 1] + build.floor)
     height = _soften(np.minimum(build.pelvis_m - dip, allowed))
-    lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # the hips go back over the heels in a crouch
+    lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # hips move back over the heels in a crouch
     return Puppet(
         pelvis=_at(xy + lean_back[:, None] * along(heading), height),
         heading=heading,
         ankles=ankles,
         foot_heading=foot_heading,
         foot_pitch=pitch,
-        swing=np.clip(0.55 * ahead[:, ::-1], -0.25, 0.3),  # arms swing against the feet
+        swing=np.clip(0.55 * ahead[:, ::-1], -0.25, 0.3),  # arms swing opposite to the feet
         **upper,
     )
 
@@ -232,11 +244,13 @@ def _puppet(
 def _footsteps(
     path: Path, time_s: Array, stride_s: float, phase: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Steps under `path` at T times: each foot stands `_STANCE` of a stride, then swings to its next place.
+    """Footsteps along `path` at T times: each foot stands for `_STANCE` of a stride, then swings to
+    its next position.
 
-    Of each foot, left and right: the ankle over the floor (T, 2, 2) and how high above standing, metres; where it
-    points, and heel above toes, radians; how far it is ahead of the pelvis, metres: (T, 2) each. A foot stands
-    where the hip is in mid-stance, the two half a stride apart. Who stays in place does not lift the feet.
+    For each foot, left and right: the ankle on the floor (T, 2, 2) and its height above standing,
+    metres; the foot's heading and pitch, radians; and its distance ahead of the pelvis, metres; (T,
+    2) each. A foot stands below the hip in mid-stance; the two are half a stride apart. People who
+    stay in place do not lift their feet.
     """
     sides = np.array([0.0, 0.5])
     cycle = time_s[:, None] / stride_s + phase + sides
@@ -260,14 +274,14 @@ def _footsteps(
 
 
 def _plant(path: Path, number: Array, offset: Array, stride_s: float) -> tuple[Array, Array]:
-    """Place (T, 2, 2) and heading (T, 2) of the feet in stance `number` (T, 2)."""
+    """Position (T, 2, 2) and heading (T, 2) of the feet in stance `number` (T, 2)."""
     xy, heading = path((number + _STANCE / 2 - offset) * stride_s)
     side = np.array([0.5, -0.5]) * _WIDTH_M
     return xy + left_of(heading) * side[:, None], heading + np.array([0.12, -0.12])
 
 
 def _tabulated(path: Path, time_s: Array) -> Path:
-    """`path`, linear between increasing times (M,)."""
+    """`path` tabulated at increasing times (M,), interpolated linearly."""
     places, headings = path(time_s)
 
     def at(t: Array) -> tuple[Array, Array]:
@@ -283,13 +297,13 @@ def _at(xy: Array, z: Array | float) -> Array:
 
 
 def _bump(time: Array, start: float, length: float, *, period: float) -> Array:
-    """Once in each period smoothly up from 0 at `start` to 1 and down again after `length`."""
+    """A smooth pulse per period, from 0 at `start` to 1 and back within `length`."""
     part = np.clip(((time - start) % period) / length, 0.0, 1.0)
     return np.clip(1.6 * np.sin(np.pi * part) ** 2, 0.0, 1.0)
 
 
 def _soften(height: Array) -> Array:
-    """A running mean over five frames, ends repeated."""
+    """Running mean over five frames, with the ends repeated."""
     if len(height) == 0:
         return height
     padded = np.concatenate([np.repeat(height[:1], 2), height, np.repeat(height[-1:], 2)])

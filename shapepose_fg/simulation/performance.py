@@ -1,4 +1,6 @@
-"""Recorded motions performed by bodies of any shape, on the floor of a room with z up; held hands stay held."""
+"""Recorded motions performed by bodies of any shape on the floor of a room, z up; held hands stay
+together.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -19,36 +21,38 @@ _FEET = (7, 8, 10, 11)
 _RELAXED_HAND = 0.25
 """Bend of the fingers of a hand that was not recorded, rad."""
 _JUMP_M = 0.12
-"""Height above the floor around a person above which it is a jump, m; less is error of recordings."""
+"""Height, m, above the floor around a person above which it is a jump; less is recording error."""
 _Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0]).as_matrix()
 _ARMS = ((13, 16, 18, 20, 22), (14, 17, 19, 21, 23))
 """Collar, shoulder, elbow, wrist, hand: left, right."""
 _HELD_M, _FREE_M = 0.17, 0.27
-"""Distance between hands below which they are held, and above which they are not, m: the limbs of recordings
-and those of drawn bodies leave 10 to 20 cm between hands that touched."""
+"""Distance between hands, m, below which they are held, and above which they are free: differences
+in limb lengths leave 10 to 20 cm between hands that touched in the recording."""
 _TOUCH_M = 0.07
-"""Distance between the knuckles of two hands that hold each other."""
+"""Distance between the knuckles of two held hands, m."""
 _STRETCH = 0.995
-"""Largest extension of an arm, as a share of its length."""
+"""Maximum extension of an arm, as a share of its length."""
 
 
 @dataclass(frozen=True)
 class Performance:
-    """One person's motion in the room, z up, metres."""
+    """Motion of one person in the room, z up, metres."""
 
     rotations: Array
-    """(T, 24, 3, 3) local rotations; the first is the pelvis' in the world."""
+    """(T, 24, 3, 3) local rotations; for the pelvis, in the world."""
     joints: Array
     """(T, 24, 3) SMPL's joints."""
     rest: Array
     """(24, 3) the shaped body's joints in the T-pose."""
 
     def __len__(self) -> int:
-        """Count of frames, T."""
+        """Number of frames, T."""
         return len(self.joints)
 
     def moved(self, xy: Array, turn_rad: float = 0.0) -> "Performance":
-        """The motion rotated about the vertical through the origin, then shifted by `xy` (2,)."""
+        """The motion rotated about the vertical through the origin, then translated by
+        `xy` (2,).
+        """
         turn = turned_about("z", np.array([turn_rad]))[0]
         rotations = self.rotations.copy()
         rotations[:, 0] = turn @ rotations[:, 0]
@@ -56,7 +60,7 @@ class Performance:
 
 
 class Figure:
-    """A shaped body as motions need it: joints of its T-pose and the soles of its feet."""
+    """A shaped body for motions: joints in the T-pose, and the soles of its feet."""
 
     def __init__(self, body: BodyModel, betas: Array):
         arrays = body.arrays
@@ -64,15 +68,17 @@ class Figure:
         self.rest: Array = arrays.joint_regressor @ shaped
         """(24, 3) joints in the T-pose, y up."""
         self.leg_m = float(np.linalg.norm(np.diff(self.rest[[1, 4, 7]], axis=0), axis=1).sum())
-        """Length of thigh and shank together."""
+        """Length of thigh and shank together, metres."""
         feet = [np.flatnonzero(arrays.weights[:, list(_FEET[side::2])].sum(axis=1) > 0.9) for side in (0, 1)]
-        # Whatever the foot's turn, its lowest point is a corner of its convex hull.
+        # The lowest point of a foot is always a vertex of its convex hull.
         hull = np.concatenate([foot[ConvexHull(shaped[foot]).vertices] for foot in feet])
         self._soles, self._weights = shaped[hull], arrays.weights[hull][:, list(_FEET)]
         self._weights = self._weights / self._weights.sum(axis=1, keepdims=True)
 
     def joints(self, rotations: Array, pelvis: Array) -> tuple[Array, Array]:
-        """Joints (T, 24, 3) and their world rotations (T, 24, 3, 3) with the pelvis joint at `pelvis` (T, 3)."""
+        """Joints (T, 24, 3) and their world rotations (T, 24, 3, 3), with the pelvis at `pelvis`
+        (T, 3).
+        """
         world, places = accumulate(rotations), np.empty((len(pelvis), 24, 3))
         places[:, 0] = pelvis
         for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
@@ -81,17 +87,18 @@ class Figure:
 
     def lowest_sole(self, joints: Array, world: Array) -> Array:
         """Height (T,) of the lowest point of both feet, z up."""
-        up = world[:, list(_FEET), 2]  # (T, 4, 3): the height's share of each rotation
+        up = world[:, list(_FEET), 2]  # (T, 4, 3): vertical component of each rotation
         offsets = self._soles[:, None] - self.rest[list(_FEET)]
         heights = np.einsum("tfi,vfi,vf->tv", up, offsets, self._weights, optimize=True)
         return (heights + joints[:, list(_FEET), 2] @ self._weights.T).min(axis=1)
 
 
 def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = None) -> Performance:
-    """Perform `clip` with a body of shape `betas` (10,), on the floor z = 0 of a room with z up; +z becomes -y.
+    """Perform `clip` with a body of shape `betas` (10,), on the floor z = 0 of a room with z up; +z
+    becomes -y.
 
-    Steps scale with the legs (`scale` overrides it, for people who must stay together); collars follow the arms,
-    hands hang loosely, and the soles are on the floor, except in jumps.
+    Steps scale with the leg length (or by `scale`, for people who must stay together); collars
+    follow the arms, hands hang loosely, and the soles are on the floor, except in jumps.
     """
     figure = Figure(body, np.asarray(betas, dtype=np.float64))
     ratio = figure.leg_m / clip.leg_m
@@ -107,7 +114,7 @@ def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = 
 
 
 def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, bend_toes: bool) -> Performance:
-    """Shift a person up and down, smoothly, so that the supporting feet are on the floor."""
+    """Shift a person vertically and smoothly, so that the supporting feet are on the floor."""
     joints, world = figure.joints(rotations, pelvis)
     if bend_toes:
         rotations = _toes_on_the_floor(rotations, joints, world, figure.lowest_sole(joints, world))
@@ -118,26 +125,28 @@ def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, ben
 
 
 def together(betas: Array, performances: list[Performance], frames: int) -> Motion:
-    """SMPL's parameters of P people, `betas` (P, 10), in `frames` frames (needed where P is 0)."""
+    """SMPL's parameters of P people, `betas` (P, 10), in `frames` frames (used if P is 0)."""
     motion = Motion.still(np.asarray(betas, dtype=np.float64).reshape(len(performances), 10), frames)
     for person, performed in enumerate(performances):
         vectors = Rotation.from_matrix(performed.rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
         motion.global_orient[:, person] = vectors[:, 0]
         motion.body_pose[:, person] = vectors[:, 1:]
-        # SMPL turns the body about its pelvis where the T-pose has it, and shifts it afterwards.
+        # SMPL rotates the body about its pelvis in the T-pose, then translates it.
         motion.transl[:, person] = performed.joints[:, 0] - performed.rest[0]
     return motion
 
 
 def _floor(lowest: Array, fps: float) -> Array:
-    """Height (T,) of the floor under a person whose lowest point is at `lowest` (T,): smooth, without jumps."""
+    """Smooth height (T,) of the floor under a person with lowest points at `lowest` (T,), ignoring
+    jumps.
+    """
     if len(lowest) == 0:
         return lowest
     reach = 2 * max(1, round(0.3 * fps)) + 1
     opened = maximum_filter1d(minimum_filter1d(lowest, reach, mode="nearest"), reach, mode="nearest")
     flies = (lowest - opened).max() > _JUMP_M
     floor = gaussian_filter1d(opened if flies else lowest, 0.1 * fps, mode="nearest")
-    below = np.maximum(floor - lowest - 0.015, 0.0)  # what would be deep in the floor lifts the person
+    below = np.maximum(floor - lowest - 0.015, 0.0)  # lift people deep in the floor
     wide = maximum_filter1d(below, 2 * max(1, round(0.15 * fps)) + 1, mode="nearest")
     return floor - gaussian_filter1d(wide, 0.08 * fps, mode="nearest")
 
@@ -146,7 +155,9 @@ def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Ar
     """Keep unrecorded toes flat where the heel rises and the ball of the foot is on the floor."""
     bent = rotations.copy()
     for ankle, ball in ((7, 10), (8, 11)):
-        pitch = np.arcsin(np.clip(-world[:, ankle, 2, 2], -1.0, 1.0))  # of the foot's +z, below the horizontal
+        pitch = np.arcsin(
+            np.clip(-world[:, ankle, 2, 2], -1.0, 1.0)
+        )  # pitch of the foot's +z below the horizontal
         near = np.clip((0.14 - (joints[:, ball, 2] - lowest)) / 0.06, 0.0, 1.0)
         angle = -np.clip(pitch, 0.0, 0.7) * near
         bent[:, ball] = turned_about("x", angle)
@@ -154,17 +165,18 @@ def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Ar
 
 
 def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Performance, Performance]:
-    """Bring together hands of two people that are nearly together for a while, each half of the way.
+    """Bring hands of two people together that are close for a while, each moving half of the
+    distance.
 
-    Only shoulders and elbows turn: the elbow bends by the law of cosines, the shoulder turns the arm along the
-    shortest arc. Each hand goes to the other's nearest one.
+    Only shoulders and elbows rotate: the elbow by the law of cosines, the shoulder along the
+    shortest arc. Each hand goes to the other person's nearest one.
     """
     if len(lead) == 0:
         return lead, follow
     pull = _pull(lead, follow, fps)
-    for _ in range(2):  # the hand's own length turns with the arm: the second pass takes up what is left
+    for _ in range(2):  # the second pass corrects the rotated hand
         hands = [person.joints[:, [22, 23]] for person in (lead, follow)]
-        apart = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) from the lead's hands to the follow's
+        apart = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) lead's hands to follow's
         gap = np.linalg.norm(apart, axis=-1)
         step = (pull * np.maximum(1.0 - _TOUCH_M / np.maximum(gap, 1e-6), 0.0) / 2)[..., None] * apart
         lead = _reach(lead, step.sum(axis=2))
@@ -173,11 +185,13 @@ def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Perf
 
 
 def _pull(lead: Performance, follow: Performance, fps: float) -> Array:
-    """(T, 2, 2) weights with which each hand of the lead holds each of the follow's, 0 to 1, smooth in time."""
+    """(T, 2, 2) weights with which the hands of lead and follow hold each other, 0 to 1, smooth in
+    time.
+    """
     gap = np.linalg.norm(lead.joints[:, [22, 23], None] - follow.joints[:, None, [22, 23]], axis=-1)
     near = np.clip((_FREE_M - gap) / (_FREE_M - _HELD_M), 0.0, 1.0)
     nearest = np.exp(-gap / 0.02)
-    # A hand that is near to both of the other's hands holds the nearer one.
+    # A hand near both hands of the other person holds the nearer one.
     share = nearest / np.maximum(
         np.maximum(nearest.sum(axis=1, keepdims=True), nearest.sum(axis=2, keepdims=True)), 1e-300
     )
@@ -185,7 +199,7 @@ def _pull(lead: Performance, follow: Performance, fps: float) -> Array:
 
 
 def _reach(person: Performance, steps: Array) -> Performance:
-    """Move the hands by `steps` (T, 2, 3) metres, left and right, as far as the arms go."""
+    """Move the hands by `steps` (T, 2, 3) metres, left and right, as far as the arms reach."""
     rotations, joints = person.rotations.copy(), person.joints.copy()
     world = rotations[:, 0]
     for joint in (3, 6, 9):
@@ -208,14 +222,16 @@ def _reach(person: Performance, steps: Array) -> Performance:
 
 
 def _bend(upper: Array, lower: Array, distance: Array) -> Array:
-    """Rotation (T, 3, 3) of the forearm `lower` (T, 3) after which the arm is `distance` (T,) long."""
+    """Rotation (T, 3, 3) of the forearm `lower` (T, 3) that gives the arm the length `distance`
+    (T,).
+    """
     a, b = np.linalg.norm(upper, axis=1), np.linalg.norm(lower, axis=1)
     axis = np.cross(upper, lower)
     size = np.linalg.norm(axis, axis=1)
     now = np.arctan2(size, (upper * lower).sum(axis=1))
     length = np.clip(distance, np.abs(a - b) + 0.12, _STRETCH * (a + b))
     then = np.arccos(np.clip((length**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
-    # The axis of an arm that is straight is not known: such an arm does not bend.
+    # The bending axis of a straight arm is undefined: such an arm is not bent.
     weight = np.clip(size / (a * b) / 0.05, 0.0, 1.0)
     change = (weight * (then - now) / np.maximum(size, 1e-9))[:, None] * axis
     return Rotation.from_rotvec(change).as_matrix()

@@ -13,7 +13,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
 from shapepose_fg.viz.rendering import look_at
 
-if TYPE_CHECKING:  # processes that only look at people do without
+if TYPE_CHECKING:  # not needed by visibility workers
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -23,28 +23,28 @@ _FEET = (19, 20, 21, 22, 23, 24)
 
 @dataclass(frozen=True)
 class Scene:
-    """The true people, and the cameras. World z up, floor at z = 0, metres."""
+    """Ground-truth people and the cameras. World z up, floor at z = 0, metres."""
 
     rig: Rig
     """The cameras."""
     body: "BodyModel"
-    """The model whose parameters `motion` holds."""
+    """The body model of the parameters in `motion`."""
     motion: Motion
-    """P people in T frames."""
+    """Bodies of P people in T frames."""
     fps: float
-    """Frames a second."""
+    """Frame rate, Hz."""
     cuts: tuple[int, ...] = ()
-    """First frames after cuts, where everybody may be somewhere else."""
+    """First frames after cuts, at which positions are discontinuous."""
     clips: tuple[tuple[str, ...], ...] = ()
-    """The name of each person's recording in each segment, where people perform recordings."""
+    """Name of each person's recording in each segment, for recorded motions."""
 
     def __len__(self) -> int:
-        """Count of frames, T."""
+        """Number of frames, T."""
         return len(self.motion.transl)
 
     @property
     def people(self) -> int:
-        """Count of people, P."""
+        """Number of people, P."""
         return len(self.motion.betas)
 
     @cached_property
@@ -53,12 +53,12 @@ class Scene:
         return keypoints_of(self.body, self.motion)
 
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "Scene":
-        """Return the scene with true keypoints where a detector with these offsets puts them."""
+        """Return the scene with ground-truth keypoints including a detector's offsets."""
         return replace(self, body=self.body.with_keypoint_offsets(offsets))
 
     def part(self, span: range) -> "Scene":
-        """The scene in some consecutive frames."""
-        # Segments that reach into the span, each from its cut (the first from frame 0) to the next.
+        """The scene in the consecutive frames `span`."""
+        # Segments that overlap the span, each from its cut (the first from frame 0) to the next.
         segments = zip((0, *self.cuts), (*self.cuts, len(self)), self.clips, strict=False)
         clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
         cuts = tuple(first - span.start for first in self.cuts if span.start < first < span.stop)
@@ -69,7 +69,9 @@ class Scene:
         return self.keypoints[frame]
 
     def vertices_at(self, frame: int, only: Index | None = None) -> NDArray[np.float32]:
-        """(P, Nv, 3) the true surfaces of one frame; or (P, M, 3), the vertices `only` (M,) of them."""
+        """(P, Nv, 3) ground-truth meshes of one frame; or (P, M, 3) for the vertices
+        `only` (M,).
+        """
         parameters = parameters_of(self.motion.rows(slice(frame, frame + 1)))
         return self.body.vertices(parameters, only).astype(np.float32)
 
@@ -83,10 +85,12 @@ def built_in_scene(
     fps: float = 25.0,
     body: "BodyModel | None" = None,
 ) -> Scene:
-    """Close motion in a room of 4 x 4 m: two dance, one walks through, one waves and crouches.
+    """Close motion in a room of 4 x 4 m: two people dance, one walks through, one waves and
+    crouches.
 
-    Any number of `people` from 0, of `cameras` from 2 and of `frames` from 0; everything that is drawn
-    (shapes, phases, places) comes from `seed`. `body` is the model that is posed, by default the shipped one.
+    Any number of `people` from 0, of `cameras` from 2 and of `frames` from 0; all random values
+    (shapes, phases, positions) depend on `seed`. `body` is the body model, by default the
+    package's.
     """
     if people < 0 or frames < 0 or cameras < 2:
         raise ValueError(f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}")
@@ -110,10 +114,12 @@ def ring_of_cameras(
     height_m: tuple[float, float] = (2.0, 2.5),
     focal_px: tuple[float, float] = (860.0, 940.0),
 ) -> Rig:
-    """Cameras on the walls around the room, 3 to 3.6 m from its middle and 1.9 to 2.7 m high, looking inward.
+    """Cameras on the walls around the room, 3 to 3.6 m from its centre and 1.9 to 2.7 m high,
+    looking inwards.
 
-    `distance_m`, `height_m` and `focal_px` are the ranges that they are drawn from; every second one is 0.3 m
-    lower. 1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by 44 degrees.
+    `distance_m`, `height_m` and `focal_px` are the ranges of uniform draws; every second camera is
+    0.3 m lower. 1280 x 720 px and a focal length near 900 px by default: a field of view of 71 by
+    44 degrees.
     """
     image_size, cameras = (1280, 720), []
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.18, 0.18, count)) / count + 0.35
@@ -129,7 +135,7 @@ def ring_of_cameras(
 
 
 def builds_of(body: "BodyModel", betas: Array) -> list[Build]:
-    """The measures of P shapes `betas` (P, 10) that motions are made to."""
+    """Dimensions of P shapes `betas` (P, 10) for motions."""
     parameters = parameters_of(Motion.still(betas))
     joints, floors = body.joints(parameters), body.vertices(parameters)[..., 1].min(axis=1)
     return [Build(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
@@ -142,7 +148,9 @@ def keypoints_of(body: "BodyModel", motion: Motion) -> Array:
 
 
 def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Motion:
-    """Shift everybody up or down so that in each frame the lowest toe or heel is as high as in standing."""
+    """Shift each person vertically so that in each frame the lowest toe or heel is as high as when
+    standing.
+    """
     floors = np.array([build.floor for build in builds])
     soles = keypoints_of(body, Motion.still(motion.betas))[0][:, _FEET, 1].min(axis=1) - floors
     transl = motion.transl.copy()

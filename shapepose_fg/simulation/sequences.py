@@ -1,7 +1,7 @@
-"""Named interaction sequences around real two-person salsa takes, in a room that fills up.
+"""Named interaction sequences with real two-person salsa takes, in a room with further people.
 
-Takes 60/61_01 to _07 are for choosing settings ("tune"), _09 to _15 for reporting ("report"); all other people
-come from other subjects. Room of 4 x 4 m, world z up, floor at z = 0.
+Takes 60/61_01 to _07 are for choosing settings ("tune"), _09 to _15 for reporting ("report"); all
+other people come from other subjects. Room of 4 x 4 m, world z up, floor at z = 0.
 """
 
 import re
@@ -23,19 +23,20 @@ from shapepose_fg.simulation.performance import Figure, Performance, hold_hands,
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
 
 _TORSO = (0, 6, 9, 12)
-"""Pelvis, spine and neck: joints that other people must keep away from."""
+"""Pelvis, spine and neck: joints from which other people must keep a distance."""
 _HALF_ROOM_M = 1.75
-"""Largest distance of pelvises from the middle of the room, in x and in y, m."""
+"""Maximum distance of pelvises from the centre of the room, in x and in y, m."""
 _LIMBS_M = 0.12
-"""Minimum distance of a standing person's joints from those of others, where there is room for it, m."""
+"""Minimum distance of a standing person's joints from those of others, if space permits, m."""
 _TORSO_M = 0.2
-"""Minimum distance of another person's joint from these, m."""
+"""Minimum distance of another person's joints from these, m."""
 _MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
 """Pelvis and chest; elbows, wrists, hands, knees."""
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
-"""Number of places that are drawn for standing people and for pairs, and number of them that are tested."""
+"""Number of random positions for standing people and for pairs, and number of them that
+are tested."""
 _PACE_MPS = 1.35
-"""Maximum speed of walking people in the crowded room, m/s."""
+"""Maximum speed of walking people in a crowded room, m/s."""
 _ARM_M = 0.3
 """Distance of walking people from others' limbs, m."""
 
@@ -45,27 +46,27 @@ class SequenceConfig:
     """Composition and difficulty of a sequence."""
 
     pairs: int = 1
-    """Salsa pairs in the room at a time, 0 to 2."""
+    """Number of salsa pairs at a time, 0 to 2."""
     standing: int = 1
     """Number of people who stand close and gesture."""
     walking: int = 1
     """Number of people who walk through, between and around."""
     close_m: float = 0.45
-    """Minimum distance of the pelvises of people who do not dance together, m, or a little more."""
+    """Approximate minimum distance between the pelvises of people who do not dance together, m."""
     segment_frames: int = 600
-    """Longest segment without a cut, frames at 30 Hz."""
+    """Maximum length of a segment without a cut, frames at 30 Hz."""
     frames: int = 3000
     """Length of the sequence, frames at 30 Hz."""
     camera_distance_m: tuple[float, float] = (3.1, 3.6)
-    """Range of the cameras' distances from the middle."""
+    """Range of the cameras' distances from the centre, m."""
     camera_height_m: tuple[float, float] = (2.0, 2.5)
-    """Range of the cameras' heights; every second one is 0.3 m lower."""
+    """Range of the cameras' heights, m; every second one is 0.3 m lower."""
     focal_px: tuple[float, float] = (860.0, 940.0)
-    """Range of the cameras' focal lengths."""
+    """Range of the cameras' focal lengths, px."""
     seed: int = 0
-    """Seed of everything that is drawn."""
+    """Seed of all random values."""
     without: frozenset[str] = frozenset()
-    """Subjects of recordings who are not among standing and walking people; the dancers never are."""
+    """Subjects excluded from standing and walking people; the dancers always are."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.pairs <= 2 and self.standing >= 0 and self.walking >= 0):
@@ -75,22 +76,24 @@ class SequenceConfig:
 
     @property
     def people(self) -> int:
-        """Count of people."""
+        """Number of people."""
         return 2 * self.pairs + self.standing + self.walking
 
 
 class Room:
-    """The people in the room from one cut to the next."""
+    """The people in the room between two cuts."""
 
     def __init__(self, body: BodyModel, config: SequenceConfig, frames: int, fps: float, rng: np.random.Generator):
         self.body, self.config, self.frames, self.fps, self.rng = body, config, frames, fps, rng
         self.performed: list[Performance] = []
-        """The people, in order of arrival."""
+        """Motions of the people, in order of arrival."""
         self.names: list[str] = []
-        """The recordings that they perform."""
+        """Names of their recordings."""
 
     def add_pair(self, betas: Array, pair: tuple[Clip, Clip]) -> None:
-        """Add two people who dance together, with one scale for both, so that held hands stay held."""
+        """Add two people who dance together, with a common scale, so that held hands
+        stay together.
+        """
         legs = np.mean([Figure(self.body, shape).leg_m for shape in betas])
         scale = float(legs / np.mean([clip.leg_m for clip in pair]))
         two = hold_hands(
@@ -147,7 +150,7 @@ class Room:
         self._add(walk, clip.name)
 
     def points(self, joints: tuple[int, ...]) -> Array:
-        """(T, P x joints, 2) positions of SMPL's `joints` of everybody over the floor."""
+        """(T, P x joints, 2) positions of SMPL's `joints` of all people on the floor."""
         if len(self.performed) == 0:
             return np.zeros((self.frames, 0, 2))
         return np.concatenate([p.joints[:, list(joints), :2] for p in self.performed], axis=1)
@@ -157,7 +160,9 @@ class Room:
         self.names.append(name)
 
     def _pair_options(self, along: float) -> tuple[Array, Array]:
-        """Turns (N,) and places (N, 2) for a pair whose steps spread `along`: two pairs dance side by side."""
+        """Rotations (N,) and positions (N, 2) for a pair with steps mainly `along`; two pairs dance
+        side by side.
+        """
         if self.config.pairs == 1:
             turns, side = self.rng.uniform(-np.pi, np.pi, _PAIR_OPTIONS), 0.0
         else:
@@ -168,7 +173,9 @@ class Room:
         return turns, np.array([0.0, side]) + self.rng.normal(0.0, 0.2, (_PAIR_OPTIONS, 2))
 
     def _worth(self, two: list[Performance], turn: float, shift: Array) -> float:
-        """Score of a pair's place: inside the room, close to others, but not closer than allowed."""
+        """Score of a pair's position: inside the room, close to others, but not closer than
+        allowed.
+        """
         steps = np.concatenate([one.joints[::3, list(_MIDDLES), :2] for one in two], axis=1)
         steps = steps @ turned_about("z", np.array([turn]))[0, :2, :2].T + shift
         outside = float(np.maximum(np.abs(steps) - _HALF_ROOM_M, 0.0).max())
@@ -177,7 +184,7 @@ class Room:
         return 20.0 * min(spare, 0.0) - max(spare, 0.0) - 10.0 * outside
 
     def _roomiest(self, options: Iterable[list[Performance]]) -> list[Performance]:
-        """The first of the options that leaves everybody enough room, else the one that leaves most."""
+        """The first option with sufficient distances, else the one with the largest."""
         best, most = [], -np.inf
         for placed in options:
             reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)
@@ -190,7 +197,7 @@ class Room:
         return best
 
     def _gap(self, one: Performance, other: Performance) -> float:
-        """Distance of two people beyond the wanted one, metres; negative: less."""
+        """Distance of two people minus the required one, metres."""
         a, b = one.joints[::5], other.joints[::5]
         limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - _LIMBS_M
         trunks = clearance_m(a, b).min() - _TORSO_M
@@ -199,7 +206,9 @@ class Room:
 
 
 def clearance_m(first: Array, second: Array) -> Array:
-    """Least distance (T,) between the torso joints of one person and any joint of the other, (T, 24, 3) each."""
+    """Minimum distance (T,) between the torso joints of one person and any joint of the other, (T,
+    24, 3) each.
+    """
     trunk = list(_TORSO)
     gaps = [
         np.linalg.norm(a[:, trunk, None] - b[:, None], axis=-1).min(axis=(1, 2))
@@ -209,9 +218,9 @@ def clearance_m(first: Array, second: Array) -> Array:
 
 
 def _long_axis(points: Array) -> float:
-    """Direction in which points (N, 2) spread most, from -1 to pi - 1 radians; 0 where they spread alike.
+    """Principal direction of points (N, 2), from -1 to pi - 1 radians; 0 if they are isotropic.
 
-    The range ends where no axis of a symmetrical motion is.
+    The range ends where no axis of a symmetric motion is.
     """
     x, y = (points - points.mean(axis=0)).T
     along, across, most = (x**2 - y**2).sum(), 2 * (x * y).sum(), (x**2 + y**2).sum()
@@ -223,23 +232,24 @@ def _long_axis(points: Array) -> float:
 Split = Literal["tune", "report"]
 
 DANCERS = frozenset({"60", "61"})
-"""Subjects of the salsa takes: no network trains on them."""
+"""Subjects of the salsa takes; no network is trained on them."""
 TAKES: dict[str, range] = {"tune": range(1, 8), "report": range(9, 16)}
 """Numbers of the takes of each split."""
 _APART_M = 1.3
-"""Distance of the dancers from which on, and up to which, a take is used, m."""
+"""Maximum distance of the dancers at the ends of the used part of a take, m."""
 _SHAPE_SPREAD = 0.8
-"""Standard deviation of the betas over people; those of a pair differ by less."""
+"""Standard deviation of the betas over people; smaller within a pair."""
 _IMAGE_PX_A_M = 259.0
-"""Size of people in the image, pixels per metre, for any distance of the cameras."""
+"""Size of people in the image, pixels per metre, for all distances of the cameras."""
 
 
 def _from_afar(distance_m: float) -> dict[str, Any]:
-    """Cameras at the height of the hips, far away, with long lenses.
+    """Settings of distant cameras at hip height with long lenses.
 
-    Rays to different people's same joints lie nearly in one plane and cross wherever somebody could stand. From
-    farther away they are flatter still, but one person hides less of the room. Distances were chosen on the tune
-    split, for room to get better in and hips that are seen in 4.5 views or more (docs/simulation.md).
+    Rays to the same joint of different people are nearly in one plane and intersect wherever a
+    person could be. With the distance, rays become flatter, but one person occludes less of the
+    room. Distances were chosen on the tune split, so that there is room for improvement, and hips
+    are seen in at least 4.5 views (docs/simulation.md).
     """
     range_m = (distance_m, distance_m + 0.5)
     focal_px = (_IMAGE_PX_A_M * range_m[0], _IMAGE_PX_A_M * range_m[1])
@@ -266,11 +276,12 @@ def sequence(
     fps: float = 30.0,
     config: SequenceConfig | None = None,
 ) -> Scene:
-    """Interaction sequence `name` of `SEQUENCES` from the takes of `split`, before `cameras` cameras.
+    """Interaction sequence `name` of `SEQUENCES` from the takes of `split`, seen by `cameras`
+    cameras.
 
-    `config` replaces that of the name; `frames` its length. With `until` no segment is made that begins at that
-    frame or later: the others are as in the whole recording. ValueError for an unknown name or split, or
-    recordings without a take of that split.
+    `config` replaces that of the name; `frames` its length. With `until` no segment is generated
+    that begins at that frame or later; the others are as in the whole recording. Raises ValueError
+    for an unknown name or split, or recordings without a take of that split.
     """
     if name not in SEQUENCES or split not in TAKES:
         raise ValueError(
@@ -294,7 +305,8 @@ def sequence(
     dances = _dances(mocap, takes, config, fps, rng)
     parts, clips, starts = [Motion.still(betas, 0)], [], [0]
     while starts[-1] < (frames if until is None else min(until, frames)):
-        # Everybody from one cut to the next: first the pairs, then who stands, then who walks around them.
+        # One segment between cuts: first pairs, then standing people, then people walking around
+        # them.
         dancing = [next(dances) for _ in range(config.pairs)]
         longest = max(1, round(config.segment_frames * fps / 30.0))
         length = min([frames - starts[-1], longest, *(len(lead) for lead, _ in dancing)])
@@ -313,14 +325,16 @@ def sequence(
 
 
 def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
-    """The pairs of clips of a split, lead and follow."""
+    """Pairs of clips of a split, lead and follow."""
     return [pair for pair in mocap.pairs if _take(mocap.names[pair[0]]) in TAKES[split]]
 
 
 def _dances(
     mocap: Mocap, takes: list[tuple[int, int]], config: SequenceConfig, fps: float, rng: np.random.Generator
 ) -> Iterator[tuple[Clip, Clip]]:
-    """Endless segments of takes in random order, each as long as possible without a cut."""
+    """Endless stream of segments from takes in random order, each as long as possible without a
+    cut.
+    """
     while True:
         drawn = [takes[index] for index in rng.permutation(len(takes))]
         segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]
@@ -332,7 +346,7 @@ def _dances(
 def _together_in(
     mocap: Mocap, pair: tuple[int, int], config: SequenceConfig, fps: float
 ) -> list[tuple[Clip, Clip]]:
-    """The segments of a take in which the two are together."""
+    """The segments of a take in which both are close together."""
     lead, follow = (mocap.clip(index).resampled(fps) for index in pair)
     gap = np.linalg.norm((lead.pelvis - follow.pelvis)[:, [0, 2]], axis=1)
     near = np.flatnonzero(gap < _APART_M)
@@ -345,7 +359,7 @@ def _together_in(
 
 
 def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
-    """(P, 10) betas: those of a pair are near each other, so that their hands still meet."""
+    """(P, 10) betas; similar within a pair, so that the hands still meet."""
     betas = rng.normal(0.0, _SHAPE_SPREAD, (config.people, 10))
     for lead in range(0, 2 * config.pairs, 2):
         betas[lead : lead + 2] = 0.6 * betas[lead] + rng.normal(0.0, 0.25, (2, 10))
@@ -353,7 +367,7 @@ def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
 
 
 def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
-    """`count` clips, none twice before all were drawn once."""
+    """Draw `count` clips; none is repeated before all are drawn once."""
     if count > 0 and len(clips) == 0:
         raise ValueError("there are no standing or walking people in these recordings: give the whole file")
     rounds = -(-count // max(len(clips), 1))
@@ -361,6 +375,6 @@ def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
 
 
 def _take(name: str) -> int:
-    """Number of the trial in a clip's name, "60_09#1" -> 9; -1 where it has none."""
+    """Number of the trial in a clip's name, "60_09#1" -> 9; -1 if there is none."""
     match = re.fullmatch(r"6[01]_(\d+)(#\d+)?", name)
     return int(match.group(1)) if match is not None else -1

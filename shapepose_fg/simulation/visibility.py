@@ -1,4 +1,6 @@
-"""Visibility of joints: the first surface on the rays to each joint, and the person that it belongs to."""
+"""Visibility of joints: the first surface on the rays to each joint, and the person it
+belongs to.
+"""
 
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass
@@ -18,15 +20,16 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 NOBODY, ITSELF, BORDER = -1, -2, -3
-"""Codes of `Visibility.hidden_by` where no other person is in front."""
+"""Codes of `Visibility.hidden_by` without another person in front."""
 
 _BONES = (
     "head neck+left_collar+right_collar right_shoulder+right_collar right_elbow right_wrist "
     "left_shoulder+left_collar left_elbow left_wrist pelvis right_hip right_knee right_ankle left_hip left_knee "
     "left_ankle head head head head left_foot left_foot left_ankle right_foot right_foot right_ankle"
 ).split()
-"""The own bones of each joint of BODY_25: SMPL's that begin there; face, toes and heels have their nearest. A
-collar has hardly any skin: it counts as the shoulder's own, so that the chest is adjacent to the shoulder."""
+"""Bones of each joint of BODY_25: SMPL's that begin there; for face, toes and heels the nearest. A
+collar has hardly any skin and counts for the shoulder, so that the chest is adjacent to the
+shoulder."""
 FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "LEar"))
 """Joints of the face, which lie on the skin, not inside a limb."""
 
@@ -34,12 +37,12 @@ _RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0
 """Directions of rays around a joint, in units of the probe's radius."""
 
 FramePeople = tuple[Array, NDArray[np.float32]] | tuple[Array, NDArray[np.float32], Rig]
-"""One frame: BODY_25 joints (P, 25, 3) and surfaces (P, M, 3) of everybody, metres; and the cameras' rig at
+"""A frame: BODY_25 joints (P, 25, 3) and meshes (P, M, 3) of all people, metres; and the rig at
 that time."""
 AHEAD = 4
-"""Number of frames per worker that are submitted ahead: each is little work."""
+"""Number of frames per worker that are submitted ahead; each is little work."""
 FRAMES_WORTH_A_WORKER = 100
-"""Minimum number of frames per worker; with fewer, starting it takes longer than it saves."""
+"""Minimum number of frames per worker; with fewer, starting it costs more than it saves."""
 
 
 @dataclass(frozen=True)
@@ -47,45 +50,48 @@ class VisibilityConfig:
     """Settings of the depth buffer."""
 
     image_scale: float = 0.25
-    """The buffer's resolution, as a share of the image's."""
+    """Resolution of the buffer, as a share of the image's."""
     cell_m: float = 0.04
     """Size of cells within which vertices of the surface are merged, m; 0 keeps all."""
     probe_m: float = 0.03
-    """Radius around a joint in which rays are sent, m; 0 uses the ray to the joint only."""
+    """Radius around a joint in which rays are cast, m; 0 uses the ray to the joint only."""
     front_m: float = 0.02
-    """Minimum distance of a surface in front of a joint that hides it, m: skin on skin hides nothing."""
+    """Minimum distance, m, of a surface in front of a joint that occludes it; touching skin does
+    not."""
     face_depth_m: float = 0.08
-    """Depth under the head's first surface, m, beyond which it hides nose, eyes and ears: they are on its other
-    side."""
+    """Depth behind the head's first surface, m, beyond which nose, eyes and ears are occluded,
+    being on the other side."""
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """Visible share of each joint in each view, and what hides it."""
+    """Visible share of each joint in each view, and the occluder."""
 
     seen: Array
     """(V, P, J) share of the rays that reach a joint, 0 to 1; 0 outside the image."""
     in_image: Mask
     """(V, P, J) whether the joint projects into the image."""
     hidden_by: Index
-    """(V, P, J) NOBODY (-1) where at least half of the rays arrive; else what stops most of the others: a
-    person's index, or ITSELF (-2), its own body; BORDER (-3) outside the image."""
+    """(V, P, J) NOBODY (-1) if at least half of the rays reach the joint; else the occluder of most
+    others: a person's index, or ITSELF (-2) for its own body; BORDER (-3) outside the image."""
 
 
 @dataclass(frozen=True)
 class Skin:
-    """The surface that is drawn for every person, and the joints that belong to each part of it."""
+    """The surface used for every person, and the joints that belong to each part of it."""
 
     vertices: Index
     """(M,) indices of the used vertices of the body's mesh."""
     faces: NDArray[np.int32]
     """(G, 3) triangles over those."""
     shows: Mask
-    """(M, J) whether at least half of a vertex's weight is on the joint's own bone or one next to it."""
+    """(M, J) whether at least half of a vertex's weight is on the joint's own or adjacent bones."""
 
     @classmethod
     def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
-        """The surface of `body`, with vertices merged that are within a cube of `cell_m` in the mean T-pose."""
+        """The surface of `body`; vertices within a cube of `cell_m` in the mean T-pose
+        are merged.
+        """
         template = body.arrays.template
         vertices, faces, cell = thinned(template, body.faces, cell_m, template.min(axis=0))
         shown = body.arrays.weights @ _bones_near(body.parents).T
@@ -94,14 +100,16 @@ class Skin:
 
 
 def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityConfig) -> Visibility:
-    """See BODY_25 `joints` (P, 25, 3) of people whose `surfaces` are (P, M, 3), the vertices of `skin`.
+    """Visibility of BODY_25 `joints` (P, 25, 3) of people with `surfaces` (P, M, 3), the vertices
+    of `skin`.
 
-    A ray arrives when the first surface on it is skinned to the joint's own bones or adjacent ones of the
-    same person, or when no surface is nearer than the joint (a toe at the edge of its silhouette).
+    A ray reaches a joint if the first surface on it is skinned to the joint's own or adjacent bones
+    of the same person, or if no surface is nearer than the joint (a toe at the edge of its
+    silhouette).
     """
     people, size = len(joints), surfaces.shape[1]
     xy, depth = rig.project(joints)
-    in_image = np.all((xy >= 0) & (xy <= rig.image_sizes[:, None, None] - 1), axis=-1)  # NaN compares false
+    in_image = np.all((xy >= 0) & (xy <= rig.image_sizes[:, None, None] - 1), axis=-1)  # false for NaN
     rays = _RAYS if config.probe_m > 0 else _RAYS[:1]
     met_depth = np.full((*depth.shape, len(rays)), np.inf)
     met = np.full(met_depth.shape, -1, dtype=np.intp)
@@ -116,9 +124,9 @@ def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityC
         column, row = np.clip(np.rint(np.nan_to_num(pixels)), 0, last).astype(np.intp).transpose(3, 0, 1, 2)
         met_depth[view], met[view] = first_surface_at(points, faces, camera, column, row)
     own = np.arange(people)[:, None, None]
-    owner, place = np.divmod(met, max(size, 1))  # nothing met: owner -1
+    owner, place = np.divmod(met, max(size, 1))  # without a surface: owner -1
     shows = (owner == own) & skin.shows[place, np.arange(joints.shape[1])[:, None]]
-    gap = depth[..., None] - met_depth  # -inf where nothing is met
+    gap = depth[..., None] - met_depth  # -inf without a surface
     deep = np.full((joints.shape[1], 1), np.inf)
     deep[list(FACE)] = config.face_depth_m
     stopped = (gap > config.front_m) & (~shows | (gap > deep))
@@ -131,12 +139,12 @@ def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityC
 
 @dataclass(frozen=True)
 class VisibilityWorker:
-    """Computes the visibility in many frames of a recording."""
+    """Computes visibility in many frames of a recording."""
 
     rig: Rig
     """The cameras."""
     skin: Skin
-    """The surface that is drawn."""
+    """The surface of people."""
     config: VisibilityConfig
     """Settings of the depth buffer."""
 
@@ -146,10 +154,11 @@ class VisibilityWorker:
         return see(moved[0] if len(moved) > 0 else self.rig, joints, surfaces, self.skin, self.config)
 
     def all(self, frames: Iterable[FramePeople], workers: int = 1) -> Generator[Visibility, None, None]:
-        """Visibility frame after frame; in `workers` processes, or here if that is 1.
+        """Yield the visibility of each frame; computed in `workers` processes, or here if that is
+        1.
 
-        Frames are taken from `frames` as they are needed. Close the iterator (`contextlib.closing`) to end the
-        processes early. RuntimeError where one of them dies.
+        Frames are taken from `frames` on demand. Close the iterator (`contextlib.closing`) to end
+        the processes early. Raises RuntimeError if one of them dies.
         """
         with worker_processes(workers, self, AHEAD) as pool:
             yield from pool.map(VisibilityWorker.one, frames)
@@ -167,10 +176,10 @@ def facing(joints: Array, centres: Array) -> Array:
 
 
 def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array) -> Array:
-    """`seen` (V, P, 25) where a face joint's share decreases with its angle to the camera, whatever the depth
-    buffer says.
+    """`seen` (V, P, 25) with the share of face joints reduced by their angle to the camera, in
+    addition to the depth buffer.
 
-    `ramp` (5, 2) holds the cosines at which a face joint is wholly lost and wholly there.
+    `ramp` (5, 2) are the cosines at which a face joint becomes invisible, and fully visible.
     """
     low, high = ramp.T
     result = seen.copy()
@@ -179,14 +188,14 @@ def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array)
 
 
 def _commonest(who: Index, counts: Mask) -> Index:
-    """Mode (...,) of the values `who` (..., R) among those that count; of equally frequent ones, the first."""
+    """Mode (...,) of the values `who` (..., R) where `counts` is true; the first on a tie."""
     votes = ((who[..., :, None] == who[..., None, :]) & counts[..., None, :]).sum(axis=-1)
     best = np.where(counts, votes, 0).argmax(axis=-1)
     return np.take_along_axis(who, best[..., None], axis=-1)[..., 0]
 
 
 def _bones_near(parents: tuple[int, ...]) -> Array:
-    """(25, 24) 1 where a bone is a joint's own, or the parent or child of one."""
+    """(25, 24) 1 for a joint's own bones, and their parents and children."""
     adjacent = np.eye(len(parents))
     child, parent = np.arange(1, len(parents)), np.array(parents[1:])
     adjacent[child, parent] = adjacent[parent, child] = 1

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
-    """Vertices (P, Nv, 3), metres, of the rows that have a body, and which rows these are (P,)."""
+    """Vertices (P, Nv, 3), metres, of the rows with a body, and the indices (P,) of these rows."""
     from shapepose_fg.body.model.body_model import BodyParameters
 
     columns = [getattr(people, name) for name in BODY]
@@ -23,7 +23,9 @@ def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
 
 
 def joined(vertices: Real, faces: Whole) -> tuple[Array, Index]:
-    """Bodies (P, Nv, 3) that share `faces` (F, 3), as one mesh: vertices (P Nv, 3) and faces (P F, 3)."""
+    """Merge bodies (P, Nv, 3) with common `faces` (F, 3) to one mesh: vertices (P Nv, 3) and faces
+    (P F, 3).
+    """
     people, count = vertices.shape[:2]
     every = faces[None] + count * np.arange(people)[:, None, None]
     return vertices.reshape(people * count, 3).astype(np.float64), every.reshape(people * len(faces), 3)

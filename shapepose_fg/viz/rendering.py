@@ -1,4 +1,4 @@
-"""Renders triangle meshes into a camera: one z-buffer for visibility and for pictures.
+"""Renders triangle meshes into a camera with a z-buffer, for visibility tests and for pictures.
 
 Pixels follow OpenCV: the centre of the first pixel is (0, 0). A surface nearer than `NEAR_M` is not drawn.
 """
@@ -16,11 +16,12 @@ from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.decompositions import rigid
 
 NEAR_M = 0.05
-"""Depth below which faces with a corner are dropped, m: nothing is clipped."""
+"""Minimum depth, m: faces with a nearer corner are dropped, because faces are not clipped."""
 _FAR_M = 100.0
-"""Depth beyond which OpenCV draws no faces, m."""
+"""Maximum depth of faces that OpenCV draws, m."""
 _NUMBER = np.float32(2.0**-20)
-"""Colour step per vertex number: OpenCV takes colours of 0 to 1, and float32 holds these exactly."""
+"""Colour step per vertex number: OpenCV takes colours from 0 to 1, and float32 represents these
+steps exactly."""
 _FLAT = (
     cv2.TriangleRasterizeSettings()
     .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
@@ -30,12 +31,12 @@ _FLAT = (
 
 @dataclass(frozen=True)
 class Surface:
-    """The first surface on the ray of every pixel."""
+    """The first surface along the ray of every pixel."""
 
     depth: NDArray[np.float32]
-    """(H, W) depth along the optical axis, metres; inf where the ray meets nothing."""
+    """(H, W) depth along the optical axis, metres; inf if the ray hits nothing."""
     face: NDArray[np.int32]
-    """(H, W) index of the visible face; -1 where there is none."""
+    """(H, W) index of the visible face; -1 if there is none."""
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:
@@ -54,14 +55,14 @@ def zoom(camera: Camera, box: tuple[float, float, float, float], width: int) -> 
     left, top, right, bottom = box
     scale = width / (right - left)
     K = camera.K.copy()
-    # Edges, not centres, of pixels are scaled: hence the half pixels.
+    # The edges of pixels are scaled, not their centres, hence the half pixels.
     K[:2, 2] = (K[:2, 2] + 0.5 - (left, top)) * scale - 0.5
     K[:2, :2] *= scale
     return Camera(camera.name, K, camera.wTc, (width, max(1, round((bottom - top) * scale))))
 
 
 def scaled(camera: Camera, scale: float) -> Camera:
-    """Return the camera with an image of `scale` times the size, without its distortion."""
+    """Return the camera with an image of `scale` times the size, and without lens distortion."""
     width, height = camera.image_size
     return zoom(camera, (0.0, 0.0, width, height), max(1, round(width * scale)))
 
@@ -69,16 +70,18 @@ def scaled(camera: Camera, scale: float) -> Camera:
 def first_surface_at(
     points_world: Real, faces: Whole, camera: Camera, column: Index, row: Index
 ) -> tuple[NDArray[np.float32], Index]:
-    """Depth and vertex, each of the shape of `column` and `row`, of the first surface on the rays of some pixels.
+    """Depth (metres) and vertex index, each of the shape of `column` and `row`, of the first
+    surface along the rays of these pixels.
 
-    The vertex is the first corner of the visible face. inf and -1 where nothing is. Equal to the picture of
-    `rasterise`, in half the time. At most 2**20 points.
+    The vertex is the first corner of the visible face. Depth is inf and vertex -1 if the ray hits
+    nothing. Equal to the result of `rasterise`, in half the time. At most 2**20 points.
     """
     width, height = camera.image_size
-    # In double precision: what a product in single precision rounds depends on the processor, and moves edges.
+    # In double precision: single-precision products round differently on different processors,
+    # which moves edges.
     points = camera.cTw[:, :3] @ np.asarray(points_world, dtype=np.float64).T + camera.cTw[:, 3:]
     near = points[2] <= NEAR_M
-    if near.any():  # OpenCV draws a face that reaches behind the camera all over the image
+    if near.any():  # OpenCV would draw a face that extends behind the camera across the whole image
         faces = faces[~near[faces].any(axis=1)]
     if len(faces) == 0:
         return np.full(row.shape, np.inf, dtype=np.float32), np.full(row.shape, -1, dtype=np.intp)
@@ -91,12 +94,13 @@ def first_surface_at(
 
 
 def _as_opengl(points: Array, camera: Camera) -> NDArray[np.float32]:
-    """(N, 3) where a camera of 1 radian, y up, z back, sees points as `camera` sees `points` (3, N) of its own
-    frame.
+    """(N, 3) points for OpenCV's renderer (a camera with 1 rad field of view, y up, z backwards)
+    that project to the same pixels as `points` (3, N) in the frame of `camera`.
     """
     (width, height), K = camera.image_size, camera.K
     focal = height / 2 / np.tan(0.5)
-    # OpenCV's pixels have their centres at halves there; a shear moves the principal point to the middle.
+    # In the renderer, pixel centres are at half-integers; a shear moves the principal point to the
+    # image centre.
     right, down, ahead = points
     seen = np.empty((len(right), 3), dtype=np.float32)
     seen[:, 0] = (K[0, 0] * right + K[0, 1] * down + (K[0, 2] + 0.5 - width / 2) * ahead) / focal
@@ -106,13 +110,17 @@ def _as_opengl(points: Array, camera: Camera) -> NDArray[np.float32]:
 
 
 class _Canvas(threading.local):
-    """Reused buffers of a thread: new memory takes a third of the time of drawing."""
+    """Reused buffers of a thread, because allocating new memory would take a third of the drawing
+    time.
+    """
 
     def __init__(self) -> None:
         self._colour = self._depth = np.empty(0, dtype=np.float32)
 
     def blank(self, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Colour (H, W, 3), -1 everywhere, and depth (H, W), `_FAR_M` everywhere; until the next call."""
+        """Colour (H, W, 3), -1 everywhere, and depth (H, W), `_FAR_M` everywhere; valid until the
+        next call.
+        """
         if self._depth.shape != (height, width):
             self._colour = np.empty((height, width, 3), dtype=np.float32)
             self._depth = np.empty((height, width), dtype=np.float32)
@@ -126,7 +134,7 @@ _canvas = _Canvas()
 
 @lru_cache(maxsize=4)
 def _numbers(count: int) -> NDArray[np.float32]:
-    """(N, 3) colours that encode the numbers of vertices."""
+    """(N, 3) colours that encode vertex numbers."""
     number = np.zeros((count, 3), dtype=np.float32)
     number[:, 0] = np.arange(count, dtype=np.float32) * _NUMBER
     return number
@@ -136,9 +144,10 @@ def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int]) -> Sur
     """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H), by
     OpenCV.
 
-    1/depth is linear in the image, so that depth is exact inside a face. Corners that are NaN, or nearer than
-    `NEAR_M`, drop their faces. Faces seen from behind are left out: right, and twice as fast, for closed meshes
-    whose faces turn counter-clockwise when seen from outside. At most 2**20 faces are drawn.
+    1/depth is interpolated linearly in the image, so depth is exact inside a face. Faces with a
+    corner that is NaN, or nearer than `NEAR_M`, are dropped. Back faces are culled, which is
+    correct, and twice as fast, for closed meshes with faces that are counter-clockwise when seen
+    from outside. At most 2**20 faces are drawn.
     """
     width, height = size
     drawable = np.isfinite(xy).all(axis=1) & (depth > NEAR_M)
@@ -146,7 +155,7 @@ def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int]) -> Sur
     if len(index) == 0:
         nothing = np.full((height, width), np.inf, dtype=np.float32)
         return Surface(nothing, np.full((height, width), -1, dtype=np.int32))
-    # As in `_as_opengl`, for pixels: x / z and y / z are what OpenCV scales by its own focal length.
+    # As in `_as_opengl`, for pixels: OpenCV scales x / z and y / z by its own focal length.
     focal = height / 2 / np.tan(0.5)
     middle = np.array([width / 2, height / 2]) - 0.5
     flat = (xy - middle) * depth[:, None] / focal * (1.0, -1.0)

@@ -1,1 +1,3 @@
-"""An archive of recordings: a table of them, reconstructed on many processes, one queue of work for all."""
+"""An archive of recordings: reconstructs all recordings of a table on many processes, with a common
+queue of work.
+"""

@@ -1,4 +1,6 @@
-"""`shapepose-fg batch`: all recordings of a table, on this machine's processes or those of a Dask cluster."""
+"""`shapepose-fg batch`: reconstructs all recordings of a table, on processes of this machine or of
+a Dask cluster.
+"""
 
 import time
 from contextlib import ExitStack
@@ -32,9 +34,11 @@ def batch(
         RUN, "Number of recordings processed at once; by default as many as keep all processes busy."
     ),
 ) -> None:
-    """Reconstruct all recordings of a table: each as `reconstruct` would, to the byte, in one queue of work.
+    """Reconstruct all recordings of a table; each result has the same bytes as that of
+    `reconstruct`.
 
-    A recording that fails twice is left, and the others go on. Exit code 1 where one failed, 0 where none did.
+    After two failures, a recording is skipped, and the others continue. Exit code 1 if a recording
+    failed, otherwise 0.
     """
     from shapepose_fg.cli.batch.table import read_table
 
@@ -47,7 +51,7 @@ def batch(
 
 
 def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
-    """The batch, in a folder that no other process writes to."""
+    """Run the batch in a folder that is locked for other processes."""
     from shapepose_fg.cli.batch.runner import BatchRunner, look_at_all
     from shapepose_fg.cli.batch.status import Bars, BatchStatus
     from shapepose_fg.pipeline.cluster import local_cluster, look_at
@@ -65,8 +69,8 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
                 scheduler = opened.enter_context(local_cluster(running.workers or cores(), dashboard=True))
             else:
                 scheduler = look_at(str(running.cluster))
-            # One leader keeps five processes busy where it follows people itself, and ten where it does not; and
-            # while one recording is read or written another fills the queue.
+            # A coordinator keeps five workers busy if it does the tracking itself, and ten
+            # otherwise. While one recording is being read or written, another one fills the queue.
             most = max(2, min(1 + scheduler.processes // 6, cores()))
             count = min(at_once or most, len(todo))
             done = "" if len(todo) == len(entries) else f", {len(entries) - len(todo)} of them are already done"
@@ -91,7 +95,9 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
 def status_of(
     entries: "list[Entry]", output: Path, *, resume: bool, restart: bool
 ) -> "dict[str, RecordingStatus]":
-    """The status of every recording; with `restart`, or if its options have changed, it begins anew."""
+    """The status of every recording; with `restart`, or if its options have changed, it is
+    restarted from the beginning.
+    """
     from shapepose_fg.cli.batch.status import RecordingStatus, read_status
     from shapepose_fg.cli.batch.table import asked
 
@@ -117,7 +123,7 @@ def status_of(
 
 
 def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None:
-    """Print what will be done, and where it can be followed."""
+    """Print what will be done, and where its progress is shown."""
     place = "here" if here else f"at {scheduler.address}"
     print(f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True)
     if scheduler.processes == 0:

@@ -1,7 +1,8 @@
-"""Reconstruct the recordings of a batch, several at a time, each in a leader process of its own.
+"""Reconstruct the recordings of a batch, several at a time, each in its own coordinator process.
 
-The leader reads the recording, submits windows to the cluster, and writes the results. It is a process and not a
-thread, so that an error, a crash or the memory of one recording does not affect the others.
+The coordinator (`Leader`) reads the recording, submits windows to the cluster, and writes the
+results. It is a process and not a thread, so that an error, a crash or the memory of one recording
+does not affect the others.
 """
 
 import os
@@ -40,23 +41,24 @@ from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.pipeline.workers import Processes
 
 ATTEMPTS = 2
-"""Attempts after which a recording is given up; the others go on."""
+"""Maximum number of attempts for a recording."""
 _PATIENCE_S = 20.0
-"""Time that a leader may take to stop, s."""
+"""Maximum time for a coordinator to stop, s."""
 _LEAST, _USUAL = 0.1, 2.0
-"""Bytes of results per byte of detections: with many cameras and hands and faces in the files; usually."""
+"""Bytes of results per byte of detections: minimum, for many cameras and for files with hands and
+faces; and typical value."""
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """The work of one leader; plain data."""
+    """The work of one coordinator; plain data."""
 
     name: str
     """The name of the recording."""
     request: Request
-    """The options of the recording."""
+    """Options of the recording."""
     folder: Path
-    """The folder of its results."""
+    """Folder of its results."""
     cluster: str
     """Address of the scheduler."""
     sharing: int = 1
@@ -69,21 +71,21 @@ class Assignment:
 
 @dataclass(frozen=True)
 class BatchRunner:
-    """The recordings of a batch, and what reconstructs them."""
+    """The recordings of a batch, and how they are reconstructed."""
 
     entries: Sequence[Entry]
     """All recordings."""
     sizes: Mapping[str, int]
     """Size of the detections of each recording, bytes."""
     output: Path
-    """The folder of all results."""
+    """Folder of all results."""
     cluster: str
     """Address of the scheduler."""
     at_once: int
     """Number of recordings that run at a time."""
 
     def run(self, batch_status: BatchStatus, watcher: Bars) -> None:
-        """Reconstruct the recordings that are not done, and keep `batch_status` up to date.
+        """Reconstruct the unfinished recordings, and keep `batch_status` up to date.
 
         The largest recordings start first; those that failed are tried again after all others.
         """
@@ -106,11 +108,13 @@ class BatchRunner:
                 leader.ask_to_stop()
             for leader in leaders:
                 found = leader.end()
-                if found is not None:  # it was done when it was asked to stop
+                if found is not None:  # it finished before it was asked to stop
                     self._done(leader, found, batch_status)
 
     def _next(self, batch_status: BatchStatus, leaders: "Sequence[Leader]") -> Entry | None:
-        """The recording to start next; recordings whose predecessor failed are given up."""
+        """The recording to start next; if the predecessor of a recording failed, its status is set
+        to failed.
+        """
         led = {leader.assignment.name for leader in leaders}
         found: list[Entry] = []
         for entry in self.entries:
@@ -129,10 +133,10 @@ class BatchRunner:
         return min(found, key=lambda each: turn[each.name], default=None)
 
     def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
-        """Process the next message of a leader; returns whether it has ended."""
+        """Process the next message of a coordinator; returns whether it has ended."""
         name, told = leader.assignment.name, leader.next()
         if isinstance(told, tuple):
-            if batch_status.of[name].anew:  # what is kept now is this run's own
+            if batch_status.of[name].anew:  # what is saved from now on belongs to this run
                 batch_status.set(name, replace(batch_status.of[name], anew=False))
             watcher.frames(name, *told)
             return False
@@ -153,7 +157,7 @@ class BatchRunner:
 
 
 class Leader:
-    """A leader process, as seen from the process that started it."""
+    """A coordinator process, as seen from the process that started it."""
 
     def __init__(self, assignment: Assignment) -> None:
         """Start the process."""
@@ -161,21 +165,24 @@ class Leader:
         self.began = time.monotonic()
         """Start time, by `time.monotonic`."""
         self.told, tell = Pipe(duplex=False)
-        """Messages: (frames done, all frames); at the end `Ended`, or the reason of the failure."""
+        """Messages of the process: (finished frames, all frames); at the end `Ended`, or the reason
+        of the failure."""
         self._process = Processes(1, _tell_by, tell)
         tell.close()
         self._pid = self._process.submit(os.getpid)
         self._end = self._process.submit(_lead, assignment)
 
     def next(self) -> tuple[int, int] | Ended | str:
-        """The next message; a reason where the process has died."""
+        """The next message; if the process has died, the reason."""
         try:
             return self.told.recv()
         except (EOFError, OSError):
             return "its process was killed; there may be too little memory"
 
     def end(self) -> Ended | None:
-        """Wait for the process to end, or end it; returns the last `Ended` message, if there is one."""
+        """Wait for the process to end, and terminate it if necessary; returns the last `Ended`
+        message, if there is one.
+        """
         wait_for([self._end], _PATIENCE_S)
         self._process.shutdown()
         found = None
@@ -189,14 +196,14 @@ class Leader:
         return found
 
     def ask_to_stop(self) -> None:
-        """Ask the process to keep what is done and to stop; `end` waits for it."""
+        """Ask the process to save finished work and to stop; `end` waits for it."""
         with suppress(BrokenProcessPool, ProcessLookupError):
             if not self._end.done():
                 os.kill(self._pid.result(), signal.SIGTERM)
 
 
 _tell: Connection
-"""Connection of a leader to the process that started it."""
+"""Connection of a coordinator to the process that started it."""
 
 
 def _tell_by(tell: Connection) -> None:
@@ -205,7 +212,7 @@ def _tell_by(tell: Connection) -> None:
 
 
 def _lead(assignment: Assignment) -> None:
-    """The work of a leader process; all output is appended to the log of the recording."""
+    """Entry point of a coordinator process; all output is appended to the log of the recording."""
     use_any_streams()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
@@ -237,9 +244,9 @@ def _lead(assignment: Assignment) -> None:
 def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:
     """Check the inputs and output folders of all recordings; returns the size of each one's detections, bytes.
 
-    `begun` says whether interrupted runs in the folders will be continued or removed. InputError if something is
-    missing, wrong or in the way: it describes the first such recording and names others; or if the disk of
-    `output` has too little room.
+    `begun` means that interrupted runs in the folders will be continued or removed. InputError if
+    an input is missing or wrong, if existing results are in the way (it describes the first such
+    recording and names others), or if the disk of `output` has too little space.
     """
     sizes, problems = {}, []
     for entry in entries:

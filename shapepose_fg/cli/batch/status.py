@@ -1,4 +1,4 @@
-"""The status of every recording of a batch: batch.json, and what `shapepose-fg batch` prints."""
+"""The status of every recording of a batch: batch.json, and the output of `shapepose-fg batch`."""
 
 import json
 from dataclasses import asdict, dataclass, field, replace
@@ -30,28 +30,29 @@ class RecordingStatus:
     asked: dict[str, Any]
     """The options that differ from the defaults (`table.asked`)."""
     status: Literal["waiting", "done", "failed"] = "waiting"
-    """`failed`: it failed twice, or a recording that it depends on did."""
+    """`failed`: it failed twice, or a recording on which it depends failed."""
     attempts: int = 0
     """Number of attempts so far."""
     anew: bool = False
-    """Whether the next attempt removes what an earlier run left; false once the first frames are kept."""
+    """Whether the next attempt removes the files of an earlier run; false after the first frames
+    have been saved."""
     reasons: tuple[str, ...] = ()
-    """The reason of each failure."""
+    """Reason of each failure."""
     seconds: float = 0.0
     """Wall time of all attempts together, seconds; other recordings run at the same time."""
     frames: int | None = None
-    """Frames that were reconstructed; None before the recording is done, as in the fields below."""
+    """Number of reconstructed frames; None until the recording is done, as are the fields below."""
     rows: int | None = None
     people: int | None = None
     warnings: tuple[str, ...] = ()
 
     def done(self, found: "Ended", seconds: float) -> "RecordingStatus":
-        """The status after an attempt that succeeded and took so many seconds."""
+        """The status after a successful attempt of this duration, seconds."""
         attempts, seconds = self.attempts + 1, self.seconds + seconds
         return replace(self, status="done", attempts=attempts, anew=False, seconds=seconds, **asdict(found))
 
     def failed(self, reason: str, seconds: float, most: int) -> "RecordingStatus":
-        """The status after an attempt that failed; final after `most` attempts."""
+        """The status after a failed attempt of this duration, seconds; final after `most` attempts."""
         attempts, seconds = self.attempts + 1, self.seconds + seconds
         status = "failed" if attempts >= most else "waiting"
         return replace(self, status=status, attempts=attempts, seconds=seconds, reasons=(*self.reasons, reason))
@@ -59,10 +60,10 @@ class RecordingStatus:
 
 @dataclass
 class BatchStatus:
-    """The status of all recordings by name, kept in batch.json."""
+    """The status of all recordings by name, stored in batch.json."""
 
     file: Path
-    """batch.json."""
+    """Path of batch.json."""
     table: str
     """Path of the table of recordings."""
     of: dict[str, RecordingStatus] = field(default_factory=dict)
@@ -74,7 +75,7 @@ class BatchStatus:
         self.write()
 
     def write(self) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file, atomically."""
         content = {
             "format": _FORMAT,
             "table": self.table,
@@ -117,7 +118,9 @@ def read_status(file: Path) -> dict[str, RecordingStatus]:
 
 
 class Bars:
-    """Progress bars on stderr: one for the batch, one for each running recording; none without a terminal."""
+    """Progress bars on stderr: one for the batch, one for each running recording; none if stderr is
+    not a terminal.
+    """
 
     def __init__(self, bars: Progress, batch_status: BatchStatus) -> None:
         self._bars, self._status = bars, batch_status
@@ -126,15 +129,17 @@ class Bars:
         self._count()
 
     def began(self, name: str) -> None:
-        """Show a bar for a recording that has started."""
+        """Add a bar for a recording that has started."""
         self._tasks[name] = self._bars.add_task(name, total=None)
 
     def frames(self, name: str, done: int, count: int) -> None:
-        """Update the number of frames that are done."""
+        """Update the number of finished frames."""
         self._bars.update(self._tasks[name], completed=done, total=count)
 
     def ended(self, name: str, *, failed: str | None, again: bool) -> None:
-        """Print that a recording is done, or why it `failed`, and whether it is tried `again`."""
+        """Print that a recording is done, or the reason why it `failed` and whether it will be
+        tried `again`.
+        """
         self._bars.remove_task(self._tasks.pop(name))
         self._count()
         each = self._status.of[name]

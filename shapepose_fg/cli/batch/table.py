@@ -1,4 +1,4 @@
-"""recordings.toml: the recordings of an archive, and the options of each."""
+"""recordings.toml: reads the recordings of an archive, and the options of each."""
 
 import re
 from dataclasses import dataclass, fields, replace
@@ -26,18 +26,18 @@ class Entry:
     """One recording of the table."""
 
     name: str
-    """Name of the recording, and of the folder of its results."""
+    """Name of the recording, and of its results folder."""
     request: Request
     """Options of the recording."""
     after: str | None = None
-    """The recording whose people's shapes it starts with, and which it therefore waits for."""
+    """Name of an earlier recording with the same file of shapes, for which this one has to wait."""
 
 
 def read_table(path: Path) -> list[Entry]:
     """Read the recordings of a table, in its order.
 
-    Paths are relative to the table's folder and do not lead out of it, unless they are absolute. InputError that
-    names the file, the recording and the cure.
+    Paths are relative to the table's folder. They must not lead out of it, unless they are
+    absolute. InputError that names the file, the recording and the cure.
     """
     tables = read_toml(path)
     for key in tables.keys() - {"defaults", "recordings"}:
@@ -54,7 +54,7 @@ def read_table(path: Path) -> list[Entry]:
     for name, own in recordings.items():
         place = f"recordings.{name}"
         own = _table(own, path, place)
-        # When frames were taken is said in one way only.
+        # The times of frames are given by one option only.
         less = {"fps", "timestamps"} if own.keys() & {"fps", "timestamps"} else set()
         values = {key: value for key, value in defaults.items() if key not in less} | own
         request = config_from(values, Request, path, place=place, cure=_CURE)
@@ -69,7 +69,7 @@ def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
 
 
 def _check_names(names: list[str], path: Path) -> None:
-    """Refuse names that no folder can have, or that are equal on some systems."""
+    """InputError for names that are not valid for a folder, or that are equal on some file systems."""
     seen = {"batch.json": "batch.json"}
     for name in names:
         if _NAME.fullmatch(name) is None:
@@ -87,7 +87,7 @@ def _check_names(names: list[str], path: Path) -> None:
 
 
 def _located(request: Request, path: Path, place: str) -> Request:
-    """Return the request with its paths relative to the table's folder resolved."""
+    """Return the request with relative paths resolved against the table's folder."""
     given = {name: getattr(request, name) for name in _PATHS}
     if request.skeleton is not None and not layouts_called(request.skeleton):
         given["skeleton"] = Path(request.skeleton)
@@ -96,19 +96,19 @@ def _located(request: Request, path: Path, place: str) -> Request:
 
 
 def _inside(given: Path, path: Path, place: str) -> Path:
-    """A path relative to the table's folder, inside it; or an absolute one."""
+    """Resolve a path: relative to the table's folder and inside it, or absolute."""
     if "\0" in str(given):
         raise InputError(f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it")
     if not (is_inside(path.parent, given) or given.is_absolute()):
         raise InputError(
             f"{path}: {place}: {given} is outside the table's folder; if this is intended, give an absolute path"
         )
-    return path.parent / given  # itself, where it is absolute
+    return path.parent / given  # an absolute path stays unchanged
 
 
 def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
-    """Return the entries such that those that share a file of shapes wait for each other, in the order of the
-    table.
+    """Set `after`, so that entries with the same file of shapes wait for each other, in the order
+    of the table.
     """
     last: dict[Path, str] = {}
     projects: dict[tuple[Path, str | None], str] = {}
@@ -130,7 +130,7 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
 
 
 def asked(request: Request) -> dict[str, Any]:
-    """The options as plain values: equal for equal requests."""
+    """The options as plain values, which are equal for equal requests."""
     default, found = Request(), {}
     for name in (field.name for field in fields(request)):
         value = getattr(request, name)

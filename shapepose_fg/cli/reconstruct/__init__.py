@@ -1,1 +1,1 @@
-"""The command that reconstructs a recording."""
+"""The command `reconstruct`."""

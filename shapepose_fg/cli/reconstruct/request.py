@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from shapepose_fg.pipeline.config import PipelineConfig
 
 OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, CLOCKS, "report.html")
-"""The files in the folder of results."""
+"""The files of a results folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request(ProjectOptions, TimeOptions):
-    """One recording, and the options of `shapepose-fg reconstruct` for it, by their names."""
+    """The options of `shapepose-fg reconstruct` for one recording, by their names."""
 
     project: Path | None = option(
         INPUT, "Pose2Sim project: use its cameras, detections and settings; also write TRC and C3D."
@@ -65,7 +65,9 @@ class Request(ProjectOptions, TimeOptions):
     check: bool = option(RESULT, "Check whether cameras and detections fit.", True, "--check/--no-check")
 
     def rig(self) -> "Rig":
-        """The cameras, with `readout` for rolling shutters where the calibration has none."""
+        """The cameras, with the option `readout` for rolling shutters, if the calibration does not
+        define it.
+        """
         from shapepose_fg.core.camera import LONGEST_READOUT_S
 
         found = super().rig()
@@ -89,7 +91,7 @@ class Prepared:
     request: Request
     """The request; cameras, detections and times are those of the project if there is one."""
     project: "Pose2SimProject | None"
-    """The project that it belongs to; None where there is none."""
+    """The project to which it belongs; None if there is none."""
     calibration: Path
     """Path of the calibration."""
     detections: Path
@@ -99,12 +101,12 @@ class Prepared:
 
     @property
     def skeleton(self) -> "str | DeclaredJoints | None":
-        """The detector's joints as the user states, else as the project does."""
+        """The detector's joints as given by the user, otherwise by the project."""
         declared = None if self.project is None else self.project.joints
         return self.request.skeleton or declared
 
     def settings(self) -> "PipelineConfig":
-        """The settings; InputError where they contradict other options."""
+        """The settings; InputError if they contradict other options."""
         from shapepose_fg.io.config import read_config
         from shapepose_fg.pipeline.config import PipelineConfig
 
@@ -129,13 +131,15 @@ class Prepared:
         return found
 
     def span(self, count: int, first: int = 0) -> range:
-        """The wanted frames of a recording of `count`, in which nobody is seen before the `first`."""
+        """The wanted frames of a recording of `count` frames, in which no one is detected before
+        frame `first`.
+        """
         if self.project is not None and self.request.frames is None:
             return self.project.span(count)
         return frame_range(self.request.frames, count, first)
 
     def cuts(self, count: int) -> tuple[int, ...]:
-        """The cuts; InputError where a recording of `count` frames cannot have them."""
+        """The cuts; InputError if they are invalid for a recording of `count` frames."""
         from shapepose_fg.core.frame_times import check_cuts
 
         try:
@@ -150,8 +154,8 @@ class Prepared:
 def prepare(request: Request, output: Path | None, tell: Callable[..., None] = note) -> Prepared:
     """Find a request's paths, and check its options, before any large file is read.
 
-    `tell` receives notes on how a project's files were interpreted. InputError where something is missing or
-    wrong.
+    `tell` receives notes on how a project's files were interpreted. InputError if something is
+    missing or wrong.
     """
     from shapepose_fg.io.recording import times_beside
 

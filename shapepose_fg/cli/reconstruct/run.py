@@ -48,14 +48,14 @@ from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 @dataclass(frozen=True)
 class Ended:
-    """Summary of a reconstructed recording; plain data, which processes exchange."""
+    """Summary of a reconstructed recording; plain data, which is sent between processes."""
 
     frames: int
     """Number of reconstructed frames."""
     rows: int
-    """Number of rows of people.npz."""
+    """Number of rows in people.npz."""
     people: int | None
-    """Number of people over time; None frame by frame."""
+    """Number of people over time; None for frame-by-frame results."""
     warnings: tuple[str, ...]
     """Problems of cameras and detections."""
 
@@ -63,17 +63,17 @@ class Ended:
 def carry_out(
     known: Prepared, execution: Execution, *, resume: bool = False, restart: bool = False, overwrite: bool = False
 ) -> Ended:
-    """Execute a request, write the results into its folder, and print a summary.
+    """Execute a request: reconstruct, write the results into its folder, and print a summary.
 
-    `resume`, `restart` and `overwrite` are the command's options; `execution` without `progress` shows a bar.
-    InputError, one sentence, for invalid input; `Stopped`, with the state of the run, on Ctrl-C or a request to
-    end.
+    `resume`, `restart` and `overwrite` are the command's options; `execution` without `progress`
+    shows a bar. InputError, one sentence, for invalid input; `Stopped`, with the state of the run,
+    on Ctrl-C or SIGTERM.
     """
     output = known.output
     refuse_corrected(output)
     if (output / PEOPLE).exists() and not (overwrite or (resume and (output / manifest.PARTS).is_dir())):
         raise InputError(f"{output}: there is a finished result; give another --output, or --overwrite")
-    settings = known.settings()  # what is wrong with them is said before the whole recording is read
+    settings = known.settings()  # report wrong settings before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
         known = _synchronised(known, kept=resume and (output / manifest.PARTS).is_dir())
         asked = known.request
@@ -105,7 +105,7 @@ def carry_out(
             inputs |= checksums([settings.offsets.source])
         if fitter is not None and fitter.weights is not None and fitter.weights.file is not None:
             inputs |= checksums([fitter.weights.file])
-        del reading  # of half a million files it is large
+        del reading  # it is large for half a million files
         note(*_about_moving(task))
         report = check_setup(known, task) if asked.check and not rig.moves else None
         task = task if report is None else replace(task, detections=Trusted(recording, report.trust))
@@ -113,8 +113,8 @@ def carry_out(
 
 
 def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
-    """The request with the times of cameras that were started by hand, estimated from people, in
-    synchronised.csv beside the results; existing times where they are `kept`, of a resumed run.
+    """The request with synchronised.csv as its times: start times of cameras that were started by
+    hand, estimated from people. With `kept`, for a resumed run, an existing file is used.
     """
     asked, file = known.request, known.output / CLOCKS
     if not asked.synchronise:
@@ -130,7 +130,7 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
 
 
 def _about_moving(task: Task) -> list[str]:
-    """Notes on what is left out, and which pictures are not used, because cameras move."""
+    """Notes on pictures and settings that are not used because cameras move."""
     rig, (_, times, _) = task.rig, task.whole()
     if not rig.moves:
         return []
@@ -158,9 +158,10 @@ def _about_moving(task: Task) -> list[str]:
 
 @contextmanager
 def _recording_folder(folder: Path) -> Iterator[Path]:
-    """A folder for the detections while the block runs: in files, because they may be larger than memory.
+    """A temporary folder for the detections during the block, because they may be larger than
+    memory.
 
-    The remains of a killed run are removed.
+    Files of a killed run are removed.
     """
     shutil.rmtree(folder, ignore_errors=True)
     try:
@@ -171,23 +172,25 @@ def _recording_folder(folder: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class _Run:
-    """A reconstruction into a folder, whose input is read and checked."""
+    """A reconstruction with its output folder; the input has been read and checked."""
 
     task: Task
     """The arguments of the reconstruction."""
     recording: DetectionTable
-    """The detections as they were read."""
+    """The detections."""
     known: Prepared
     """The request."""
     inputs: dict[str, str]
-    """Checksums of the files that were read."""
+    """Checksums of the input files as read."""
     execution: Execution
-    """How it is executed."""
+    """How it is executed (processes, cluster)."""
     report: SetupReport | None
-    """Problems of cameras and detections; None where they were not checked."""
+    """Problems of cameras and detections; None if they were not checked."""
 
     def begun(self) -> dict[str, Any]:
-        """Everything that the result depends on, as plain values: equal for a resumed run."""
+        """Everything on which the result depends, as plain values, which are equal in a resumed
+        run.
+        """
         task, asked, skeleton = self.task, self.known.request, self.recording.skeleton
         frames, times, cuts = task.whole()
         return {
@@ -209,7 +212,7 @@ class _Run:
     def carried_out(self, *, resume: bool, restart: bool) -> Ended:
         """Reconstruct, and write the results into the folder; raises as `carry_out` does.
 
-        If interrupted, the finished part is kept there, and the next call with `resume` continues.
+        If interrupted, the finished part is saved there, and the next call with `resume` continues.
         """
         output = self.known.output
         if not (output / manifest.PARTS).is_dir():
@@ -219,7 +222,7 @@ class _Run:
                 note(f"{output}: there is no run to resume; a new one is started")
         kept = manifest.open_run(output, self.begun(), resume=resume, restart=restart)
         try:
-            # Of what is kept everything may be in order, and yet make no sense.
+            # All saved parts may be intact and still be inconsistent with each other.
             with naming(kept.folder, ANEW) if resume else nullcontext():
                 return self._finished(kept)
         except Stopped as stop:
@@ -230,7 +233,7 @@ class _Run:
             raise InputError(f"{what}; {self._standing()}") from None
 
     def _finished(self, kept: InFolder) -> Ended:
-        """The reconstruction, its files, and its summary."""
+        """Assemble the reconstruction, write its files, and return its summary."""
         asked, output, rig, frames = (
             self.known.request,
             self.known.output,
@@ -266,8 +269,7 @@ class _Run:
         people = people.with_run(**result.run)
         note(*set_aside(output))
         result.save(output)
-        # What the observations were seen with: to solve or draw them anew.
-        # `carry_out` refuses a part of the cameras of that very file.
+        # The cameras of the observations, for solving or drawing them again.
         if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
             write_rig(rig, output / CAMERAS)
         if not self.known.request.synchronise:
@@ -305,10 +307,10 @@ class _Run:
             written.append(f"{output / 'trajectories'}  poses of moving cameras: CSV with covariances, and TUM")
         if self.known.request.report:
             written.append(f"{write_report(output, people, rig, every=every)}  open it in a browser")
-        else:  # that of an earlier result would say what is no longer true
+        else:  # the report of an earlier result would be out of date
             (output / REPORT).unlink(missing_ok=True)
         if project is not None:
-            from shapepose_fg.io.export.markers import write_pose2sim_files  # with SciPy: a fifth of a second
+            from shapepose_fg.io.export.markers import write_pose2sim_files  # imports SciPy: a fifth of a second
 
             whole = people if len(people) == len(result) else result.reconstruction()
             made = write_pose2sim_files(whole, self.task.rig.up, project)
@@ -327,7 +329,7 @@ class _Run:
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:
-    """The people in `file`, for the body model in use; none where there is no such file yet."""
+    """The shapes in `file` for the body model in use; empty if the file does not exist yet."""
     model = fingerprint(BodyModel.default() if body is None else BodyModel.load(body))
     if file.exists():
         return SubjectShapes.load(file, model)
@@ -336,5 +338,5 @@ def _known_people(file: Path, body: Path | None) -> SubjectShapes:
 
 
 def _digest(value: Any) -> str:
-    """SHA-256 of plain values and arrays."""
+    """SHA-256 of a plain value or array."""
     return hashlib.sha256(json.dumps(value, default=plain).encode()).hexdigest()

@@ -19,7 +19,7 @@ from shapepose_fg.setup_check.report import ResultCheck, SetupReport, unseen
 from shapepose_fg.setup_check.report import check_setup as check_detections
 
 _SURE = 0.9
-"""Probability below which people are listed."""
+"""People with a probability below this are listed."""
 _KNOWN_WORDS = {
     "seen": "seen by two views",
     "weak": "seen by one view or weakly",
@@ -30,7 +30,7 @@ _KNOWN_WORDS = {
 
 
 def check_setup(known: Prepared, task: Task) -> SetupReport:
-    """Check whether cameras, detections and, for a project, videos fit each other."""
+    """Check whether cameras, detections and (for a project) videos are consistent."""
     frames, sizes = task.whole()[0], ()
     used = known.detections / FOOTAGE
     if used.is_file():
@@ -39,7 +39,7 @@ def check_setup(known: Prepared, task: Task) -> SetupReport:
         videos = known.project.folder / "videos"
         try:
             sizes = other_sizes([str(videos)], task.rig) if videos.is_dir() else ()
-        except InputError as error:  # the result does not need them
+        except InputError as error:  # the result does not depend on the videos
             note(f"{error}; their sizes are not checked")
     return check_detections(task.detections, task.rig, frames, sizes)
 
@@ -49,8 +49,8 @@ def summary_table(
 ) -> Table:
     """Summary of a reconstruction: people, quality, and times.
 
-    `people` are rows of the `result` of `task` with covariances of joints. For an `unchecked` one it also states
-    whether cameras see more people.
+    `people` are rows of the `result` of `task`, with covariances of joints. If the set-up was
+    `unchecked`, the summary also states whether cameras see people who were not reconstructed.
     """
     run, counts, span, cameras = result.run, result.counts(), task.whole()[0], len(task.rig)
     per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
@@ -79,7 +79,7 @@ def summary_table(
         f"{count} rows dropped: {reason}{_frames_words(run.get('dropped_frames', {}).get(reason, []))}"
         for reason, count in run.get("people", {}).get("dropped", {}).items()
     ]
-    if unchecked:  # else the check says it
+    if unchecked:  # otherwise the check reports it
         lasts = float(np.ptp(task.whole()[1].frame_s[span.start : span.stop])) * len(span) / max(len(span) - 1, 1)
         lost += unseen(task.detections, task.rig.names, span, per_frame, lasts if task.config.temporal else None)
     if len(lost) > 0:
@@ -93,7 +93,7 @@ def summary_table(
         table.add_row("", words, style="yellow")
     if len(people) > 0:
         table.add_row("joints", _joints(counts["joints"], people))
-    # Loading the body takes a third of a second, once; it says nothing about the time of a frame.
+    # Loading the body takes a third of a second once, and is not part of the time per frame.
     stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
     table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
     words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
@@ -102,8 +102,8 @@ def summary_table(
 
 
 def _doubtful(run: dict[str, Any]) -> str:
-    """People with a probability below `_SURE`; without identities the number of rows; empty where there are
-    none.
+    """People with a probability below `_SURE`; without identities, their number of rows; empty if
+    there are none.
     """
     said = run.get("probability", [])
     if isinstance(said, dict):
@@ -114,13 +114,13 @@ def _doubtful(run: dict[str, Any]) -> str:
 
 
 def _frames_words(spans: list[list[int]]) -> str:
-    """The frames in words, as far as there is room: run.json has all."""
+    """The frames in words, shortened to fit; run.json has all."""
     told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
     return f" (frames {' '.join(told)}{' ...' * (len(spans) > 4)})" if told else ""
 
 
 def _joints(count: dict[str, int], people: Reconstruction) -> str:
-    """How joints are known, as shares, and their standard deviations, in words."""
+    """Shares of joints by how they are known, and standard deviations, in words."""
     total = max(sum(count.values()), 1)
     shares = [f"{100 * count[how] / total:.1f} % {word}" for how, word in _KNOWN_WORDS.items() if count[how] > 0]
     variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3
@@ -130,7 +130,7 @@ def _joints(count: dict[str, int], people: Reconstruction) -> str:
 
 
 def show_check(checked: ResultCheck) -> None:
-    """Print the distance of each camera from the result, and on stderr the problems."""
+    """Print the residuals of each camera against the result, and on stderr any problems."""
     if len(checked.cameras) > 0:
         print()
         show(use_table(checked.cameras))

@@ -23,7 +23,7 @@ Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
 _SUFFIX = ".safetensors"
 ANEW = "start that run again with --restart"
-"""What an error message tells the user to do about a damaged set."""
+"""Cure in error messages about a damaged set."""
 _SAID = {"about", "arrays", "sha256"}
 """Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all
 metadata."""

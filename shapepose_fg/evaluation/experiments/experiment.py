@@ -69,7 +69,7 @@ class Experiment:
     name: str
     """Name in the table's marks in the documentation."""
     rows: Mapping[str, Sequence[Case]]
-    """Name of each row, and the cases whose figures it combines; a case may be in several rows."""
+    """For each row, its name and the cases that are combined in it; a case may be in several rows."""
     columns: Sequence[Column]
     """Columns of the table after the first, which has the names of the rows."""
 
@@ -82,7 +82,7 @@ class Experiment:
         return every
 
     def only(self, wanted: Callable[[str], bool]) -> "Experiment":
-        """Return the experiment with only the cases for whose names `wanted` is true."""
+        """Return the experiment with only those cases for which `wanted(name)` is true."""
         rows = {label: [case for case in row if wanted(case.name)] for label, row in self.rows.items()}
         return replace(self, rows={label: row for label, row in rows.items() if len(row) > 0})
 

@@ -165,8 +165,8 @@ class KeptPeople:
         return np.where(every[..., 2:] > 0, every[..., :2], np.nan)
 
     def blocks(self, *, last_time: bool = False) -> Iterator[PeopleBlock]:
-        """The people, sorted by frame; with `last_time`, blocks are dropped from storage as they
-        are read.
+        """The people, sorted by frame. With `last_time`, blocks are deleted from storage after they
+        have been read.
         """
         for name in self._names:
             block = PeopleBlock(*(self._kept.array(name, key) for key in ("frame", "keypoints")))

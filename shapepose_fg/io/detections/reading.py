@@ -273,8 +273,8 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
 def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:
     """The people of every camera as candidates, notes on their scores and frames, and the table's `first`.
 
-    If all files list only frames with people, frame numbers are used as they are, and earlier
-    frames are empty.
+    If all files list only frames with people, frame numbers are kept, and frames before the first
+    listed one are empty.
     """
     cameras = [each.camera for each in people]
     first, last = _span(cameras)

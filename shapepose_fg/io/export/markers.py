@@ -158,8 +158,8 @@ def _write_c3d(
 ) -> None:
     """One person's file from the first to the last frame with a marker; several of 65,535 frames.
 
-    `take` is at one rate. `name` gives a file's name without ending: of all frames (None), or of the first to the
-    last frame in it.
+    `take` has a constant rate. `name` returns a file's name without extension: for all frames
+    (None), or for its first and last frame.
     """
     first, stop = int(markers.frames[0]), int(markers.frames[-1]) + 1
     for start in range(first, stop, _MOST):

@@ -97,7 +97,7 @@ class Motion:
             given, rotations, pelvis = self.index[part], self.rotations[part], self.pelvis[part]
             index = np.arange(given[0], given[-1] + 1)
             if len(index) > len(given):
-                from scipy.spatial.transform import Rotation, Slerp  # a sixth of a second, and no hole in most
+                from scipy.spatial.transform import Rotation, Slerp  # slow to import; only for gaps
 
                 turns = [Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)]
                 rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)

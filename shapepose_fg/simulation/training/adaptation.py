@@ -1,4 +1,6 @@
-"""The learned fitter for another body: the shipped network translated to that body's shapes, and trained on it."""
+"""Adapts the learned fitter to another body: converts the package's network to that body's shapes,
+and trains it.
+"""
 
 import json
 from collections.abc import Callable, Mapping
@@ -32,9 +34,9 @@ from shapepose_fg.simulation.training.train import (
 
 TRAINED, PLAIN = "trained", "plain optimiser"
 _RIDGE_M = 0.005
-"""Movement of points by a shape component, m, below which it is ignored in the other body."""
+"""Displacement of points by a shape component, m, below which it is ignored in the other body."""
 _SLOWER = 0.2
-"""Learning rate relative to that of training from scratch: this network needs small changes only."""
+"""Learning rate relative to training from scratch, since only small changes are needed."""
 _CALIBRATION_PEOPLE = 4096
 _SEEN = tuple(range(len(BODY_25)))
 
@@ -47,17 +49,17 @@ def adapted(
     card: Mapping[str, str],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FitterWeights, dict[str, Score]]:
-    """The shipped weights trained on `motions` for `body`; and their scores and the plain optimiser's on `unseen`
-    ones.
+    """Train the package's weights on `motions` for `body`; also returns scores of these and of the
+    plain optimiser on `unseen` motions.
 
-    Covariances are calibrated on `unseen`. `card` describes the motions; `progress` is called with the number of
-    finished iterations and of all.
+    Covariances are calibrated on `unseen`. `card` describes the motions; `progress` is called with
+    the number of finished iterations and of all.
     """
     shipped, frame = FitterWeights.default(), PersonFrame.of(body, motions.poses, motions.weight)
     rate = _SLOWER * config.learning_rate
     config = replace(config, network=shipped.network.config, learning_rate=rate)
     torch.manual_seed(config.seed)
-    # The network lives on a GPU where there is one, the bodies on the CPU.
+    # The network is on a GPU if available, the bodies on the CPU.
     network = translated(shipped, BodyModel.default(), body).to("cuda" if torch.cuda.is_available() else "cpu")
     trainer = Trainer(PeopleSource(motions, body, frame, config), frame, network, config)
     for done, _ in enumerate(trainer.run(config.iterations), start=1):
@@ -76,10 +78,12 @@ def adapted(
 
 
 def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -> TrainedNetwork:
-    """The network of `weights` for `body`: shapes are converted from those of `trained_on`, all else stays.
+    """The network of `weights` for `body`: shapes are converted from those of `trained_on`, all
+    else is kept.
 
-    With betas c = M b of the body that it knows, the same person has b = N c: by least squares of all points. So
-    its input is M b and the gradient Nᵀ dE/db, and its step in b is N times its output.
+    The same person has betas c = M b in the body that the network knows, and b = N c, by least
+    squares over all points. So its input is M b and the gradient Nᵀ dE/db, and its step in b is N
+    times its output.
     """
     network = TrainedNetwork.of(weights.network)
     if fingerprint(body) == weights.body:
@@ -100,5 +104,5 @@ def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -
 
 
 def _solved(by: Array, wanted: Array) -> Tensor:
-    """X (10, 10) with `by` X closest to `wanted`."""
+    """Least-squares X (10, 10) with `by` X close to `wanted`."""
     return torch.from_numpy(np.linalg.solve(by.T @ by + _RIDGE_M**2 * np.eye(10), by.T @ wanted)).float()

@@ -1,10 +1,10 @@
-"""Corrupts true joints as a detector and triangulation do, for the targets that a fitter is trained on.
+"""Corrupts true joints like a detector with triangulation, to make training targets for a fitter.
 
-Half of the people are seen by a few virtual cameras: each view hides some joints, misses some, and reports the
-others with a confidence and an error drawn from the simulator's tables; the views' rays are triangulated with the
-weights that the pipeline gives them. So depth is worse than width, a joint may be a single ray, and stated
-covariances are sometimes wrong. The rest have plain isotropic noise. Then whole limbs, sides and halves are
-removed, joints become outliers, and sides are swapped.
+Half of the people are seen by a few virtual cameras: each view hides some joints, misses some, and
+reports the others with a confidence and an error drawn from the simulator's tables; the rays are
+triangulated with the pipeline's weights. So depth is worse than width, a joint may be a single ray,
+and stated covariances are sometimes wrong. The rest have isotropic noise. Then whole limbs, sides
+and halves are removed, joints become outliers, and sides are swapped.
 """
 
 from dataclasses import dataclass
@@ -22,18 +22,18 @@ _NEAREST = {
     "head": "Nose", "collar": "Neck", "hip": "LHip", "knee": "LKnee", "ankle": "LAnkle", "foot": "LBigToe",
     "shoulder": "LShoulder", "elbow": "LElbow", "wrist": "LWrist", "hand": "LWrist",
 }  # fmt: skip
-"""Nearest joint of the points for which there are no statistics of the detector, whose errors they get."""
+"""Joint with statistics that is used for points without their own."""
 _GROUP = torch.tensor(
     [
         int(JOINT_GROUP[BODY_25.index(name if name in BODY_25.joints else _NEAREST[name.split("_")[-1]])])
         for name in BODY_POINTS
     ]
 )
-"""(K,) rows of the statistics' tables."""
+"""(K,) row of each point in the statistics' tables."""
 
 
 def _named(*parts: str) -> Tensor:
-    """(K,) 1 for the points whose name holds one of `parts`."""
+    """(K,) 1 for the points with one of `parts` in their name."""
     return torch.tensor([float(any(part in name for part in parts)) for name in BODY_POINTS])
 
 
@@ -47,45 +47,47 @@ _ARM = _HAND + _named("Elbow", "elbow", "Shoulder", "shoulder")
 _FACE = _named("Nose", "Eye", "Ear", "Head") + torch.tensor([float(name == "head") for name in BODY_POINTS])
 _FOREARM = _ARM - _named("Shoulder", "shoulder")
 _LIMBS = torch.stack([part * side for part in (_ARM, _LEG, _SHIN, _FOREARM) for side in (_LEFT, _RIGHT)])
-"""(8, K) arms and legs, whole and without their first joint."""
+"""(8, K) masks of arms and legs, complete and without their first joint."""
 _REGIONS = torch.stack([_LEFT, _RIGHT, _LEG, _ARM, _FACE, 1 - _LEG])
-"""(6, K) one side, everything below the hips, both arms, the head, everything but the legs."""
+"""(6, K) masks: one side, everything below the hips, both arms, the head, everything
+but the legs."""
 _SWAPPED = torch.stack([_LEG, _SHIN, _ARM, _HAND, _LEG + _ARM])
 _MIRROR = torch.tensor(MIRROR)
 
 _PIPELINE_SIGMA_M = 0.013
-"""Standard deviation that the pipeline states for a joint, m, divided by the confidence (see `observations`)."""
+"""Standard deviation stated by the pipeline for a joint of confidence 1, m (see `observations`)."""
 
 
 @dataclass(frozen=True)
 class CorruptionConfig:
-    """Probabilities of corruptions; shares of people unless stated otherwise."""
+    """Probabilities of corruptions, per person unless stated otherwise."""
 
     triangulated: float = 0.5
-    """Share of people whose targets come from virtual cameras; the others' have isotropic noise."""
+    """Share of people with targets from virtual cameras; the others have isotropic noise."""
     clean: float = 0.3
-    """Share without noise among the people with isotropic noise."""
+    """Share of noise-free people among those with isotropic noise."""
     limb: float = 0.45
-    """One limb is missing; two limbs with the square of this."""
+    """Probability that a limb is missing; two limbs with its square."""
     region: float = 0.08
-    """A side, a half or the head is missing."""
+    """Probability that a side, a half or the head is missing."""
     single: float = 0.5
-    """Largest share of joints that are missing one by one."""
+    """Maximum share of joints that are missing individually."""
     complete: float = 0.25
-    """No joint is removed."""
+    """Probability that no joint is removed."""
     outlier: float = 0.012
-    """Share of joints that are off by 25 cm (one sigma per axis) though their stated information is that of a
+    """Share of joints with an error of 25 cm (sigma per axis) despite the stated information of a
     good joint."""
     swap: float = 0.04
-    """Left and right of a limb are swapped."""
+    """Probability of a left-right swap of a limb."""
 
 
 def corrupt(
     xyz: Tensor, offered: Tensor, generator: torch.Generator, config: CorruptionConfig | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Targets (B, K, 3), metres, and their information (B, K, 3, 3), 1/m², of true points `xyz` (B, K, 3).
+    """Targets (B, K, 3), metres, and their information (B, K, 3, 3), 1/m², from true points `xyz`
+    (B, K, 3).
 
-    `offered` (B, K) is 1 for the points of each one's skeleton. y is up.
+    `offered` (B, K) is 1 for the points of each person's skeleton. y is up.
     """
     config = CorruptionConfig() if config is None else config
     draw = _Draw(generator)
@@ -130,7 +132,9 @@ def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
 
 
 def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
-    """Targets with isotropic noise, 2 to 40 mm before it is varied from joint to joint, and their information."""
+    """Targets with isotropic noise, 2 to 40 mm before a variation per joint, and their
+    information.
+    """
     B, K = xyz.shape[:2]
     base = torch.exp(torch.log(torch.tensor(0.002)) + draw.uniform(B, 1) * torch.log(torch.tensor(20.0)))
     base = base * (draw.uniform(B, 1) >= clean)
@@ -141,7 +145,9 @@ def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
 
 
 def triangulated(xyz: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tuple[Tensor, Tensor]:
-    """Joints as 2 to 8 virtual cameras around the person would give them, far enough for parallel rays."""
+    """Joints as triangulated by 2 to 8 virtual cameras around the person, distant enough for
+    parallel rays.
+    """
     B, K = xyz.shape[:2]
     target, information = torch.zeros(B, K, 3), torch.zeros(B, K, 3, 3)
     number = 2 + draw.integers(7, B, 1)
@@ -157,7 +163,7 @@ def triangulated(xyz: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tu
         error = sigma[..., None] * draw.normal(B, K, 3)
         information = information + weight
         target = target + (weight @ (xyz + error)[..., None]).squeeze(-1)
-    # Along a single ray nothing is known: the triangulation puts the joint anywhere.
+    # A single ray leaves the depth unobserved: triangulation gives an arbitrary position.
     anywhere = xyz + 0.4 * draw.normal(B, K, 3)
     little = 0.5
     solved = inverse_3x3(information + little * torch.eye(3)) @ (target + little * anywhere)[..., None]
@@ -165,7 +171,9 @@ def triangulated(xyz: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tu
 
 
 def _camera(B: int, draw: _Draw) -> tuple[Tensor, Tensor]:
-    """Unit vectors (B, 3) from the person to a camera, and one in the image's plane."""
+    """Unit directions (B, 3) from the person to a camera, and unit vectors (B, 3) in the image's
+    plane.
+    """
     turn, rise = 2 * torch.pi * draw.uniform(B), torch.deg2rad(60 * draw.uniform(B) - 10)
     direction = torch.stack((rise.cos() * turn.cos(), rise.sin(), rise.cos() * turn.sin()), -1)
     tilt = 2 * torch.pi * draw.uniform(B)
@@ -175,7 +183,9 @@ def _camera(B: int, draw: _Draw) -> tuple[Tensor, Tensor]:
 
 
 def _hidden(xyz: Tensor, direction: Tensor, across: Tensor, draw: _Draw) -> Tensor:
-    """(B, K) 0 visible, 1 hidden by the own body, 2 by another person, whose edge runs straight over the image."""
+    """(B, K) 0 visible, 1 self-occluded, 2 occluded by another person with a straight edge in the
+    image.
+    """
     B, K = xyz.shape[:2]
     middle = xyz.mean(1, keepdim=True)
     behind = ((xyz - middle) @ direction[..., None]).squeeze(-1) < -0.05
@@ -186,7 +196,9 @@ def _hidden(xyz: Tensor, direction: Tensor, across: Tensor, draw: _Draw) -> Tens
 
 
 def _reports(state: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tuple[Tensor, Tensor, Tensor]:
-    """Detections of one view for joints in `state` (B, K): missed or not, true sigma and stated sigma, metres."""
+    """Detections of one view for joints in `state` (B, K): missed or not, true sigma and stated
+    sigma, metres.
+    """
     B, K = state.shape
     group = _GROUP.expand(B, K)
     missed = draw.uniform(B, K) < _table(statistics.miss)[group, state]

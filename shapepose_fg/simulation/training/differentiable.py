@@ -1,8 +1,8 @@
-"""The differentiable parts of training, in torch: the update network's layers, its steps, and the points of a
-body.
+"""Differentiable parts of training in torch: layers of the update network, its steps, and points of
+a body.
 
-The network's input is computed by the fitter's own code (`body/fitting/descent.py`), which has no gradient. Fits
-use NumPy's network (`body/fitting/network.py`); a test compares the two.
+The network's input is computed by the fitter's own code (`body/fitting/descent.py`), without a
+gradient. Fits use the NumPy network (`body/fitting/network.py`); a test compares the two.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,9 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 
 
 class TrainedNetwork(nn.Module):
-    """A trainable `UpdateNetwork`. Its last layer starts at zero, so that an untrained one makes no step."""
+    """A trainable `UpdateNetwork`. Its last layer is initialised to zero, so that an untrained one
+    makes no steps.
+    """
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -46,11 +48,13 @@ class TrainedNetwork(nn.Module):
         return found
 
     def finished(self) -> UpdateNetwork:
-        """Return this network as the fitter uses it."""
+        """Return this network in the fitter's form."""
         return UpdateNetwork(self.config, {name: value.cpu().numpy() for name, value in self.state_dict().items()})
 
     def forward(self, inputs: Tensor, step: int) -> Tensor:
-        """(B, `NUM_PARAMETERS`) the change of the parameters in update number `step`; inputs (B, `num_inputs`)."""
+        """(B, `NUM_PARAMETERS`) change of the parameters in update `step`; inputs (B,
+        `num_inputs`).
+        """
         place, count = self.leave.weight.device, UpdateNetwork.num_inputs
         with torch.autocast(place.type, torch.bfloat16, enabled=self.training and self.config.half_precision):
             weight, bias = self.enter.weight, self.enter.bias + self.enter.weight[:, count + step]
@@ -78,7 +82,7 @@ class DescentTargets:
     xyz: Tensor
     """(B, K, 3) metres, finite."""
     information: Tensor
-    """(B, K, 3, 3) 1/m², the model's error included; zero for a joint that was not seen."""
+    """(B, K, 3, 3) information, 1/m², including the model's error; zero for an unseen joint."""
 
 
 @dataclass(frozen=True)
@@ -88,13 +92,15 @@ class State:
     betas: Tensor
     """(B, 10) shape."""
     local: Tensor
-    """(B, 24, 3, 3) rotations relative to the parent, the root's to the person's frame."""
+    """(B, 24, 3, 3) rotations relative to the parent; for the root, to the person's frame."""
     transl: Tensor
-    """(B, 3) metres."""
+    """(B, 3) translation, metres."""
 
 
 def unroll(see: Sight, network: TrainedNetwork, state: State, targets: DescentTargets) -> Iterator[State]:
-    """The states after each update of bodies that `see` their targets. Each starts from the last one detached."""
+    """Yield the state after each update, with network inputs from `see`; each starts from the last
+    one detached.
+    """
     xyz, information = (value.double().numpy() for value in (targets.xyz, targets.information))
     scale = network.gradient_scale.cpu().numpy()
     for step in range(network.config.steps):
@@ -114,7 +120,7 @@ def positions(points: SkinnedPoints, state: State) -> Tensor:
         for part in (points.offsets, points.offsets_shape, points.root, points.root_shape, points.translation)
     )
     world = [state.local[:, 0]]
-    for bone in range(1, len(SMPL_PARENTS)):  # parents come before their children
+    for bone in range(1, len(SMPL_PARENTS)):  # parents first
         world.append(world[SMPL_PARENTS[bone]] @ state.local[:, bone])
     terms = offsets + torch.einsum("bn,nkyj->bkyj", state.betas, by_shape)
     if points.offsets_pose is not None:
@@ -125,9 +131,10 @@ def positions(points: SkinnedPoints, state: State) -> Tensor:
 
 
 def inverse_3x3(matrix: Tensor) -> Tensor:
-    """Inverses (..., 3, 3) by cross products of the rows; a singular matrix gives infinities, not an error.
+    """Inverses (..., 3, 3) by cross products of the rows; a singular matrix gives infinities, not
+    an error.
 
-    LAPACK would go through a batch one by one.
+    LAPACK would process a batch one by one.
     """
     a, b, c = matrix.unbind(-2)
     columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)

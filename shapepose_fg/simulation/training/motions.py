@@ -1,4 +1,6 @@
-"""Poses of recorded people, frame by frame: CMU's .npz or a folder of AMASS files, split by subject for good."""
+"""Poses of recorded people, by frame: CMU's .npz or a folder of AMASS files, with a fixed split by
+subject.
+"""
 
 import hashlib
 from dataclasses import dataclass
@@ -21,15 +23,15 @@ from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 Split = Literal["train", "validation", "test"]
 
 SPLITS: tuple[Split, ...] = get_args(Split)
-"""The three parts: for training, for choosing settings, and for reporting."""
+"""Names of the splits: for training, for choosing settings, and for reporting."""
 
 TEST_SUBJECTS = ("60", "61", "02", "08", "16", "43", "94", "139")
-"""CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and jumps, a bar,
-Indian dance, getting up."""
+"""CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and
+jumps, a bar, Indian dance, getting up."""
 VALIDATION_SUBJECTS = ("06", "12", "127", "140")
 """CMU subjects on which settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
 UNKNOWN_SUBJECT = "?"
-"""Subject of a recording without one: used for training, never for reports."""
+"""Subject of a recording without one: used for training only."""
 
 ACKNOWLEDGEMENT = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. "
@@ -41,30 +43,31 @@ MIRROR_JOINTS = tuple(place - BODY_POINTS.index(SMPL_24[0]) for place in MIRROR[
 SEGMENT_CAP = 300
 """Maximum weight of one recording, frames (10 s)."""
 SUBJECT_CAP = 1500
-"""Maximum weight of one subject, frames: 13,000 frames of one climber are one person's habit."""
+"""Maximum weight of one subject, frames: 13,000 frames of one climber show one person's habits."""
 WALK_CAP = 0.25
-"""Maximum share of all walking in the weight of a split. Learning from 0.25 instead of 0.15 gave walks of
-unseen people 1.6 nats a frame and took 0.1 from everything else; without a cap 0.6 more for 0.1 more."""
+"""Maximum share of walking in the weight of a split. With 0.25 instead of 0.15, likelihoods of
+unseen people's walks rise by 1.6 nats a frame, and those of all else fall by 0.1; without a cap by
+a further 0.6 and 0.1."""
 TARGET_FPS = 30.0
-"""Approximate frame rate to which AMASS recordings are thinned, Hz: every k-th frame, nothing interpolated."""
+"""Approximate frame rate to which AMASS recordings are decimated, Hz: every k-th frame, without
+interpolation."""
 
 _LEANING_RAD = 0.15
-"""Standard deviation of the lean of drawn people, rad."""
+"""Standard deviation of the lean of sampled people, rad."""
 _WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
 _BODY_COLUMNS = 66
 """Number of columns of root and 21 body joints, which SMPL, SMPL+H and SMPL-X files have in common."""
 _Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])
 """Rotation from AMASS, z up, to SMPL's own frame, y up."""
 _NOT_MOTIONS = ("shape.npz", "_stagei.npz")
-"""Suffixes of files beside motions in AMASS."""
+"""Suffixes of other files than motions in AMASS."""
 
 
 def split_of(subject: str) -> Split:
-    """The part that a `subject` belongs to.
+    """The split of a `subject`.
 
-    CMU's subjects are known by their numbers, written as CMU writes them ("02", "139"): a copy of the same
-    recordings in another collection is in the same part. Others are assigned by a stable hash of the name, 8 : 1 :
-    1.
+    CMU's subjects have their original numbers ("02", "139"), so that copies of a recording in other
+    collections are in the same split. Others are assigned by a stable hash of the name, 8 : 1 : 1.
     """
     if subject in TEST_SUBJECTS:
         return "test"
@@ -98,7 +101,7 @@ class Motions(Table):
             raise ValueError("poses must be finite: leave out frames that were not recorded")
 
     def of(self, split: Split) -> "Motions":
-        """The frames of the subjects of one part."""
+        """The frames of the subjects of one split."""
         if split not in SPLITS:
             raise ValueError(f"split must be one of {' '.join(SPLITS)}, got {split!r}")
         subjects, place = np.unique(self.subject, return_inverse=True)
@@ -106,7 +109,9 @@ class Motions(Table):
 
 
 def drawn_motions(count: int, seed: int) -> Motions:
-    """Poses of the pose prior, upright and with any heading: training data without recordings."""
+    """Poses sampled from the prior, upright and with any heading: training data without
+    recordings.
+    """
     rng = np.random.default_rng(seed)
     root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
@@ -119,11 +124,11 @@ _Recording = tuple[str, bool, NDArray[np.float32]]
 
 
 def load_motions(path: str | Path) -> Motions:
-    """All recordings in `path`; InputError where it cannot be used.
+    """Read all recordings in `path`; raises InputError if it is unusable.
 
-    A file is read as CMU's motions in SMPL's structure (`simulation.mocap`), a folder as AMASS: every `.npz` in it
-    and below, `poses` (T, 66 or more), `mocap_framerate` or `mocap_frame_rate`; the folder that holds a file names
-    its subject.
+    A file is read as CMU's motions in SMPL's structure (`simulation.mocap`), a folder as AMASS: all
+    `.npz` in it and below, with `poses` (T, 66 or more) and `mocap_framerate` or
+    `mocap_frame_rate`; the subject is the name of the file's folder.
     """
     path = Path(path)
     if path.is_dir():
@@ -144,7 +149,9 @@ def load_motions(path: str | Path) -> Motions:
 
 
 def frame_weights(length: Whole, subject: NDArray[np.str_], walking: Mask) -> Array:
-    """Weight (S,) of a frame of each of S recordings: recordings, subjects and walking are capped, by split."""
+    """Weight (S,) of a frame in each of S recordings: recordings, subjects and walking are capped,
+    per split.
+    """
     total = np.minimum(length.astype(np.float64), SEGMENT_CAP)
     for name in np.unique(subject):
         rows = subject == name
@@ -167,7 +174,7 @@ def _of_clip(clip: Clip) -> _Recording:
 
 
 def _read_amass(path: Path) -> _Recording:
-    """One AMASS file, thinned to about 30 frames a second and turned to y up; hands are left out."""
+    """One AMASS file, decimated to about 30 Hz and rotated to y up, without hands."""
     poses, fps = _amass_arrays(path)
     step = max(1, round(fps / TARGET_FPS))
     kept = np.zeros((len(poses[::step]), 24, 3))
@@ -177,7 +184,7 @@ def _read_amass(path: Path) -> _Recording:
 
 
 def _amass_arrays(path: Path) -> tuple[Array, float]:
-    """`poses` (T, 66 or more) and frame rate of an AMASS file, checked."""
+    """`poses` (T, 66 or more) and frame rate of an AMASS file, validated."""
     rates = ("mocap_framerate", "mocap_frame_rate")
     arrays = read_npz(path, ("poses", *rates), "copy it again")
     rate = next((name for name in rates if name in arrays), None)

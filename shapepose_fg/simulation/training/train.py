@@ -1,5 +1,5 @@
-"""Trains the update network: draws people, corrupts their joints, unrolls updates, scores every iterate;
-calibrates.
+"""Training of the update network: samples people, corrupts joints, unrolls updates; calibration and
+scores.
 """
 
 import time
@@ -33,9 +33,10 @@ from shapepose_fg.simulation.training.differentiable import (
 from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 
 INSIDE = 0.9
-"""Share of the joints inside the ellipsoid of that probability from the stated prior covariance."""
+"""Probability of the ellipsoids of the stated prior covariance for which the share of joints inside
+is calibrated."""
 _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
-"""Skeletons for calibration; the last one that has a point determines its value."""
+"""Skeletons for calibration; for a shared point the last one counts."""
 _ENOUGH = 50
 """Minimum number of joints for a calibration."""
 
@@ -51,31 +52,33 @@ class TrainingConfig:
     batch: int = 256
     """Number of people per batch."""
     learning_rate: float = 1.5e-3
-    """Largest learning rate, after a twentieth of the iterations; it falls to zero by a cosine."""
+    """Maximum learning rate, after a twentieth of the iterations; it decays to zero by a cosine."""
     weight_decay: float = 0.02
     """Weight decay of AdamW."""
     averaging: float = 0.999
-    """Decay of the exponential moving average of the weights over iterations; the averaged weights are shipped."""
+    """Decay of the exponential moving average of the weights over iterations; the averaged weights
+    are the result."""
     model_sigma_m: float = 0.02
     """Standard deviation added to every target, m, as in the fitter."""
     kernel_scale: float = 6.0
-    """Width of the robust kernel of the energy whose gradient the network receives, in standard deviations."""
+    """Width of the robust kernel of the energy that gives the network's gradient, in standard
+    deviations."""
     shake_rad: float = 0.05
-    """Standard deviation added to recorded angles, rad: bodies and recordings are inexact."""
+    """Standard deviation of noise on recorded angles, rad; bodies and recordings are inexact."""
     exchange: float = 0.15
-    """Share of people who get an arm or a leg of another person."""
+    """Share of people with an arm or a leg from another person."""
     skeletons: tuple[float, ...] = (0.55, 0.15, 0.15, 0.15)
     """Shares of BODY_25, COCO_17, HALPE_26, SMPL_24."""
     rotation_m: float = 0.05
-    """Weight of a wrong rotation in the loss, metres of a joint per radian."""
+    """Weight of rotation errors in the loss, metres of a joint per radian."""
     shape_m: float = 0.01
-    """Weight of a wrong beta in the loss, metres of a joint per standard deviation."""
+    """Weight of beta errors in the loss, metres of a joint per standard deviation."""
     corruption: CorruptionConfig = field(default_factory=CorruptionConfig)
     """Settings of the corruption of targets."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Size of the network."""
     seed: int = 0
-    """Seed of everything that is drawn."""
+    """Seed of all random values."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class People:
 
 
 class PeopleSource:
-    """Draws bodies: shapes from the model's own distribution, poses from recordings."""
+    """Samples bodies: shapes from the model's own distribution, poses from recordings."""
 
     def __init__(self, motions: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig):
         self.config, self.model, self._frame = config, model, frame
@@ -98,7 +101,7 @@ class PeopleSource:
         self._mirror = torch.tensor(MIRROR_JOINTS)
 
     def draw(self, count: int, generator: torch.Generator) -> People:
-        """`count` people."""
+        """Sample `count` people."""
         pose = self._pose(count, generator)
         other = self._pose(count, generator)
         exchanged = torch.rand(count, generator=generator) < self.config.exchange
@@ -112,7 +115,7 @@ class PeopleSource:
         return People(state, positions(self.model.points, state))
 
     def _pose(self, count: int, generator: torch.Generator) -> Tensor:
-        """(count, 24, 3) axis-angle, half of them in the mirror."""
+        """(count, 24, 3) axis-angle poses, half of them mirrored."""
         at = torch.rand(count, generator=generator, dtype=torch.float64) * self._weight[-1]
         pose = self._poses[torch.searchsorted(self._weight, at).clamp_max(len(self._poses) - 1)]
         flipped = pose[:, self._mirror] * torch.tensor([1.0, -1.0, -1.0])
@@ -120,7 +123,7 @@ class PeopleSource:
 
 
 def _tensor(values: Array) -> Tensor:
-    """A tensor in single precision, in which training runs."""
+    """A tensor in single precision, as used in training."""
     return torch.from_numpy(values).float()
 
 
@@ -144,13 +147,13 @@ class Trainer:
         self.iteration = 0
 
     def run(self, iterations: int) -> Iterator[list[float]]:
-        """Run some `iterations`; yields the mean joint error in mm of every iterate."""
+        """Run some `iterations`; yields the mean joint error of every update in mm."""
         for _ in range(iterations):
             yield self._iterate()
 
     def _iterate(self) -> list[float]:
         config = self.config
-        # Everything that is drawn follows from seed and iteration.
+        # All random values depend on seed and iteration.
         generator = torch.Generator().manual_seed(config.seed * 10_000_019 + self.iteration)
         torch.manual_seed(config.seed * 10_000_019 + self.iteration)  # dropout
         for group in self.optimiser.param_groups:
@@ -188,7 +191,9 @@ def _learning_rate(config: TrainingConfig, iteration: int) -> float:
 def prepared(
     people: People, frame: PersonFrame, config: TrainingConfig, generator: torch.Generator
 ) -> tuple[DescentTargets, State, State, Tensor]:
-    """Corrupted targets, the start, the true state and true points, all in the person's estimated frame."""
+    """Corrupted targets, initial state, true state and true points, all in the person's estimated
+    frame.
+    """
     B = len(people.points)
     offered = _OFFERED[torch.multinomial(torch.tensor(config.skeletons), B, True, generator=generator)]
     xyz, information = corrupt(people.points, offered, generator, config.corruption)
@@ -210,13 +215,13 @@ def prepared(
 
 
 def mean_variance(information: Tensor) -> Tensor:
-    """(B, K) mean variance over the axes, m²; infinite where that is over `_SEEN_M` squared, a ray for example."""
+    """(B, K) mean variance over the axes, m²; infinite above `_SEEN_M` squared, e.g. for a ray."""
     variance = torch.diagonal(inverse_3x3(information + 0.1 * torch.eye(3)), dim1=-2, dim2=-1).mean(-1)
     return torch.where(variance < _SEEN_M**2, variance, torch.inf)
 
 
 _SEEN_M = 0.2
-"""Standard deviation above which joints are ignored in a person's position, m."""
+"""Standard deviation, m, above which joints are ignored for a person's position."""
 _OFFERED = torch.zeros(len(TARGET_SKELETONS), len(BODY_POINTS))
 for _row, _names in enumerate(TARGET_SKELETONS.values()):
     _OFFERED[_row, list(slots(_names))] = 1
@@ -237,9 +242,9 @@ def _judge(
 def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) -> FitterWeights:
     """Return the weights with `spread` measured on `count` people of `source` for each skeleton.
 
-    The claimed covariance of joints without their own target (`BodyFit.prior_covariance`, less the error of the
-    model; whether or not they have one) is scaled so that regions of probability `INSIDE` contain this share of
-    them. Left and right are taken together.
+    The stated covariance of joints without their own target (`BodyFit.prior_covariance`, less the
+    error of the model) is scaled so that regions of probability `INSIDE` contain this share of
+    them. Left and right are pooled.
     """
     plain = replace(weights, spread=np.ones(len(BODY_POINTS)))
     spread = np.ones(len(BODY_POINTS))
@@ -257,7 +262,9 @@ def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) 
 def left_out_squared(
     weights: FitterWeights, source: PeopleSource, places: tuple[int, ...], count: int, generator: torch.Generator
 ) -> dict[int, Array]:
-    """Squared Mahalanobis distances of true joints to the body's without their target, by point."""
+    """Squared Mahalanobis distances of true joints from predictions without their
+    target, by point.
+    """
     model = source.model.with_keypoints(tuple(BODY_POINTS[place] for place in places))
     fitter = SmplFitter(model, weights=weights)
     truth, targets = _corrupted(source, places, count, generator)
@@ -271,7 +278,7 @@ def left_out_squared(
 def _corrupted(
     source: PeopleSource, places: tuple[int, ...], count: int, generator: torch.Generator
 ) -> tuple[Array, JointTargets]:
-    """True joints (count, J, 3) at some `places` of `BODY_POINTS`, and targets as `corrupt` makes them."""
+    """True joints (count, J, 3) at `places` in `BODY_POINTS`, and their targets from `corrupt`."""
     points, chosen = source.draw(count, generator).points, list(places)
     target, information = corrupt(points, torch.ones(count, len(BODY_POINTS)), generator)
     truth, *given = (values[:, chosen].double().numpy() for values in (points, target, information))
@@ -283,14 +290,14 @@ class Score:
     """Scores of a fitter."""
 
     joints_mm: float
-    """Mean error of all joints, with and without a target, mm."""
+    """Mean error of all joints, with or without a target, mm."""
     ms: float
-    """Processor time of a fit, ms, leave-one-out passes included."""
+    """Processor time of a fit, ms, including leave-one-out passes."""
 
 
 def compared(fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int = 512) -> dict[str, Score]:
-    """Scores of `fitters` of BODY_25's joints on the same people; rows that one of them does not fit count for
-    none.
+    """Scores of `fitters` for BODY_25's joints on the same people, over the rows that all of them
+    fit.
     """
     places = slots(TARGET_SKELETONS["BODY_25"])
     truth, targets = _corrupted(source, places, count, torch.Generator().manual_seed(3))

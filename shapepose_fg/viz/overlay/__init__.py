@@ -1,1 +1,1 @@
-"""A result drawn over the pictures that it was made from."""
+"""Draws a result over the pictures from which it was made."""

@@ -1,5 +1,5 @@
-"""Draws bodies, skeletons, detections and labels on pictures as the camera took them: with distortion, at any
-size.
+"""Draws bodies, skeletons, detections and labels on the original, distorted pictures of a camera,
+at any size.
 """
 
 from collections.abc import Sequence
@@ -29,34 +29,34 @@ GATED: Colour = (40, 40, 255)
 _WHITE: Colour = (255, 255, 255)
 _DARK: Colour = (30, 30, 30)
 _BEND = 8
-"""Number of straight pieces in which a bone is drawn, because a lens bends it."""
+"""Number of straight segments in which a bone is drawn, because lens distortion curves it."""
 _OPACITY = 0.45
-"""Opacity of bodies: what is under them stays visible."""
+"""Opacity of bodies, so that the picture behind them stays visible."""
 _FINE = 8
-"""Number of fractional bits of a pixel in OpenCV's drawing."""
+"""Number of fractional bits of pixel coordinates in OpenCV's drawing functions."""
 _REACH = 0.5
-"""Distance outside the picture, as a share of its size, beyond which points are not drawn: no lens was
-calibrated there, and its polynomial may fold them back into the picture."""
+"""Distance outside the picture, as a share of its size, beyond which points are not drawn: the
+distortion is not calibrated there, and its polynomial may map them back into the picture."""
 
 
 @dataclass(frozen=True)
 class PictureView:
-    """A camera's pictures at the size at which they are drawn."""
+    """A camera's pictures, with the size at which they are drawn."""
 
     camera: Camera
     """The camera, with its lens."""
     placement: Placement
-    """Place of calibrated pixels in its pictures."""
+    """Position of calibrated pixels in its pictures."""
     size: tuple[int, int]
-    """Width and height of what is drawn on, pixels: the picture, enlarged or made smaller."""
+    """Width and height of the canvas, pixels: the picture, enlarged or reduced."""
 
     @property
     def scale(self) -> Array:
-        """(2,) drawn pixels per pixel of the picture, x and y."""
+        """(2,) canvas pixels per pixel of the picture, x and y."""
         return np.array(self.size) / self.placement.picture_size
 
     def project(self, points: Real) -> tuple[Array, Array]:
-        """Drawn pixels (..., 2) and depths (...,) in metres of `points` (..., 3) in the world.
+        """Canvas pixels (..., 2) and depths (...,), metres, of `points` (..., 3) in the world.
 
         Pixels are NaN behind the camera, and far outside the picture.
         """
@@ -65,7 +65,7 @@ class PictureView:
         return self.through_lens(xy), depth
 
     def through_lens(self, xy: Real) -> Array:
-        """Drawn pixels (..., 2) from undistorted ones, as observations have them."""
+        """Canvas pixels (..., 2) for undistorted pixels, such as those of observations."""
         flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         size = np.array(self.camera.image_size)
         with np.errstate(invalid="ignore"):
@@ -83,7 +83,7 @@ def blue_green_red(person: int) -> Colour:
 
 
 def stroke_of(size: tuple[int, int]) -> int:
-    """Width of bones on a picture of `size`, pixels."""
+    """Line width of bones for a picture of `size`, pixels."""
     return max(2, round(max(size) / 320))
 
 
@@ -94,7 +94,9 @@ def draw_bodies(
     faces: Whole,
     colours: Sequence[Colour],
 ) -> Picture:
-    """Draw the surfaces `vertices` (P, Nv, 3), metres, in a colour each, lit from the camera."""
+    """Draw the surfaces `vertices` (P, Nv, 3), metres in the world, one colour each, lit from the
+    camera.
+    """
     if len(vertices) == 0:
         return picture
     points, corners = joined(vertices, faces)
@@ -117,11 +119,11 @@ class Skeletons:
     """People's joints in one frame."""
 
     joints: Array
-    """(P, J, 3) metres; NaN where unknown."""
+    """(P, J, 3) metres; NaN if unknown."""
     seen: Mask
-    """(P, J) whether a view saw the joint in this frame; others are inferred."""
+    """(P, J) whether a view detected the joint in this frame; other joints are inferred."""
     bones: Index
-    """(B, 2) pairs of joints that lines connect."""
+    """(B, 2) pairs of joints connected by lines."""
     colours: Sequence[Colour]
     """(P,) colour of each person."""
     labels: Sequence[str]
@@ -141,7 +143,7 @@ class Skeletons:
 
 
 def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:
-    """Draw bones, joints (rings where they are inferred) and labels on `picture`."""
+    """Draw bones, joints (rings if they are inferred) and labels on `picture`."""
     stroke = stroke_of(view.size)
     part = np.linspace(0.0, 1.0, _BEND + 1)[:, None]
     tops = []
@@ -158,19 +160,21 @@ def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> No
             cv2.circle(picture, centre, radius, _WHITE if filled else _DARK, -1, cv2.LINE_AA, _FINE)
             cv2.circle(picture, centre, radius, colour, max(1, stroke // 2), cv2.LINE_AA, _FINE)
         tops.append(_top(xy[known], view.size))
-    # Names last: no limbs cross them.
+    # Labels last, so that limbs do not cross them.
     for top, colour, label in zip(tops, people.colours, people.labels, strict=True):
         if top is not None:
             draw_label(picture, label, (top[0], top[1] - 5 * stroke), colour)
 
 
 def draw_lines(picture: Picture, xy: Array, colour: Colour, width: int = 1) -> None:
-    """Draw lines through the drawn pixels `xy` (L, K, 2)."""
+    """Draw polylines through the canvas pixels `xy` (L, K, 2)."""
     cv2.polylines(picture, list(_fine(xy)), False, colour, width, cv2.LINE_AA, _FINE)
 
 
 def _top(xy: Array, size: tuple[int, int]) -> tuple[float, float] | None:
-    """The middle of a person's width, and the highest of their joints `xy` (K, 2); None outside the picture."""
+    """Position for a label: horizontal centre of a person's joints `xy` (K, 2), and the highest of
+    them; None outside the picture.
+    """
     inside = np.all((xy >= 0) & (xy < np.array(size)), axis=1)
     if not inside.any():
         return None
@@ -179,7 +183,9 @@ def _top(xy: Array, size: tuple[int, int]) -> tuple[float, float] | None:
 
 
 def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> None:
-    """Draw detections at drawn pixels `xy` (K, 2): squares in `colours` (K, 3), red crosses where not used."""
+    """Draw detections at canvas pixels `xy` (K, 2): used ones as squares in `colours` (K, 3),
+    others as red crosses.
+    """
     reach = max(2, stroke_of(picture.shape[1::-1]))
     there = np.isfinite(xy).all(axis=1)
     drawn = _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist()
@@ -200,7 +206,9 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> 
 def draw_label(
     picture: Picture, text: str, at: tuple[float, float], colour: Colour, *, centred: bool = True
 ) -> None:
-    """Write `text` on a filled box with its lower edge at `at`, moved into the picture where it would leave it."""
+    """Write `text` on a filled box with its lower edge at `at`, moved into the picture if
+    necessary.
+    """
     height, width = picture.shape[:2]
     size = max(0.4, max(height, width) / 1500)
     thick = max(1, round(1.6 * size))
@@ -217,7 +225,7 @@ def draw_label(
 
 
 def _fine(xy: Array) -> NDArray[np.int32]:
-    """Pixels with fractions as OpenCV's drawing expects them."""
+    """Convert pixels to the fixed-point coordinates of OpenCV's drawing functions."""
     return np.round(np.clip(xy, -30000, 30000) * (1 << _FINE)).astype(np.int32)
 
 

@@ -1,4 +1,6 @@
-"""A result drawn over the pictures of all cameras, frame by frame: videos or still images, whole or not at all."""
+"""Draws a result over the pictures of all cameras, frame by frame, and writes videos or still
+images atomically.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -28,25 +30,25 @@ _GRID = "grid"
 
 @dataclass(frozen=True)
 class Overlay:
-    """A result over the pictures of some cameras."""
+    """A result, and the pictures of the cameras over which it is drawn."""
 
     people: OpenedReconstruction
-    """The result, as it was saved."""
+    """The saved result."""
     rig: Rig
     """Cameras of the result."""
     cameras: Sequence[tuple[CameraFootage, Footage]]
     """The pictures of the cameras that are drawn."""
     skeletons: bool = True
-    """Whether bones and joints are drawn, with the person's number."""
+    """Whether bones and joints are drawn, with the numbers of people."""
     detections: bool = True
-    """Whether 2D detections are drawn that were used, and in another colour those that were not."""
+    """Whether 2D detections are drawn: used ones, and in another colour unused ones."""
     body: "BodyModel | None" = None
-    """The model of the bodies; None where they are not drawn."""
+    """Body model; None if bodies are not drawn."""
 
     def draw(self, frame: int, sizes: Sequence[tuple[int, int]]) -> list[Picture]:
-        """Each camera's picture of `frame`, drawn on, at a size (width, height) of its own.
+        """Draw on each camera's picture of `frame`, with one size (width, height) per camera.
 
-        Where there is no picture it is grey.
+        A missing picture is replaced by grey.
         """
         people = self.people.at(frame)
         people = people.rows(np.argsort(people.person, kind="stable"))
@@ -80,13 +82,13 @@ def write_overlay(
     fps: float | None,
     done: Callable[[int, int], None],
 ) -> list[Path]:
-    """Draw `frames` and write them into `folder`: a video of `fps` frames a second, or without a rate still
-    pictures.
+    """Draw `frames` and write them into `folder`: as video with `fps` frames a second, or as still
+    pictures if `fps` is None.
 
-    All cameras are in a grid `width` pixels wide, or each has a file of its own where that is None. `done` is told
-    how many frames are. Returns the files.
+    All cameras are in a grid of `width` pixels; if `width` is None, each camera has its own file.
+    `done` is called with the number of finished frames and the total. Returns the files.
     """
-    # Videos want even sides.
+    # Videos require even sides.
     own = [(footage.size[0] // 2 * 2, footage.size[1] // 2 * 2) for _, footage in over.cameras]
     columns, cells = (1, own) if width is None else grid_shape(own, width)
     names = [used.name for used, _ in over.cameras] if width is None else [_GRID]
@@ -111,10 +113,10 @@ def write_overlay(
 
 @contextmanager
 def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWriter]:
-    """An mp4 video that is moved to `path` when it is complete."""
-    part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV tells the container by the ending
+    """Context manager: an mp4 video that is moved to `path` when it is complete."""
+    part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV selects the container by extension
     path.parent.mkdir(parents=True, exist_ok=True)
-    part.unlink(missing_ok=True)  # it may be a link
+    part.unlink(missing_ok=True)  # it may be a symbolic link
     writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     try:
         if not writer.isOpened():
@@ -131,7 +133,7 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWri
 
 
 def _draw_detections(picture: Picture, view: drawing.PictureView, people: Reconstruction) -> None:
-    """Draw the detections of the people of one frame in the camera of `view`."""
+    """Draw the detections of the people of one frame that belong to the camera of `view`."""
     table = people.observations
     if table is None or view.camera.name not in table.view_names.tolist():
         return
@@ -144,7 +146,7 @@ def _draw_detections(picture: Picture, view: drawing.PictureView, people: Recons
 
 
 def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int, int]) -> Picture:
-    """The camera's picture of a frame at the drawn size; grey where there is none."""
+    """The camera's picture of a frame at the given size; grey if there is none."""
     place = int(used.places[frame]) if frame < len(used.places) else -1
     picture = footage.at(place) if place >= 0 else None
     if picture is None:
@@ -157,9 +159,10 @@ def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int,
 
 
 def grid_shape(sizes: Sequence[tuple[int, int]], width: int) -> tuple[int, list[tuple[int, int]]]:
-    """Number of columns with which a grid of pictures is nearest to 16:9, and the size of each picture in it.
+    """Number of columns for which a grid of pictures is nearest to 16:9, and the size of each
+    picture in it.
 
-    All have the same height; sides are even, as videos need them.
+    All pictures have the same height; sides are even, as required for videos.
     """
     widest = max(w / h for w, h in sizes)
 
@@ -172,7 +175,7 @@ def grid_shape(sizes: Sequence[tuple[int, int]], width: int) -> tuple[int, list[
 
 
 def grid(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Pictures of one height side by side, `columns` in a row; short rows are filled up in dark grey."""
+    """Arrange pictures of equal height in rows of `columns`; short rows are padded with dark grey."""
     rows = [np.hstack(pictures[at : at + columns]) for at in range(0, len(pictures), columns)]
     missing = [max(row.shape[1] for row in rows) - row.shape[1] for row in rows]
     pairs = zip(rows, missing, strict=True)

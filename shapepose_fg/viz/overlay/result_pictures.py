@@ -26,13 +26,15 @@ def pictures_of(
     open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
     tell: Callable[[str], None] = print,
 ) -> list[tuple[CameraFootage, Footage]]:
-    """The pictures of the cameras `drawn`, and the one of each frame; InputError where they are missing.
+    """The pictures of the cameras `drawn`, with the picture of each frame; InputError if they are
+    missing.
 
-    `run` is the result's run.json. Pictures are in `videos`, as `find_footage` takes it, or where `detect` noted
-    it in the folder `detections`, or beside the inputs of the result. `image_placement` is how pictures of another
-    size than the calibration's were made, as `placements_of` takes it. `moments` are (T,) the frames of each
-    camera's own that the result's frames show, where these differ (`read_moments`). `open_one` opens the pictures
-    of a camera, by its name; `tell` receives notes on inferred files.
+    `run` is the content of the result's run.json. Pictures are in `videos` (arguments of
+    `find_footage`), at the paths that `detect` wrote into the folder `detections`, or beside the
+    inputs of the result. `image_placement` (arguments of `placements_of`) states how pictures of
+    another size than the calibration's were made. `moments` has, by camera, (T,) the number of its
+    own frame in each frame of the result, if these differ (`read_moments`). `open_one` opens the
+    pictures of a camera by name and path; `tell` receives notes on inferred files.
     """
     used = {each.name: each for each in _used_footage(run, detections)}
     unknown = [name for name in drawn if name not in used]
@@ -51,7 +53,7 @@ def pictures_of(
         if not path.exists():
             raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
     opened = {name: open_one(name, path) for name, path in paths.items()}
-    # What detect was told of the pictures holds as long as they have the same size.
+    # The placement recorded by `detect` is valid as long as the pictures have the same size.
     alike = {
         name: used[name].placement
         for name, each in opened.items()
@@ -88,7 +90,9 @@ def pictures_of(
 
 
 def _counted(footage: Footage, numbered: bool) -> Index:
-    """(T,) the picture of each frame, -1 where one is missing: by its number, or counted from the first."""
+    """(T,) the picture of each frame, -1 if it is missing: found by its number, or counted from the
+    first picture.
+    """
     first = 0 if numbered else int(footage.number[0])
     count = int(footage.number[-1]) - first + 1
     if count > MOST_FRAMES:
@@ -102,7 +106,7 @@ def _counted(footage: Footage, numbered: bool) -> Index:
 
 
 def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[CameraFootage]:
-    """The pictures that `detect` noted beside the detections that the result was made from."""
+    """The pictures that `detect` recorded beside the detections from which the result was made."""
     if detections is not None:
         file = detections / FOOTAGE if detections.is_dir() else detections
         if not file.is_file():

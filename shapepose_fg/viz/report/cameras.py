@@ -1,4 +1,6 @@
-"""The page of calibrated or refined cameras: poses now and before, and people over them."""
+"""The HTML report of calibrated or refined cameras: poses before and after, and the people in their
+views.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,30 +24,31 @@ _SCENE_BYTES = 4_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPage:
-    """A self-contained page of cameras, and of the people in their views."""
+    """A self-contained HTML page of cameras, and of the people in their views."""
 
     rig: Rig
     """The cameras."""
     before: Rig | None = None
-    """The cameras as they were given, drawn beside the refined ones; None: there are none to compare with."""
+    """The given cameras, drawn beside the refined ones; None if there are none to compare with."""
     points: Array
-    """(P, J, 3) people's joints, metres."""
+    """(P, J, 3) joints of people, metres."""
     frame: Index
     """(P,) frame of each person."""
     time_s: Array
     """(T,) times of the frames, seconds."""
     skeleton: Skeleton
-    """Skeleton of whose core joints `points` are."""
+    """Skeleton; `points` are its core joints."""
     heads: Sequence[str]
-    """Headings of the figures."""
+    """Column headings of the table of cameras."""
     rows: Sequence[tuple[str, Sequence[str]]]
-    """Name and figures of each camera."""
+    """Name of each camera, and its values for these columns."""
     missed_px: Mapping[str, Array]
-    """(N, V) distances of joints from where other cameras put them, under a name; NaN where unknown."""
+    """(N, V) distances of joints from their positions by the other cameras, pixels, by name of the
+    series; NaN if unknown."""
     lines: Sequence[str]
-    """The figures' caption, and lines above them."""
+    """Caption of the table, and lines above it."""
     remarks: Sequence[str] = ()
-    """Notes on what is weakly observed, a sentence each."""
+    """Notes on weakly observed parameters, one sentence each."""
 
     def write(self, file: Path) -> None:
         """Write the page."""

@@ -1,17 +1,18 @@
-"""The entries of run.json in words; invalid entries are left out."""
+"""Converts entries of run.json to words; invalid entries are left out."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
 from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.pipeline.config import PipelineConfig
 
 Run = Mapping[str, Any]
 
 
 def told_by(run: Run) -> dict[str, Any]:
-    """The entries of a run that the page shows, by the names in its template."""
+    """The entries of a run that the page shows, by the names in the page's template."""
     people, time = objects(run.get("people")), objects(run.get("time"))
     problems, spans = people.get("problems"), covered_frames(run) or []
     return {
@@ -27,6 +28,7 @@ def told_by(run: Run) -> dict[str, Any]:
         "body": run.get("body"),
         "time": _time(objects(run.get("seconds"))),
         "configured": isinstance(run.get("configuration"), dict),
+        "noise": _noise(objects(run.get("noise_law"))),
         "over_time": bool(objects(run.get("configuration")).get("temporal", True)),
         "changed": _changed_settings(run),
         **{
@@ -37,21 +39,22 @@ def told_by(run: Run) -> dict[str, Any]:
 
 
 def number(value: object) -> float | None:
-    """A finite number of run.json; None for anything else."""
+    """`value` if it is a finite number, otherwise None."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
         return None
     return float(value)
 
 
 def objects(value: object) -> Mapping[str, Any]:
-    """An object of run.json; an empty one for anything else."""
+    """`value` if it is an object, otherwise an empty one."""
     return value if isinstance(value, dict) else {}
 
 
 def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
-    """Settings that differ from the default: dotted name, value, default; a dash where there is none any more.
+    """Settings that differ from the default: dotted name, value, default; a dash if the setting no
+    longer exists.
 
-    Tables of older versions, which wrote all settings down, are left out.
+    Tables of older versions, which contain all settings, are left out.
     """
     usual = dict(_flat(asdict(PipelineConfig())))
     given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
@@ -63,21 +66,33 @@ def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
 
 
 def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
-    """Reasons for leaving people out: reason, number, and frames, as far as there is room."""
+    """Reasons for dropping people: reason, number, and frames, shortened to fit."""
     counts = {reason: number(count) for reason, count in reasons.items()}
     told = [(reason, int(count)) for reason, count in counts.items() if count is not None]
     return [(reason, count, _frames_words(frames.get(reason))) for reason, count in told]
 
 
+def _noise(told: Run) -> list[tuple[float, float, float, float, int]]:
+    """Errors of the detector, a row per range of scores from which it was learnt: middle of the range, standard
+    deviation, that of what ships, mm, share of gross errors, and number of detections.
+    """
+    try:
+        law, usual = NoiseLaw.from_dict(told).as_dict(), NoiseLaw.shipped().as_dict()
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return []
+    columns = law["score"], law["sigma_mm"], usual["sigma_mm"], law["gross"], law["count"]
+    return [row for row in zip(*columns, strict=True) if row[-1] > 0]
+
+
 def _probabilities(listed: object) -> dict[int, float]:
-    """Probability of each person by number; empty frame by frame."""
+    """Probability of each person by number; empty for frame-by-frame results."""
     entries = [objects(each) for each in lists(listed)]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
     return {int(who): value for who, value in found.items() if who is not None and value is not None}
 
 
 def _time(seconds: Run) -> str:
-    """Times of the stages, the longest first; empty where they are missing."""
+    """Durations of the stages, the longest first; empty if they are missing."""
     spent = {name: value for name, each in seconds.items() if (value := number(each)) is not None}
     longest = sorted((each for each in spent.items() if each[1] >= 0.05), key=lambda each: -each[1])
     listed = ", ".join(f"{name} {value:.1f}" for name, value in longest)
@@ -85,7 +100,7 @@ def _time(seconds: Run) -> str:
 
 
 def lists(value: object) -> list[Any]:
-    """A list of run.json; an empty one for anything else."""
+    """`value` if it is a list, otherwise an empty one."""
     return value if isinstance(value, list) else []
 
 

@@ -1,4 +1,6 @@
-"""The figures of a report: each camera's detections, how joints are known, and the five main figures."""
+"""The numbers of a report: each camera's detections, how joints are known, and the five key
+figures.
+"""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.viz.report.facts import lists, number, objects
 
 _BINS = 60
-"""Number of points of a line over time: as many as can be distinguished in a cell of a table."""
+"""Number of points of a time series: as many as can be distinguished in a table cell."""
 KINDS = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
 """How joints are known, from the most to the least certain."""
 
@@ -24,13 +26,13 @@ class Residual:
     """Distances of projected joints to their detections, pixels."""
 
     median_px: float | None
-    """Median; None where there are none."""
+    """Median; None without distances."""
     high_px: float | None
-    """90th percentile; None where there are none."""
+    """90th percentile; None without distances."""
 
     @classmethod
     def of(cls, px: Real) -> "Residual":
-        """Median and 90th percentile of the finite distances `px`."""
+        """Compute median and 90th percentile of the finite distances `px`."""
         px = px[np.isfinite(px)]
         return cls(*np.quantile(px, [0.5, 0.9]).tolist()) if len(px) > 0 else cls(None, None)
 
@@ -44,23 +46,25 @@ class CameraFigures:
     given: int
     """Number of detections that were assigned to people."""
     gates: dict[Gate, int]
-    """Number of these by gate: used, or the reason why not."""
+    """Number of these detections by gate: used, or the reason why not."""
     all: Residual
     """Residuals of all detections that were assigned to people."""
     used: Residual
     """Residuals of the detections that were used."""
     trend_px: list[float | None]
-    """Medians of all assigned detections over time, in equal segments of the recording."""
+    """Time series: median residual of all assigned detections, in equal segments of the recording."""
     offered: float | None = None
-    """Number of all detections, assigned or not; None where run.json does not state it."""
+    """Number of all detections, assigned or not; None if run.json does not have it."""
     left_out_px: float | None = None
-    """Median distance to where the other cameras alone put the joint; None where run.json does not state it."""
+    """Median distance to the joint as estimated without this camera, pixels; None if run.json does
+    not have it."""
     left_out_mm: float | None = None
-    """Median of the same distances as lengths at the depth of the joint, mm; None where run.json does not say."""
+    """Median of the same distances as lengths at the joint's depth, mm; None if run.json does not
+    have it."""
 
 
 def camera_figures(people: Reconstruction) -> list[CameraFigures]:
-    """One entry for each camera; none where the result has no observations."""
+    """One entry for each camera; empty if the result has no observations."""
     table = people.observations
     if table is None:
         return []
@@ -68,7 +72,7 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
     entries = [objects(each) for each in lists(people.run.get("cameras"))]
     told = {str(each.get("camera")): each for each in entries}
     made = []
-    for view, name in enumerate(table.view_names.tolist()):  # a handful of cameras
+    for view, name in enumerate(table.view_names.tolist()):  # only a few cameras
         gate, error = table.gate[..., view], px[..., view]
         more = told.get(name, {})
         left_out = objects(more.get("left_out"))
@@ -89,7 +93,9 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
 
 
 def overall(people: Reconstruction) -> dict[str, Any]:
-    """The main figures of a result, by the template's names; shares 0 to 1, None where there is nothing."""
+    """The key figures of a result, by the names in the template; shares are 0 to 1, None if
+    undefined.
+    """
     table, known = people.observations, people.known[people.known != Known.UNKNOWN]
     sigma = sigma_m(people.covariance)
     sigma = sigma[np.isfinite(sigma)]
@@ -114,7 +120,7 @@ def overall(people: Reconstruction) -> dict[str, Any]:
 
 
 def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:
-    """Number of joints that are known in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the
+    """Number of joints in each of `KINDS`: (J, 5) by joint, or (G, 5) by groups `by` (N,) of the
     rows.
     """
     kinds = people.known[..., None] == np.array(KINDS)

@@ -1,4 +1,4 @@
-"""The page of a report: data/page.html filled in, as one self-contained text."""
+"""The HTML page of a report: data/page.html filled in, as one self-contained text."""
 
 import base64
 import hashlib
@@ -22,9 +22,10 @@ _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 def page_text(
     title: str, people: Reconstruction, tracks: Sequence[TrackSummary], scene: Scene | None, remarks: Sequence[str]
 ) -> str:
-    """The page of a result as HTML: self-contained, without addresses of anything else.
+    """The page of a result as self-contained HTML, without references to other addresses.
 
-    `tracks` are its identities, `scene` is drawn where there is one, and `remarks` state what the page lacks.
+    `tracks` are the identities, `scene` is drawn if given, and `remarks` state what is missing on
+    the page.
     """
     by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
     by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
@@ -50,9 +51,10 @@ def page_text(
 
 
 def filled(name: str, scene: Scene | None, **values: object) -> str:
-    """One of the pages in data/, with the `scene` that is drawn and everything that it needs in it.
+    """Fill in one of the pages in data/, and embed the `scene` and everything that the page needs.
 
-    Texts of the input are escaped, and the page's own policy forbids every script but those that are part of it.
+    Texts of the input are escaped, and the page's Content-Security-Policy forbids all scripts
+    except its own.
     """
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
@@ -75,12 +77,12 @@ def filled(name: str, scene: Scene | None, **values: object) -> str:
 
 
 def _dash(value: float | None, text: str, none: str = "–") -> str:
-    """`value` as `text` formats it; a dash where it is None or NaN."""
+    """`value` formatted by `text`; a dash if it is None or NaN."""
     return none if value is None or value != value else text % value
 
 
 def _share(count: int, total: int) -> str:
-    """A share in words, in which only 0 is shown as 0 and only 1 as 1; a dash where there is nothing."""
+    """A share as text, in which only 0 is shown as 0 and only 1 as 1; a dash if `total` is 0."""
     if count in (0, total):
         return "–" if total == 0 else f"{100 * count / total:.0f} %"
     percent = 100 * count / total
@@ -88,17 +90,17 @@ def _share(count: int, total: int) -> str:
 
 
 def _percent(share: float | None) -> str:
-    """A share of 0 to 1 in three digits, in which only 1 is shown as 100 %."""
+    """A share of 0 to 1 in per cent with three digits; only 1 is shown as 100 %."""
     return "–" if share is None else f"{min(100 * share, 99.9) if share < 1 else 100:.3g} %"
 
 
 def _count(value: float | None) -> str:
-    """Whole numbers with a thin space between thousands."""
+    """A whole number with thin spaces between groups of three digits."""
     return "–" if value is None else f"{value:,.0f}".replace(",", "\u202f")
 
 
 def _path(values: list[float | None], most: float) -> str:
-    """A line over time in a box of 120 x 22, from 0 to `most`, as SVG draws it; None is a gap."""
+    """SVG path of a time series in a box of 120 x 22, for values from 0 to `most`; None is a gap."""
     step, drawn, pen_down = 120 / max(len(values) - 1, 1), list[str](), False
     for index, value in enumerate(values):
         if value is not None:
@@ -109,5 +111,5 @@ def _path(values: list[float | None], most: float) -> str:
 
 
 def _asset(name: str) -> str:
-    """Text of a file that ships beside this one."""
+    """Text of a file in the folder data/."""
     return (files("shapepose_fg.viz.report") / "data" / name).read_text(encoding="utf-8")

@@ -1,4 +1,6 @@
-"""The 3D scene of a report: people, bodies, cameras and floor as small arrays for the page's script."""
+"""The 3D scene of a report: people, bodies, cameras and floor as compact arrays for the page's
+script.
+"""
 
 import base64
 from dataclasses import dataclass
@@ -16,54 +18,56 @@ from shapepose_fg.io.export.skinned import BONES, motion_of
 from shapepose_fg.io.export.take import Take, z_up
 
 _MISSING = -32768
-"""Value of an unknown coordinate."""
+"""Code of an unknown coordinate."""
 _FINEST_MM = 1.0
-"""Resolution of positions, mm; coarser where the scene is more than 65 m wide."""
+"""Resolution of positions, mm; coarser if the scene is more than 65 m wide."""
 _OCTAVE, _LEVELS = 8, 63
-"""Standard deviations have 63 levels, eight per doubling, from 1 mm on: 9 % apart, in six bits."""
+"""Quantisation of standard deviations: 63 levels in six bits, eight per doubling (steps of 9 %),
+from 1 mm on."""
 _FLOOR_M = 0.3
-"""Height of feet within which the floor is drawn at 0, m."""
+"""Maximum height of feet above 0, m, for which the floor is drawn at 0."""
 CELL_M = 0.05
-"""Size of cells with one vertex of a body each, m: 860 of the open body's 12,488, which a page can draw in
-every frame."""
+"""Size of the grid cells in which one vertex of a body is kept, m. The open body then has 860 of
+its 12,488 vertices, which a page can draw in every frame."""
 _ROW_BYTES = 8 * BONES + 6
-"""Size of a body in a frame, bytes: quaternions and the pelvis."""
+"""Size of a body in a frame, bytes: quaternions and pelvis position."""
 _MOST_BONES = 4
-"""Maximum number of bones of a vertex; the strongest are kept."""
+"""Maximum number of bones per vertex; those with the largest weights are kept."""
 _TURN = 32767
-"""Scale of a quaternion's entries, which are stored as integers."""
+"""Scale of quaternion entries, which are stored as integers."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Data of a page, and the frames of the recording that it has."""
+    """Data of a page, and the frames of the recording in it."""
 
     data: dict[str, Any]
     """The data for the page's script: plain values for JSON."""
     every: int
-    """Step between the frames that it has."""
+    """Step between the frames in it."""
     kept: int
-    """Number of these frames."""
+    """Number of frames in it."""
     frames: int
     """Number of frames of the recording."""
 
 
 def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
-    """The scene in at most about `most_bytes`, with every second, third ... frame if need be.
+    """The scene with at most about `most_bytes`; if necessary, only every second, third ... frame
+    is used.
 
-    The page's axes are those of the world rotated so that z is up. Bodies where `arrays`, the body model, is
-    given.
+    The page's axes are those of the world rotated so that z is up. Bodies are included if the body
+    model `arrays` is given.
     """
     J = len(take.people.joint_names)
     row_bytes = 4 / 3 * (6 * J + J + 2 + (_ROW_BYTES if arrays is not None else 0))
     every = max(1, int(np.ceil(len(take.people) * row_bytes / most_bytes)))
     index = np.arange(0, len(take.frames), every)
     axes = z_up(take.up)
-    # By frame, and within a frame by person.
+    # Sorted by frame, and within a frame by person.
     frame, person = np.nonzero(take.rows[:, index].T >= 0)
     rows = take.rows[person, index[frame]]
     joints = take.people.joints[rows] @ axes.T
-    # Cameras that move are drawn where they are at first.
+    # Moving cameras are drawn at their initial poses.
     cameras = () if take.rig is None else take.rig.at(np.full(len(take.rig), take.times_s[:1].sum())).cameras
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3) @ axes.T
     pack = _packing(joints)
@@ -93,7 +97,7 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
 
 @dataclass(frozen=True)
 class _Packing:
-    """Positions as integers of a unit from an origin."""
+    """Positions as integer multiples of a unit, relative to an origin."""
 
     origin: Array
     """(3,) origin, metres."""
@@ -101,28 +105,30 @@ class _Packing:
     """Unit, metres."""
 
     def __call__(self, points: Array) -> Array:
-        """(..., 3) whole numbers of points (..., 3); missing where a point is not known or too far."""
+        """Convert points (..., 3) to integers (..., 3); unknown or too distant points become
+        `_MISSING`.
+        """
         steps = np.rint((points - self.origin) / self.unit_m)
         near = np.isfinite(steps).all(axis=-1, keepdims=True) & (np.abs(steps) < -_MISSING).all(-1, keepdims=True)
         return np.where(near, steps, _MISSING)
 
 
 def _packing(joints: Array) -> _Packing:
-    """The unit and origin for some joints."""
+    """Unit and origin for the given joints."""
     placed = joints[np.isfinite(joints).all(axis=-1)]
     if len(placed) == 0:
         return _Packing(np.zeros(3), 1e-3 * _FINEST_MM)
     low, high = placed.min(axis=0), placed.max(axis=0)
-    # Bodies reach a little farther than joints.
+    # Surfaces of bodies extend slightly beyond joints.
     coarse = float(np.ceil(1e3 * ((high - low).max() + 2.0) / 2 / 32000))
     return _Packing((low + high) / 2, 1e-3 * max(_FINEST_MM, coarse))
 
 
 def _known_and_sigma(known: NDArray[np.uint8], sigma: Array) -> NDArray[np.uint8]:
-    """Codes with how a joint is known in the two low bits, and the level of its sigma in the six above; 0 is
-    unknown.
+    """Codes of one byte: how a joint is known in the two low bits, and the level of its sigma in
+    the six high bits; 0 for unknown.
 
-    A weakly seen joint is drawn like one from the body.
+    Joints of kind `WEAK` are drawn like those of kind `BODY`.
     """
     known = np.where(known == Known.WEAK, Known.BODY, known)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -132,7 +138,7 @@ def _known_and_sigma(known: NDArray[np.uint8], sigma: Array) -> NDArray[np.uint8
 
 
 def _floor(joints: Array) -> float:
-    """Height of the floor, metres: 0 where feet are near it, else that of the lowest joints."""
+    """Height of the floor, metres: 0 if feet are near 0, otherwise that of the lowest joints."""
     height = joints[..., 2]
     placed = np.isfinite(height)
     if not placed.any():
@@ -143,12 +149,12 @@ def _floor(joints: Array) -> float:
 
 
 def _view(joints: Array, centres: Array) -> dict[str, Any]:
-    """The initial view: the box around people, and the extent of people and cameras."""
+    """The initial view: bounding box of the people, and extent of people and cameras."""
     points = joints.reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         points = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.8]])
-    # A joint that ran away is not looked at.
+    # Outliers among the joints do not change the view.
     low, high = np.quantile(points, [0.003, 0.997], axis=0)
     low, high = np.minimum(low, high - 1.0), np.maximum(high, low + 1.0)
     middle = (low + high) / 2
@@ -159,7 +165,7 @@ def _view(joints: Array, centres: Array) -> dict[str, Any]:
 
 
 def camera_of(camera: Camera, axes: Array) -> dict[str, Any]:
-    """A camera in the page's axes; the columns of `turn` point right, down and forward."""
+    """A camera in the page's axes; the columns of `turn` are its right, down and forward axes."""
     width, height = camera.image_size
     return {
         "name": camera.name,
@@ -173,11 +179,13 @@ def camera_of(camera: Camera, axes: Array) -> dict[str, Any]:
 def _bodies(
     take: Take, arrays: SmplArrays, axes: Array, frame: Index, person: Index, pack: _Packing
 ) -> dict[str, Any]:
-    """The bodies of N rows, each a `person` (N,) of the take in a `frame` (N,), for the page's script to bend.
+    """The bodies of N rows, for skinning by the page's script; each is a `person` (N,) of the take
+    in a `frame` (N,).
 
-    All share one light `mesh`: faces (F, 3), and each vertex's bones (M, 4) with their weights of 255. `rest`
-    (P, M, 3) and `rest_joints` (P, 24, 3) are people in the T-pose; `turns` (N, 24, 4) are quaternions x y z w of
-    bones against their parents, and `pelvis` (N, 3) is where it is. Rows without a body are missing in them.
+    All share a simplified `mesh`: faces (F, 3), and the bones (M, 4) of each vertex with weights
+    out of 255. `rest` (P, M, 3) and `rest_joints` (P, 24, 3) are the people in the T-pose; `turns`
+    (N, 24, 4) are quaternions x y z w of bones relative to their parents, and `pelvis` (N, 3) is
+    its position. Rows without a body are left out.
     """
     kept, faces, _ = thinned(arrays.template, arrays.faces, CELL_M)
     order = np.argsort(-arrays.weights[kept], axis=1, kind="stable")[:, :_MOST_BONES]
@@ -211,5 +219,5 @@ def _bodies(
 
 
 def _base64(values: NDArray[Any], kind: str) -> str:
-    """Numbers as the page's script decodes them into a typed array."""
+    """Base64 text of numbers, which the page's script decodes to a typed array."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")

@@ -20,12 +20,13 @@ from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
 
 MOST_ROWS = 40_000
-"""Maximum number of rows that check and report use, about 400 MB: of longer results every second, third ...
-frame."""
+"""Maximum number of rows that check and report use, about 400 MB: of longer results, only every
+second, third ... frame is used."""
 REPORT = "report.html"
-"""The report of a result, beside its people.npz."""
+"""File name of the report, beside people.npz."""
 SCENE_BYTES = 8_000_000
-"""Maximum size of people and bodies in a page, bytes: a page of 10 MB opens at once and fits in a mail."""
+"""Maximum size of people and bodies in a page, bytes: a page of 10 MB opens quickly and can be sent
+by e-mail."""
 
 
 def write_report(
@@ -37,12 +38,13 @@ def write_report(
     body: Path | None = None,
     every: int = 1,
 ) -> Path:
-    """Write report.html of `people` into `folder`, whole or not at all; returns its path.
+    """Write report.html of `people` into `folder`, atomically; returns its path.
 
-    `rig` are the cameras; where they are unknown the axis that is up, or None for the one along which people
-    stand. `fps` replaces the result's times. `body` is the body model's file where it has moved since run.json was
-    written. `people` are those of every frame of the result, or of every `every`-th; of longer recordings the
-    scene has every second, third ... frame. Where people have no timeline, the page has no scene and says why.
+    `rig` are the cameras; if they are unknown, the up axis, or None for the axis along which people
+    stand. `fps` replaces the times of the result. `body` is the file of the body model if it was
+    moved after run.json was written. `people` are those of every frame of the result, or of every
+    `every`-th frame; for long recordings the scene has only every second, third ... frame. If the
+    people have no timeline, the page has no scene and states the reason.
     """
     arrays, remarks = _body(people, body)
     if every > 1:
@@ -64,7 +66,7 @@ def write_report(
     title = str(people.run.get("project") or folder.resolve().name or folder)
     text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks)
     file = folder / REPORT
-    # A name may hold half of a pair of surrogates, which no file can.
+    # A name may contain half of a surrogate pair, which cannot be written to a file.
     write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
     return file
 
@@ -72,7 +74,7 @@ def write_report(
 def report_of(
     results: Path, *, up: Axis | None = None, fps: float | None = None, body: Path | None = None
 ) -> Path:
-    """Write report.html of the saved result at `results` again; InputError where it cannot be read."""
+    """Write report.html of the saved result at `results` again; InputError if it cannot be read."""
     folder = results_folder(results)
     with Reconstruction.open(results) as opened:
         people, every = opened.thinned(MOST_ROWS)
@@ -84,12 +86,12 @@ def report_of(
 
 
 def th(number: int) -> str:
-    """An ordinal."""
+    """An ordinal number as text, such as 2nd."""
     return {2: "second", 3: "third"}.get(number, f"{number}th")
 
 
 def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None, list[str]]:
-    """The body model of a result; None, and a remark, where its file is missing."""
+    """The body model of a result; None and a remark if its file is missing."""
     try:
         return body_of(people.run, given), []
     except InputError as error:
@@ -99,14 +101,14 @@ def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None
 
 
 def _timed(people: Reconstruction) -> bool:
-    """Whether a result has times of its frames: two times, or a time and the rate."""
+    """Whether a result has frame times: two times, or one time and the frame rate."""
     times = np.unique(people.time_s[np.isfinite(people.time_s)])
     rate = people.run.get("time", {}).get("fps")
     return len(times) > 1 or (len(times) == 1 and rate is not None and rate > 0)
 
 
 def _standing(people: Reconstruction) -> Axis:
-    """The axis along which people stand: from their feet to their heads, mostly."""
+    """The axis along which people stand: the most frequent direction from feet to head."""
     ends = (("Neck", "Nose", "Head"), ("RAnkle", "LAnkle", "RKnee", "LKnee"))
     heads, feet = (people.joints[:, np.isin(people.joint_names, each)] for each in ends)
     along = (heads[:, :, None] - feet[:, None]).reshape(-1, 3)

@@ -157,6 +157,7 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
         "cameras": [{"camera": "cam0", "offered": 1234, "left_out": {"median_px": 9.4, "median_mm": 21.0}}],
         "seconds": {"solve": 2.5},
         "probability": [{"person": 7, "evidence": 0.22, "probability": 0.87}],
+        "noise_law": {"times": [2.0] * 7, "gross": [0.25] * 7, "count": [0, 0, 0, 5678, 0, 0, 0]},
     }
     text = Page(write_report(tmp_path, result.with_run(**run), scene.rig)).text
     for part in (
@@ -170,6 +171,8 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
         "9.4 px, 21 mm",
         "1.4 / 1.4 px",
         "person 7100–123161",
+        "Errors of the detector",
+        "5 678",
         "0.87",
     ):
         assert part in text, part
@@ -178,7 +181,7 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
 @pytest.mark.parametrize("value", [None, 7, "text", ["a", 3], {"a": {"b": None}}, [[1, "x"]]])
 def test_entries_of_run_json_that_make_no_sense_say_nothing(result, scene, tmp_path, value):
     """Those that a loaded result may hold: others are refused when it is loaded (check_run)."""
-    names = ("notes", "setup", "cameras", "dropped_frames", "keypoint_offsets", "probability")
+    names = ("notes", "setup", "cameras", "dropped_frames", "keypoint_offsets", "noise_law", "probability")
     run = {key: value for key in names}
     run["people"] = {"dropped": value, "problems": value}
     assert_closed(Page(write_report(tmp_path, result.with_run(**run), scene.rig)))

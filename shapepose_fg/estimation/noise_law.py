@@ -1,0 +1,240 @@
+"""A detector's noise law: how far its joints lie from the true ones, by score, learnt from the recording itself.
+
+Each joint of a person's 2D detections in one view, used or not, is compared with the place that good detections of
+the other views give it: detections that were used are cut off by gates. No ground truth is needed. What ships
+(`calibration.json`) is the prior, so that a short recording keeps it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    inverses,
+    linearise,
+    observation_sigmas,
+    triangulate,
+)
+
+EDGES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)
+"""Scores that separate the K = 7 ranges of scores; relative to what ships, the law is constant within each."""
+GROSS_M = 0.2
+"""Standard deviation of a gross error along an axis, m: another joint, or another person's."""
+_MIDDLES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.85, 0.95)
+_GOOD_SCORE = 0.5
+"""Minimum score of the other views' detections."""
+_GOOD_M = 0.1
+"""Maximum standard deviation of the place that they give, m."""
+_AGREE_SIGMA = 3.5
+"""Maximum residual of each of them there, in standard deviations: otherwise they contradict each other."""
+_PRIOR_COUNT = 30.0
+"""Weight of what ships, as a number of detections, in each range of scores."""
+_ROUNDS = 40
+"""Rounds of expectation maximisation."""
+
+
+@dataclass(frozen=True)
+class NoiseLaw:
+    """Errors of detections in K ranges of scores: a Gaussian core, and a share of gross errors."""
+
+    times: tuple[float, ...]
+    """(K,) standard deviation of the core, as a multiple of that in Eq. 1's weights (`ObservationConfig`)."""
+    gross: tuple[float, ...]
+    """(K,) share of gross errors, 0 to 1."""
+    count: tuple[int, ...] = (0,) * (len(EDGES) + 1)
+    """(K,) number of detections that it was learnt from; 0 in what ships."""
+    COLUMNS: ClassVar = ("times", "gross", "count")
+
+    def __post_init__(self) -> None:
+        for name in self.COLUMNS:
+            values = getattr(self, name)
+            most = 1.0 if name == "gross" else 1e9
+            if len(values) != len(EDGES) + 1 or not all(0 <= each <= most for each in values):
+                raise ValueError(f"{name} must be {len(EDGES) + 1} numbers, 0 to {most:g}, got {values}")
+        if min(self.times) <= 0:
+            raise ValueError(f"times must be above 0, got {self.times}")
+
+    @classmethod
+    @cache
+    def shipped(cls) -> "NoiseLaw":
+        """The law that joints' covariances are calibrated for (`scripts/fit_covariances.py`)."""
+        with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
+            return cls.from_dict(read_json(path)["noise"])
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> "NoiseLaw":
+        """What `as_dict` gave; KeyError, TypeError or ValueError for anything else."""
+        times, gross, count = (content[name] for name in cls.COLUMNS)
+        return cls(tuple(map(float, times)), tuple(map(float, gross)), tuple(map(int, count)))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "NoiseLaw":
+        """The law in a run.json, what ships where it has none; InputError for a damaged one."""
+        return cls.read(read_json(Path(path)), Path(path))
+
+    @classmethod
+    def read(cls, run: Any, path: Path) -> "NoiseLaw":
+        """The law in the content `run` of a run.json at `path`, as `load`."""
+        told = run.get("noise_law") if isinstance(run, dict) else None
+        try:
+            return cls.shipped() if told is None else cls.from_dict(told)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise InputError(f"{path}: noise_law is damaged ({error}); reconstruct the recording again") from None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for run.json."""
+        sigma_m = [times * float(core_sigma_m(score)) for times, score in zip(self.times, _MIDDLES, strict=True)]
+        return {
+            "score": list(_MIDDLES),
+            "sigma_mm": [round(1e3 * each, 1) for each in sigma_m],
+            **{name: list(getattr(self, name)) for name in self.COLUMNS},
+        }
+
+    def variances(self, scores: Array) -> tuple[Array, Array]:
+        """Variances (...) of detections of these `scores` (...): that of the core relative to what ships, and what
+        gross errors add to it, m².
+
+        Only the share of gross errors beyond that of good scores counts: that one lies with associations.
+        """
+        score = np.digitize(scores, EDGES)
+        core = np.square(np.divide(self.times, self.shipped().times))
+        good = np.array(_MIDDLES) > EDGES[3]
+        usual = np.average(np.array(self.gross)[good], weights=np.array(self.count)[good] + 1)
+        return core[score], np.maximum(np.array(self.gross) - usual, 0.0)[score] * GROSS_M**2
+
+
+def core_sigma_m(scores: Array | float, config: ObservationConfig | None = None) -> Array:
+    """(...) standard deviation in Eq. 1's weights of detections of these `scores` (...), m, of the mean joint."""
+    config = ObservationConfig() if config is None else config
+    return config.sigma_m / np.sqrt(config.weight(np.asarray(scores, dtype=np.float64)))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Detections of one view beside the places that others give their joints, R of them."""
+
+    score: Array
+    """(R,) the detector's score."""
+    scatter: Array
+    """(R,) standard deviation in Eq. 1's weights, as a length at the joint's depth, m."""
+    squared: Array
+    """(R, 2) squared distances along the axes of the place's covariance, m²."""
+    others: Array
+    """(R, 2) variances of the place along these axes by Eq. 1's weights, rising, m²."""
+    of_others: Array
+    """(R, V) scores of the other views' detections; 0 for none."""
+
+    @classmethod
+    def of(
+        cls,
+        chosen: Observations,
+        every: Observations,
+        views: Views,
+        config: ObservationConfig,
+        joints: Sequence[str],
+    ) -> "Residuals":
+        """Residuals of N rows: `chosen` are the detections of each person, `every` those of its 2D people."""
+        parts, scatter = [], config.scatter(joints)
+        for view in range(len(views)):
+            good = chosen.seen & (chosen.confidence >= _GOOD_SCORE)
+            good[..., view] = False
+            good &= (good.sum(axis=-1) >= 2)[..., None]
+            nowhere = np.full(chosen.initial.shape, np.nan)
+            rows = replace(chosen, confidence=np.where(good, chosen.confidence, 0.0), initial=nowhere)
+            points = triangulate(rows, views, config)
+            sigmas = observation_sigmas(rows, points, views, config, joints)
+            evidence = linearise(rows, sigmas, points, views, config)
+            evidence = linearise(rows, sigmas, evidence.target, views, config)
+            off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / np.where(good, sigmas, 1.0)
+            there = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
+            there &= every.seen[..., view] & (evidence.sigma_m < _GOOD_M)
+            row, joint = np.nonzero(there)
+            xy, depth, slope = views.rows(row).project(evidence.target[there][:, None])
+            focal = np.broadcast_to(views.focal_px, (len(chosen), len(views)))[row, view]
+            length = depth[:, 0, view] / focal
+            off_m = length[:, None] * (xy[:, 0, view] - every.xy[there][:, view])
+            slope = length[:, None, None] * slope[:, 0, view]
+            covariance = slope @ inverses(evidence.information[there]) @ slope.mT
+            variance, whole = np.linalg.eigvalsh(covariance), np.square(off_m).sum(axis=1)
+            along = np.einsum("ni,nij,nj->n", off_m, covariance, off_m) - variance[:, 0] * whole
+            second = np.clip(along / np.maximum(np.ptp(variance, axis=1), 1e-12), 0.0, whole)
+            squared = np.column_stack([whole - second, second])
+            score = every.confidence[there][:, view]
+            known = np.isfinite(squared + variance).all(axis=1)
+            columns = (
+                score,
+                core_sigma_m(score, config) * scatter[joint],
+                squared,
+                variance,
+                rows.confidence[there],
+            )
+            parts.append([column[known] for column in columns])
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def law(self, prior: NoiseLaw | None = None) -> NoiseLaw:
+        """The most probable law, by expectation maximisation from the `prior` (default: what ships)."""
+        prior = NoiseLaw.shipped() if prior is None else prior
+        score, seen = np.digitize(self.score, EDGES), self.of_others > 0
+        of_others = np.digitize(self.of_others, EDGES)
+
+        def total(values: Array) -> Array:
+            return np.bincount(score, values, len(EDGES) + 1).astype(np.float64)
+
+        count, expected = total(np.ones(len(score))), np.square(prior.times)
+        squared_times, gross = expected, np.array(prior.gross)
+        for _ in range(_ROUNDS):
+            theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+            others, own = self.others * theirs[:, None], (squared_times[score] * self.scatter**2)[:, None]
+            likely = [
+                -0.5 * (self.squared / variance + np.log(variance)).sum(axis=1)
+                for variance in (others + own, others + own + GROSS_M**2)
+            ]
+            odds = gross[score] / np.maximum(1 - gross[score], 1e-9)
+            core = 1 / (1 + odds * np.exp(np.clip(likely[1] - likely[0], -50.0, 50.0)))
+            # Expected square of the detection's own error, which is a part of the residual.
+            share = own / (others + own)
+            error = (share**2 * self.squared + share * others).mean(axis=1) / self.scatter**2
+            squared_times = (_PRIOR_COUNT * expected + total(core * error)) / (_PRIOR_COUNT + total(core))
+            gross = (_PRIOR_COUNT * np.array(prior.gross) + total(1 - core)) / (_PRIOR_COUNT + count)
+        # As in run.json, from which it is read again.
+        times, gross = np.sqrt(squared_times).round(4), gross.round(4)
+        return NoiseLaw(tuple(times.tolist()), tuple(gross.tolist()), tuple(count.astype(int).tolist()))
+
+
+def variance_ratio(
+    law: NoiseLaw, alone: Mask, scores: Array, sigma_m: Array, by_view: Array, body: Array
+) -> Array:
+    """(N, J) ratio of joints' variances under this `law` to those with Eq. 1's weights, which solved them.
+
+    `scores` (N, J, V) are those of observations, `sigma_m` (N, J, V) their standard deviations in Eq. 1's
+    weights, m, `by_view` (N, J, V, 3, 3) the information of those that were used, and `body` (N, J, 3, 3) the
+    body's, 1/m². A body is as wrong as its person's detections in the mean; over time, where it averages them, by
+    the root of that. In rows that stand `alone` (N,) gross errors count; covariances over time are calibrated with
+    them.
+    """
+    core, gross_m2 = law.variances(scores)
+    ratio = core + np.where(alone[:, None, None], gross_m2 / sigma_m**2, 0.0)
+    if (ratio == 1.0).all():
+        return np.ones(scores.shape[:2])
+    used = by_view.any(axis=(-2, -1))
+    count = used.sum(axis=(1, 2))
+    mean = np.where(count > 0, np.where(used, ratio, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1), 1.0)
+    of_body = np.where(alone, mean, np.sqrt(mean))[:, None, None, None]
+    least = 1e-2 * np.eye(3)
+    covariance = inverses(by_view.sum(axis=2) + body + least)
+    errors = np.einsum("njv,njvik->njik", ratio, by_view) + of_body * body + least
+    found = np.trace(covariance @ errors @ covariance, axis1=-2, axis2=-1) / np.trace(
+        covariance, axis1=-2, axis2=-1
+    )
+    return np.where(alone[:, None], np.maximum(found, 1.0), found)
