@@ -62,7 +62,7 @@ def test_cameras_that_began_apart_are_put_together_by_their_times(tmp_path, rig)
     assert moments is not None and moments.picture.tolist() == [[2, 0], [3, 1], [4, 2], [5, -1], [6, 4]]
     expected = [[0.08, 0.084], [0.12, 0.124], [0.16, 0.164], [0.2, 0.2], [0.24, 0.244]]
     np.testing.assert_allclose(times.time_s, expected)
-    assert "no picture within half a frame of 1 of 5 moments" in " ".join(moments.notes)
+    assert "1 of 5 synchronised frames have no picture within half a frame" in " ".join(moments.notes)
 
 
 def test_what_is_written_is_read(tmp_path, rig):

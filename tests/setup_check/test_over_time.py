@@ -114,7 +114,7 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     assert result_check(report, people, recording, room, range(60)).warnings == ()
     fast = replace(people, time_s=people.time_s * 25 / 1000)
     (said,) = result_check(report, fast, recording, room, range(60)).warnings
-    assert "m/s" in said and "--fps is probably wrong (1000 a second" in said
+    assert "m/s" in said and "--fps is probably wrong (1000 Hz" in said
     assert np.isfinite(people.time_s).all()
     none = np.zeros((0, 2), dtype=np.intp), np.zeros(0)
     crowd = [

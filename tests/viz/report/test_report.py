@@ -161,7 +161,7 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
     }
     text = Page(write_report(tmp_path, result.with_run(**run), scene.rig)).text
     for part in (
-        "2 people in 24 frames of 6 cameras, 1.0 s at 25 a second, an assumed frame rate",
+        "2 people in 24 frames of 6 cameras, 1.0 s at 25 Hz, an assumed frame rate",
         "cam2 looks turned by 5 degrees.",
         "3 joints were left out.",
         "too few parts in the box4100–102, 110",
