@@ -47,7 +47,7 @@ class Freedom:
     move_m: float = 0.02
     """Translation, metres."""
     focal: float = 0.0
-    """Focal length, as a share of it."""
+    """Focal length, relative to its value."""
     centre_px: float = 0.0
     """Principal point, each axis, pixels."""
     lens: float = 0.0

@@ -53,8 +53,8 @@ class Relative:
     t: Array
     """(3,) direction of the translation, of length one."""
     score: float
-    """Share of the common sightings that are matched, weighted by their residuals: 1 for all without error, 0
-    for none."""
+    """Share of the common sightings that are matched, weighted by their residuals. It is 1 if all match
+    with zero residual, and 0 if none match."""
     seconds: float
     """Person-seconds that are matched."""
     covariance: Array
@@ -175,8 +175,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
 
 
 def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Select the one of the four poses of an essential matrix that has most joints in front of both
-    cameras."""
+    """Choose the pose, of the four of an essential matrix, with most joints in front of both cameras."""
     one, two, t = (np.asarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(E))
     ways = [(R, sign * t[:, 0]) for R, sign in product((one, two), (1.0, -1.0))]
     return max(ways, key=lambda way: int(_meeting(*way, a, b)[1].sum()))

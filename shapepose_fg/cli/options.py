@@ -171,7 +171,7 @@ class CameraOptions:
         return found
 
     def chosen(self, names: Sequence[str]) -> list[str]:
-        """The cameras that the user wants, among `names` from videos without a calibration."""
+        """The camera names that the user wants, among those of videos (without a calibration)."""
         from shapepose_fg.core.camera import choose
 
         with naming("--cameras, --without"):

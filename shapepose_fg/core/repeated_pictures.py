@@ -59,7 +59,7 @@ class WithoutRepeats(DerivedFrames):
 
 
 def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
-    """(V,) the views whose detections equal those of the frame before, if other views have new
+    """(V,) the views with detections equal to those of the frame before, if other views have new
     ones.
     """
     there, was = (np.bincount(each.view, minlength=views) for each in (now, before))

@@ -34,7 +34,7 @@ _BROKEN = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 @dataclass(frozen=True)
 class NamedNetwork:
-    """A downloadable network with a name."""
+    """A downloadable network that can be selected by name."""
 
     file: str
     """Archive of the network, at each of `BASES`."""

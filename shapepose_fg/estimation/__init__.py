@@ -1,1 +1,3 @@
-"""Stage II: where exactly people's joints are, in alternation with their bodies (section 3.2 of the paper)."""
+"""Stage II: estimates people's joints, in alternation with their bodies (section 3.2 of
+the paper).
+"""

@@ -1,4 +1,4 @@
-"""The Theta step: what the body is fitted to, and what it then says of each joint."""
+"""The Theta step: targets of the body fit, and the body's constraints on the joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,27 +12,27 @@ from shapepose_fg.estimation.linearisation import ViewEvidence, squared_distance
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 MODEL_SIGMA_M = 0.02
-"""How far a detector's joints lie from the body's, metres."""
+"""Standard deviation of a detector's joints from the body's, metres."""
 JOINT_SIGMA_M = 0.03
-"""Sigma of every joint where the body is fitted to X, all joints alike, metres."""
+"""Standard deviation of all joints if the body is fitted to X as in the paper, metres."""
 _SAME, _AS_MUCH = 2.5, 1.25
-"""The body of a frame by itself is as before where all targets moved by less than so many times what joints move
-that have settled, and weigh up to a quarter more or less: 5 mm, a quarter of `MODEL_SIGMA_M`."""
+"""Criteria for reusing a single-frame body: maximum motion of targets relative to `settled_m` (5
+mm, a quarter of `MODEL_SIGMA_M`), and maximum change of their weights."""
 
 
 @dataclass(frozen=True)
 class BodyStep:
-    """The Theta step of one round, for its R rows."""
+    """The Theta step of one round, for R rows."""
 
     fitter: BodyFitter
     """Fits bodies."""
     people: Sequence[WindowGraph]
-    """Whose the rows are, one person's after the other's."""
+    """The people with these rows, one after the other."""
     config: EstimatorConfig
-    """How."""
+    """Settings of stage II."""
 
     def targets(self, evidence: ViewEvidence, enough: Mask) -> JointTargets:
-        """What the bodies of the rows whom their views determine, `enough` (R,), are fitted to."""
+        """Targets of the bodies (R), for rows that their views determine, `enough` (R,)."""
         if self.config.refine.body_from_views:
             return joint_targets(evidence, enough)
         known = np.isfinite(evidence.points).all(axis=-1) & enough[:, None]
@@ -40,7 +40,9 @@ class BodyStep:
         return JointTargets(np.nan_to_num(evidence.points), information)
 
     def fit_changed(self, targets: JointTargets, last: BodyFit, told: JointTargets) -> tuple[BodyFit, Index]:
-        """Bodies (R), and which rows were fitted anew, from the `last` ones, fitted to what they were `told`."""
+        """Fit bodies (R) again where targets differ from `told`, those of the `last` fit; also
+        returns these rows.
+        """
         near_m = _SAME * self.config.refine.settled_m
         over_time = np.concatenate([np.full(len(person), person.temporal) for person in self.people])
         rows = np.arange(len(targets))
@@ -51,10 +53,11 @@ class BodyStep:
         return last.with_rows(rows, self.fit(targets, last, rows)) if len(rows) > 0 else last, rows
 
     def fit(self, targets: JointTargets, last: BodyFit, rows: Index | None = None) -> BodyFit:
-        """Bodies of some `rows` (K,) or of all, from the `last` ones (R) on.
+        """Fit the bodies of some `rows` (K,) or all, starting at the `last` ones (R).
 
-        A group's shape is then that of those of its rows that are in `rows`: a row fitted again has another shape
-        than the rest of its group. Over time results are measured so; a frame alone is a group of its own.
+        The shape of a group is then estimated from those of its rows in `rows`, and may differ from
+        that of its other rows. Reported accuracies over time include this; single frames are groups
+        of their own.
         """
         lengths = [len(person) for person in self.people]
         groups = np.repeat(np.arange(len(lengths)), lengths) if max(lengths, default=1) > 1 else None
@@ -67,12 +70,12 @@ class BodyStep:
         return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
 
     def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> JointTargets:
-        """What the bodies say of the joints `pulled` (R, J): E_shape of Eq. 3."""
+        """The bodies' constraints on the joints `pulled` (R, J): E_shape of Eq. 3."""
         xyz, covariance = body.prior_xyz.copy(), body.prior_covariance.copy()
         ok = np.repeat(body.ok[:, None], xyz.shape[1], axis=1)
         tied = {each for person in self.people for each in person.coupled}
         for joints in sorted(tied, key=sorted) if self.config.refine.body_from_views else ():
-            # Tied to each other, each would get the others' views twice: through the tie, and through the body.
+            # Coupled joints would get each other's views twice: by the coupling, and by the body.
             ties = [np.full(len(person), joints in person.coupled) for person in self.people]
             rows = np.flatnonzero(np.concatenate(ties))
             columns = np.array(sorted(joints))
@@ -90,13 +93,17 @@ class BodyStep:
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:
-    """What the body is fitted to: what the views say of all joints, of rows whom they determine (`enough`)."""
+    """Targets of the body: estimates of all joints from the views, for rows that these determine
+    (`enough`).
+    """
     information = np.where(enough[:, None, None, None], evidence.information, 0.0)
     return JointTargets(np.nan_to_num(evidence.target), information)
 
 
 def changed_targets(before: JointTargets, now: JointTargets, moved_m: float, times: float) -> Index:
-    """Rows with a joint whose target moved by more than `moved_m`, or weighs so many `times` more or less."""
+    """Rows with a target that moved by more than `moved_m`, or changed its weight by more than the
+    factor `times`.
+    """
     weights = [np.trace(each.information, axis1=2, axis2=3) for each in (before, now)]
     less, more = np.minimum(*weights), np.maximum(*weights)
     moved = (more > 0) & (np.linalg.norm(now.xyz - before.xyz, axis=-1) > moved_m)
@@ -104,12 +111,13 @@ def changed_targets(before: JointTargets, now: JointTargets, moved_m: float, tim
 
 
 def disagreement(evidence: ViewEvidence, fit: BodyFit) -> Array:
-    """How far (N, J) each joint's views put it from where the body can have it, in standard deviations.
+    """Disagreement (N, J) of each joint's views with the body, in standard deviations.
 
-    The smaller of two distances, each against the sum of both covariances: to where the rest of the body puts the
-    joint (`prior_xyz`), a Gaussian around one pose, far from which a forearm is that is only bent further; and to
-    the joint of the body that was fitted with it, whose robust kernel stays away from what no pose reaches. Where
-    the views leave a direction open, they cannot disagree in it. 0 for rows without a body.
+    The smaller of two Mahalanobis distances, with the sum of both covariances: to the prediction by
+    the rest of the body (`prior_xyz`), a Gaussian around one pose that is too narrow for, say, a
+    forearm bent further; and to the joint of the body fitted with it, which its robust kernel keeps
+    away from unreachable positions. The views cannot disagree in directions they leave unobserved.
+    0 for rows without a body.
     """
     fitted = np.nan_to_num(fit.covariance) + MODEL_SIGMA_M**2 * np.eye(3)
     squared = [

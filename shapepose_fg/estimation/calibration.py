@@ -1,4 +1,6 @@
-"""What covariances of joints are made of: all that tells how well each is known, weighed by measured numbers."""
+"""Calibrated covariances of joints: combines all features of their uncertainty with measured
+weights.
+"""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -9,24 +11,25 @@ from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
 
 LASTS_S = 0.25
-"""Doubts are the same before and after, over this time, seconds, one sigma; 0.5 and 1 s scored less."""
+"""Standard deviation of the temporal smoothing of features, seconds; 0.5 and 1 s scored worse."""
 SURE_M = 0.02
-"""Joints that views see are known to this, metres."""
+"""Usual standard deviation of joints that views see, metres."""
 CARRIED_MOST = 3.0
-"""A joint that no view sees is as doubtful at any sigma over this many times as much: it has room enough then."""
+"""Upper limit of the feature `carried`, the ratio of sigma and `SURE_M`."""
 
 PERSON_MOST = 4.0
-"""A person known on average to this many times `SURE_M` is as doubtful at any more."""
+"""Upper limit of the ratio of a person's mean sigma and `SURE_M`."""
 
 WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
-"""What the file names beside the scales of joints, as `Calibration` has them."""
+"""Entries of the file besides the scales of joints, as in `Calibration`."""
 
 
 @dataclass(frozen=True)
 class Clues:
-    """How well the joints of N rows, solved over time, are known: what the graph says, and what speaks against it.
+    """Features of the uncertainty of N rows' joints, solved over time: the graph's covariance, and
+    contradicting evidence.
 
-    The last four are means over the frames around (`in_time.smoothed_in_time`).
+    The last four are temporal means (`in_time.smoothed_in_time`).
     """
 
     frame: Whole
@@ -34,28 +37,33 @@ class Clues:
     joints: Array
     """(N, J, 3) the joints, metres; NaN where unknown."""
     views: Whole
-    """(N, J) how many views see each."""
+    """(N, J) number of views that see each joint."""
     covariance: Array
-    """(N, J, 3, 3) covariance from the graph, with errors that last, m²."""
+    """(N, J, 3, 3) covariance from the graph, including correlated errors, m²."""
     disagreement: Array
-    """(N, J) squared Mahalanobis distance of the joint from where the body has it."""
+    """(N, J) squared Mahalanobis distance of the joint from the body's prediction."""
     association: Array
-    """(N, J, 3, 3) between places with and without its doubtful observations (`doubt.association_spread`), m²."""
+    """(N, J, 3, 3) spread due to uncertain associations (`doubt.association_spread`), m²."""
     draft: Array
-    """(N, J, 3, 3) outer product of the way from the draft, around which detections were given out, to the joint,
-    m²."""
+    """(N, J, 3, 3) outer product of the displacement from the initial estimate used for
+    reassociation, m²."""
     exchange: Array
-    """(N, J, 3, 3) between it and others' joints that may be its own (`doubt.exchange_spread`), m²."""
+    """(N, J, 3, 3) spread due to possible exchanges with other people's joints
+    (`doubt.exchange_spread`), m²."""
 
     @property
     def carried(self) -> Array:
-        """(N, J) sigma over `SURE_M` of joints that no view sees, from 1 to `CARRIED_MOST`; 1 of others."""
+        """(N, J) sigma over `SURE_M`, clipped to 1 to `CARRIED_MOST`, for joints that no view sees;
+        1 for others.
+        """
         sigma_m = np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1) / 3)
         return np.where(self.views == 0, np.clip(sigma_m / SURE_M, 1.0, CARRIED_MOST), 1.0)
 
     @property
     def person(self) -> Array:
-        """(N, 1) squared logarithm of a person's mean sigma over `SURE_M`, from 1 to `PERSON_MOST`."""
+        """(N, 1) squared logarithm of a person's mean sigma over `SURE_M`, with the ratio clipped
+        to 1 to `PERSON_MOST`.
+        """
         known = np.isfinite(self.covariance).all(axis=(-2, -1))
         variance = np.where(known, np.trace(self.covariance, axis1=-2, axis2=-1) / 3, 0.0)
         sigma_m = np.sqrt(variance).sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
@@ -64,31 +72,34 @@ class Clues:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What each clue weighs."""
+    """Weights of the features."""
 
     scale: Array
-    """(J,) what the variances of each joint are multiplied with where nothing speaks against them: by the whole
-    recording's errors a shoulder or a hip is known less well than the graph takes it, a nose or a knee better."""
+    """(J,) factor on each joint's variances without contradicting evidence: over whole recordings a
+    shoulder or a hip is less certain than the graph's covariance, a nose or a knee more."""
     power: float
-    """Exponent of one plus the disagreement, by which variances are multiplied, too."""
+    """Exponent of one plus the disagreement, as a further factor on variances."""
     unseen: float
-    """Exponent of the sigma over `SURE_M`, where over 1, of a joint that no view sees: body and
-    motion, which carry it then, err rarely and by much."""
+    """Exponent of `carried`, for joints that no view sees: errors of body and motion, which then
+    determine them, are rare and large."""
     association: float
-    """How many times the clue of this name is added: single doubts of several views, of neighbouring joints and of
-    frames are one."""
+    """Factor on the feature of this name: uncertainties of several views, of neighbouring joints
+    and of frames are correlated."""
     draft: float
-    """How many times the clue of this name is added."""
+    """Factor on the feature of this name."""
     exchange: float
-    """How many times the clue of this name is added: how probable it is that two limbs that both bodies can have
-    are exchanged."""
+    """Factor on the feature of this name: probability that two limbs that fit both bodies are
+    exchanged."""
     person: float
-    """Covariances are multiplied by the exponential of this times how badly the person is known as a whole
-    (`Clues.person`): where that is badly, detections are somebody else's more often, and nothing tells which."""
+    """Covariances are multiplied by the exponential of this times `Clues.person`. If the overall
+    uncertainty of a person is large, its detections more often belong to another person, and no
+    other feature shows this."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":
-        """For a detector's joints, as `scripts/fit_covariances.py` wrote it; joints it lacks are as the mean."""
+        """Read the weights for a detector's joints, fitted by `scripts/fit_covariances.py`; others
+        get the mean scale.
+        """
         with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
             data = read_json(path)
         known = data["scale"]

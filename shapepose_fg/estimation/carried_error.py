@@ -1,4 +1,4 @@
-"""What it means for joints that poses of cameras that move are not known exactly."""
+"""Propagates uncertain poses of moving cameras to joints."""
 
 from collections.abc import Sequence
 
@@ -19,15 +19,17 @@ from shapepose_fg.estimation.linearisation import (
 )
 
 _NOTHING = 1.0
-"""What a joint of which nothing is known is known to, 1/m²: a metre."""
+"""Information added to joints without any, 1/m²: one metre."""
 POSES_LAST_S = 3.0
-"""Errors of poses that SLAM gives are taken to be new after this time: one of them counts in so long."""
+"""Correlation time of pose errors from SLAM, s: within it they count as one error."""
 
 
 def carried_covariance(
     evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
-    """(N, J, 3, 3) covariance of joints, m², that comes of their cameras' poses; zero where all stand still."""
+    """(N, J, 3, 3) covariance of joints from uncertain camera poses, m²; zero for
+    static cameras.
+    """
     if views.carried is None or len(evidence.points) == 0:
         return np.zeros((*evidence.points.shape, 3))
     goes = goes_with_poses(evidence, body, sigmas, views, config)
@@ -37,7 +39,9 @@ def carried_covariance(
 def reported_with_poses(
     rows: Observations, joints: Array, views: Views, config: ObservationConfig, names: Sequence[str]
 ) -> Array:
-    """(N, J, B, 3, 6) how `joints` (N, J, 3), which are called `names`, go with the poses of carriers."""
+    """(N, J, B, 3, 6) derivatives of `joints` (N, J, 3), with the given names, by the poses of
+    carriers.
+    """
     sigmas = observation_sigmas(rows, joints, views, config, names)
     nothing = JointTargets(joints, np.zeros((*joints.shape, 3)))
     return goes_with_poses(linearise(rows, sigmas, joints, views, config), nothing, sigmas, views, config)
@@ -46,12 +50,14 @@ def reported_with_poses(
 def goes_with_poses(
     evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
 ) -> Array:
-    """(N, J, B, 3, 6) how joints go with the poses of the B carriers of cameras, of which there is one.
+    """(N, J, B, 3, 6) derivatives of joints by the poses of the B carriers of cameras, at least
+    one.
 
-    Joints are where they are most probable given the poses; the law of total covariance adds G S G^T, with S the
-    covariance of a pose and G how the joint goes with it: the share of its information that comes from cameras on
-    that carrier, times how a point goes with the carrier. A body is where its views have it: what it says goes
-    with each carrier as its person's joints do on average, and so does a joint that nothing is said of.
+    Joints are solved given the poses; the law of total covariance adds G S G^T, with S the
+    covariance of a pose and G the derivative of the joint by it: the share of the joint's
+    information from cameras on that carrier, times the derivative of a point fixed to the carrier.
+    A body follows its views: its constraint moves with each carrier as its person's joints do on
+    average, and so does a joint without information.
     """
     carried, points = views.carried, np.nan_to_num(evidence.points)
     assert carried is not None
@@ -68,7 +74,7 @@ def goes_with_poses(
         gain = total @ (own + share[:, None, None, None] * (body.information + least))
         R, t = carried.wTb[:, number, :3, :3], carried.wTb[:, number, :3, 3]
         arm = points - t[:, None]
-        # With a turn w and a way v along the carrier's axes a point goes by R w x arm + R v.
+        # A rotation w and a translation v along the carrier's axes move a point by R w x arm + R v.
         goes = np.concatenate([-hat(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
         found[:, :, number] = gain @ goes
     return found

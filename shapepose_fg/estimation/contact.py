@@ -1,4 +1,6 @@
-"""Feet that stand: how probably, by their speeds over a window, and what that says of their next step."""
+"""Standing feet: their probability from speeds over a window, and the constraint on their next
+step.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,47 +13,48 @@ from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.joint_chains import Problem
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
-"""Joints that may stand, on either side, each by itself: toes stand while the heel rises."""
+"""Joints that may stand, independently on either side: toes stand while the heel rises."""
 SPEEDS_M_S = np.array([0.017, 0.116, 1.62])
-"""Speed per axis, one sigma, of a foot's joint that stands, that turns or slides, and that moves. These, and the
-next four, are a hidden Markov model of CMU motion capture, training subjects, 30 frames a second, fitted by
-expectation maximisation to velocities over two frames of ankles, heels and toes (code: 77ab725)."""
+"""Standard deviation of the speed per axis of a foot's joint that stands, that rotates or slides,
+and that moves. These and the next four are a hidden Markov model of CMU motion capture, training
+subjects, 30 frames a second, fitted by expectation maximisation to velocities over two frames of
+ankles, heels and toes (code: 77ab725)."""
 LASTS_S = np.array([0.63, 0.35, 0.57])
-"""How long each of these lasts, seconds, in the mean."""
+"""Mean duration of each state, seconds."""
 FIRST = np.array([0.29, 0.37, 0.34])
-"""How often each is."""
+"""Stationary probability of each state."""
 NEXT = np.array([[0.0, 0.99, 0.01], [0.42, 0.0, 0.58], [0.01, 0.99, 0.0]])
-"""What each turns into."""
+"""Transition probabilities between the states."""
 CORRELATION_S = np.array([0.06, 0.1, 0.5])
-"""How long a speed lasts within each, seconds."""
+"""Correlation time of the speed within each state, seconds."""
 LOOK_S = 0.05
-"""Frames within this time are one look at the speed: errors of velocities are alike for longer, but their
-covariances are wider than they are. Of 0.03, 0.05 and 0.1 s this has the least error over all speeds in simulated
-recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
+"""Frames within this time count as one observation of the speed. Errors of velocities are
+correlated for longer, but their covariances are too wide. Among 0.03, 0.05 and 0.1 s this has the
+least error over all speeds in simulated recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
 UNSEEN_S = 0.5
-"""Time after and before a joint was seen for which its speed is taken from the body, seconds."""
+"""Time before and after a joint is seen for which its speed is taken from the body, seconds."""
 FREE_M2_S = 0.02
-"""A step whose density is more than this is no step of a standing foot: at 30 frames a second it would be held to
-2.6 cm, and motion says more."""
+"""Density above which a step is unconstrained: at 30 frames a second it corresponds to 2.6 cm,
+where the motion model is stronger."""
 
 
 def feet_of(joints: Sequence[str]) -> Index:
-    """(F,) which of a detector's joints stand while a foot does."""
+    """(F,) indices of a detector's joints that stand with a foot."""
     return np.array([n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp)
 
 
 def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) -> Problem:
-    """Return the problem with those of the `feet` (F,) held that stand; arguments are those of
+    """Return the problem with constraints on standing `feet` (F,); arguments are those of
     `WindowGraph.solve`.
 
-    The feet are solved by themselves, without knowing of any standing.
+    The feet are first solved independently, without these constraints.
     """
     standing = problem.standing.copy()
     for chains in problem.chains(feet.tolist()):
         joints, states, at = chains.joints, chains.solved(initial), initial.copy()
         at[:, joints], velocity = states[..., :3].swapaxes(0, 1), states[..., 3:6].swapaxes(0, 1)
         if lost is not None:
-            # A body's guess that stands still is no foot that does, but for a while.
+            # A standing guess of the body is not evidence, except for a short time.
             velocity = np.where(
                 near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None], velocity, np.nan
             )
@@ -61,12 +64,12 @@ def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) ->
 
 
 def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Array:
-    """(T - 1, F) density of the walk that joints make in each step, m²/s: small where they stand.
+    """(T - 1, F) density of the random walk of joints in each step, m²/s: small if they stand.
 
-    `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are of a solution that knows nothing of standing,
-    NaN where nothing was seen. With p_k how probable each way to move is, given the whole window, and 2 s_k² c_k
-    the density of one with speed s_k that lasts for c_k, their mean is what a Gaussian can say of the step: where
-    it is doubtful whether a foot stands, it is hardly held.
+    `velocity` (T, F, 3) m/s and its `covariance` (T, F, 3, 3) are of a solution without standing
+    constraints, NaN if not seen. With p_k the probability of each state given the whole window, and
+    2 s_k² c_k the density for speed s_k with correlation time c_k, the density is their mean: if it
+    is uncertain whether a foot stands, it is hardly constrained.
     """
     known = np.asarray(np.isfinite(velocity).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3)))
     log = log_densities(np.nan_to_num(velocity), np.where(known[..., None, None], covariance, np.eye(3)))
@@ -76,7 +79,7 @@ def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Arra
 
 
 def log_densities(velocity: Array, covariance: Array) -> Array:
-    """(T, F, K) log density of velocities under each way to move, but for a constant."""
+    """(T, F, K) log-density of velocities under each state, up to a constant."""
     values, axes = principal_axes(covariance)
     along = np.einsum("tfia,tfi->tfa", axes, velocity)
     variance = np.maximum(values, 0.0)[..., None] + SPEEDS_M_S**2
@@ -84,9 +87,11 @@ def log_densities(velocity: Array, covariance: Array) -> Array:
 
 
 def smoothed(log: Array, times_s: Array) -> Array:
-    """(T, F, K) how probable each way to move is in each frame, given all frames: forwards and backwards.
+    """(T, F, K) probability of each state in each frame, given all frames (forward-backward
+    algorithm).
 
-    `log` (T, F, K) are log densities of what was seen. A frame counts with the share of a look that it is.
+    `log` (T, F, K) are log-densities of the observations. A frame is weighted by its share of an
+    observation.
     """
     dt = np.diff(times_s)
     share = np.minimum(np.gradient(times_s) / LOOK_S, 1.0)[:, None, None]

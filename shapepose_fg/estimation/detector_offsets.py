@@ -1,4 +1,4 @@
-"""Which joints of a recording are known well enough to learn the detector's habits from, and who uses them."""
+"""Selects well observed joints of a recording for estimating the detector's offsets."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -14,29 +14,30 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 
 _MIN_VIEWS = 3
-"""Views that must agree on a joint for it to be learnt from: two that agree may both be wrong."""
+"""Minimum number of views that agree on a joint; two that agree may both be wrong."""
 _MIN_CONFIDENCE = 0.4
-"""Confidence that a detection must have to count as one of these views."""
+"""Minimum confidence of a detection to count as one of these views."""
 _MAX_SIGMA_M = 0.03
-"""A joint whose views leave it less certain than this in some direction is not learnt from."""
+"""Maximum standard deviation of a used joint in its worst direction, m."""
 
 
 @dataclass(frozen=True)
 class OffsetConfig(Settings):
-    """Whether, and from what, the difference between the detector's joints and the body's is learnt, and how large
-    the detector's errors are (`noise_law`).
+    """Source of the detector's joint offsets and noise law.
+
+    Offsets are the difference between the detector's joints and the body's.
     """
 
     source: str = "recording"
-    """"recording": learnt from the recording itself; "none": there is none, and errors are the usual ones; else
-    a file that holds offsets: the run.json of another recording by the same detector, from which the errors are
-    taken, too, or what `KeypointOffsets.save` wrote."""
+    """"recording" learns both from the recording itself. "none" uses no offsets, and the shipped noise
+    law. Otherwise it is a file with offsets: the run.json of another recording with the same
+    detector, which also has a noise law, or a file from `KeypointOffsets.save`."""
     frames: Annotated[int, Interval(ge=1, le=10000)] = 30
-    """Frames, spread over the whole recording, that offsets are learnt from."""
+    """Number of frames, spread over the whole recording, for estimating offsets."""
     replaced: ClassVar[dict[str, str]] = dict.fromkeys(
         ("min_views", "min_confidence", "max_sigma_m", "prior"), "is a constant now"
     )
-    """Settings that there were, and what took their place."""
+    """Obsolete settings, and what replaces them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -45,16 +46,16 @@ class OffsetConfig(Settings):
 
 
 def spread_frames(length: int, count: int) -> list[int]:
-    """At most `count` frames spread evenly over a recording of `length` frames, rising."""
+    """At most `count` frames, ascending, evenly spread over a recording of `length` frames."""
     if length <= count:
         return list(range(length))
     return np.unique(np.linspace(0, length - 1, count).round().astype(int)).tolist()
 
 
 def confident_targets(observations: Observations, rig: Rig, config: ObservationConfig) -> JointTargets:
-    """Where the views alone put the joints that they know well, information zero for all others.
+    """Estimates of well observed joints from the views only, with zero information for all others.
 
-    Without the body: what it pulled towards its own joint would hide the detector's.
+    The body is not used, because its constraints would hide the detector's offsets.
     """
     views = Views.of(rig, observations.time_s)
     points = triangulate(observations, views, config)

@@ -1,4 +1,4 @@
-"""What it means for a joint that it is not certain whose its detections are, or whose limb it is on."""
+"""Spread of joints due to uncertain associations and exchanged limbs."""
 
 from collections.abc import Sequence
 
@@ -14,22 +14,24 @@ from shapepose_fg.estimation.limbs import ARMS_AND_LEGS, on_both_sides
 from shapepose_fg.estimation.linearisation import LEAST_PROBABILITY, ObservationConfig, ViewEvidence
 
 CERTAIN = 0.99
-"""Observations that are more probably the person's make no alternatives: four in five."""
+"""Probability above which an observation counts as certainly the person's: four in five."""
 FREE_M = 0.3
-"""A joint that nothing but a doubtful observation places is known to this, metres, without it: half an arm."""
+"""Standard deviation of a joint with a single, uncertain observation if that is wrong, metres: half
+an arm."""
 
 DOUBTED = 0.05
-"""Rows most of whose joints are more probably of the other side are not `Status.OK`: 95 % regions cannot hold."""
+"""Median probability of swapped sides above which a row is not `Status.OK`: its 95 % regions would
+be wrong."""
 REACH_M = 0.6
-"""Limbs of two people whose ends are nearer than this may be exchanged."""
+"""Maximum distance between the ends of two people's limbs that may be exchanged, metres."""
 FITS_M = 0.05
-"""An exchanged limb fits a body if it is as long as the body's own up to this, one sigma, metres: what limbs that
-were solved differ from their bodies' by."""
+"""Standard deviation of the length of an exchanged limb from the body's, metres, as for correctly
+solved limbs."""
 _FEET = ("BigToe", "SmallToe", "Heel")
 
 
 def limbs_to_exchange(joints: Sequence[str]) -> Index:
-    """(L, 3) joints of a detector that get exchanged with a limb, and the two ends of the limb.
+    """(L, 3) joints of a detector that may be exchanged with a limb, and the two ends of the limb.
 
     A foot goes with its ankle.
     """
@@ -38,11 +40,12 @@ def limbs_to_exchange(joints: Sequence[str]) -> Index:
 
 
 def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) -> Array:
-    """(N, J, 3, 3) outer products of the ways from joints to others' that may be theirs, m².
+    """(N, J, 3, 3) outer products of displacements from joints to others' that may be the person's
+    own, m².
 
-    Of `joints` (N, J, 3) in the `frame` (N,). Two people's limbs can have been exchanged for long, and each frame
-    looks certain. But hardly ever are both as long as in the fitted `bodies` (N, J, 3). Where they are, it counts
-    in full, and less and less with what the limbs miss.
+    For `joints` (N, J, 3) in the `frame` (N,). Two people's limbs may be exchanged over a long
+    time, without uncertainty in any single frame. But both rarely have lengths as in the fitted
+    `bodies` (N, J, 3); the displacement is weighted by this likelihood.
     """
     spread = np.zeros((*joints.shape, 3))
     far, near, end = limbs.T
@@ -60,10 +63,10 @@ def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) ->
 
 
 def mirrored_spread(joints: Array, mirrored: Array, names: Sequence[str]) -> Array:
-    """(N, J, 3, 3) outer products of the ways from joints (N, J, 3) to the same ones of the other side, m².
+    """(N, J, 3, 3) outer products of displacements from joints (N, J, 3) to those of the other
+    side, m².
 
-    They count by how probably the sides are exchanged: what the row's observations of them say, `mirrored`
-    (N, J, V).
+    Weighted by the probability of exchanged sides, `mirrored` (N, J, V) of the row's observations.
     """
     other = [names.index(mirror_of(name)) if mirror_of(name) in names else n for n, name in enumerate(names)]
     doubt = mirrored.max(axis=2, initial=0.0)
@@ -80,11 +83,13 @@ def association_spread(
     views: Views,
     config: ObservationConfig,
 ) -> Array:
-    """(N, J, 3, 3) covariance between the places that joints have with and without each doubtful observation, m².
+    """(N, J, 3, 3) covariance between the estimates of joints with and without each uncertain
+    observation, m².
 
-    Of an observation of probability p it is p (1 - p) d d^T, d being the way from the joint with it, as if it were
-    certain, to the joint without it. Whole segments are the one or the other: d is taken from one frame's views,
-    `evidence` at the solved joints, and from what the `body` says, without motion. The sum over the views.
+    For an observation of probability p it is p (1 - p) d d^T, with d the displacement between the
+    estimates with it, as if it were certain, and without it. Whole segments are right or wrong
+    together, so that d is computed from one frame's views, `evidence` at the solved joints, and the
+    `body`, without motion. Summed over the views.
     """
     joints = evidence.points
     spread = np.zeros((*joints.shape, 3))

@@ -1,4 +1,4 @@
-"""Roughly where joints are, without a graph: enough to assign the detections again."""
+"""Initial estimates of joints without a graph, for reassociating the detections."""
 
 from dataclasses import dataclass, replace
 
@@ -20,41 +20,42 @@ from shapepose_fg.estimation.linearisation import (
 )
 
 NARROWING_M = (0.2, 0.1, 0.05, 0.05)
-"""A draft's body is fitted to the detections around it, fit by fit, under a kernel that narrows, as in SMPLify:
-the distance from the projection, as a length at the joint's depth, at which a detection counts a quarter. On
-`tune`, frame by frame, MPJPE is 35 mm, and 44 where the body is fitted once, to what lies within `rho_2d_m` of
-where the views alone put each joint. With priors that are stiff as long as the kernel is wide F1 rose by 1.5
-points there, and raised arms hung on real footage."""
+"""Widths of the kernel for the body fits of an initial estimate, decreasing as in SMPLify:
+reprojection distance, as a length at the joint's depth, at which a detection's weight is a quarter.
+On `tune`, frame by frame, MPJPE is 35 mm, and 44 if the body is fitted once, to detections within
+`rho_2d_m` of the triangulated joints. With priors that are stiff while the kernel is wide F1 rose
+by 1.5 points there, but raised arms sank on real footage."""
 
 _AS_PROBABLY = 0.2
-"""A row is drafted anew where the probability of a detection is another by more than this since its draft: from 1
-to 0.8 the standard deviation of a detection grows by an eighth."""
+"""Change of a detection's probability above which a row is estimated again: from 1 to 0.8 the
+detection's standard deviation grows by an eighth."""
 
 MOVED_M = 0.02
-"""A draft's body is fitted again only where a joint's target moved by this since its last fit, as much as a
-detector's joints lie from the body's, or weighs another share: on Shelf a quarter of all fits are left."""
+"""Motion of a target, m, above which the body of an initial estimate is fitted again, similar to a
+detector's deviation from the body; or a changed weight. On Shelf a quarter of all fits remain."""
 
 
 @dataclass(frozen=True)
 class Draft:
-    """About where the joints of N rows are."""
+    """Initial estimates of the joints of N rows."""
 
     observations: Observations
-    """What it was made from: a row that was kept holds the probabilities that it was drafted with."""
+    """Observations of the estimate; unchanged rows keep the probabilities used for
+    their estimate."""
     places: Array
-    """(N, J, 3) metres; NaN where neither views nor body say any."""
+    """(N, J, 3) positions, metres; NaN if neither views nor body determine them."""
     covariance: Array
-    """(N, J, 3, 3) m²; NaN where the place is."""
+    """(N, J, 3, 3) covariances, m²; NaN like the positions."""
 
 
 def draft(
     observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
 ) -> tuple[Array, Array]:
-    """About where the joints of N rows are (N, J, 3), metres, and how surely (N, J, 3, 3).
+    """Initial estimates (N, J, 3), metres, and covariances (N, J, 3, 3) of the joints of N rows.
 
-    What the views say, and where that is little, or contradicts the body, what the body says. Views are asked
-    around where they put the joints, and then around the body, ever nearer to it (`NARROWING_M`). A joint's views
-    are in the body, too, so that these covariances are too small.
+    From the views, and from the body where these are weak or contradict it. Measurements are
+    linearised at triangulated joints, then at the body's, with a decreasing kernel (`NARROWING_M`).
+    As a joint's views also determine the body, the covariances are too small.
     """
     X = triangulate(observations, views, config.observations)
     sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
@@ -79,8 +80,8 @@ def draft(
 def redraft(
     last: Draft | None, observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
 ) -> Draft:
-    """`draft`, which leaves rows as they were in the `last` one whose detections are the same, and nearly as
-    probably theirs.
+    """`draft`, but rows keep their `last` estimate if their detections are the same, with similar
+    probabilities.
     """
     places = np.full(observations.initial.shape, np.nan)
     covariance = np.full((*places.shape, 3), np.nan)
@@ -97,7 +98,9 @@ def redraft(
 
 
 def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
-    """(K,) rows whose detections are as in a row of the same track and frame `before`, and (K,) those rows."""
+    """(K,) rows with the same detections as in the row of their track and frame `before`, and (K,)
+    these rows.
+    """
     width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
     names = [each.frame * width + each.track for each in (now, before)]
     _, here, there = np.intersect1d(*names, assume_unique=True, return_indices=True)
@@ -108,8 +111,8 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
 
 
 def first_places(observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig) -> Array:
-    """X_0 (N, J, 3), metres: where stage I has the joints, else where views do, and in windows of several frames
-    where a draft has them: a view that sees a joint counts from the first round on, then.
+    """X_0 (N, J, 3), metres: joints of stage I, else triangulated ones, and in windows of several
+    frames initial estimates, so that a single view of a joint counts from the first round on.
     """
     X = observations.initial
     if config.refine.complete_start:
@@ -126,10 +129,11 @@ def first_places(observations: Observations, views: Views, fitter: BodyFitter, c
 
 
 def drafted(evidence: ViewEvidence, body: BodyFit, disagreement: float) -> tuple[Array, Array]:
-    """Places (N, J, 3), metres, and covariances (N, J, 3, 3) of joints; NaN where neither views nor body say any.
+    """Positions (N, J, 3), metres, and covariances (N, J, 3, 3) of joints; NaN if neither views nor
+    body determine them.
 
-    What the views say and what the body says, weighted by their information. Views that are `disagreement`
-    standard deviations from the body count nothing: its robust kernel has passed over them, too.
+    Information-weighted means of views and body. Views more than `disagreement` standard deviations
+    from the body are ignored, as its robust kernel did.
     """
     known = (body.ok[:, None] & np.isfinite(body.covariance).all(axis=(2, 3)))[..., None]
     covariance = np.where(known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3))
@@ -139,10 +143,10 @@ def drafted(evidence: ViewEvidence, body: BodyFit, disagreement: float) -> tuple
     pull = (views @ (target - at)[..., None])[..., 0]
     spread = inverses(views + of_body)
     step = (np.where(known[..., None], spread, 0.0) @ pull[..., None])[..., 0]
-    # d^T (C + H^-1)^-1 d, of information H that may be singular.
+    # d^T (C + H^-1)^-1 d, with possibly singular information H.
     agree = ~known | (((target - at - step) * pull).sum(axis=-1, keepdims=True) < disagreement**2)
     spread, place = np.where(agree[..., None], spread, covariance), np.where(agree, at + step, at)
-    # To a metre: what the body knows so well itself, and of all else what has so much information.
+    # Determined to a metre: by the body itself, or by the sum of all information.
     determined = known & (np.trace(covariance, axis1=2, axis2=3) < 1.0)[..., None]
     asked = ~determined[..., 0]
     total = (of_body + np.where(agree[..., None], views, 0.0))[asked]

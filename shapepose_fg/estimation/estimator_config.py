@@ -1,4 +1,4 @@
-"""The settings of stage II."""
+"""Settings of stage II."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -16,54 +16,58 @@ from shapepose_fg.estimation.noise_law import NoiseLaw
 
 @dataclass(frozen=True)
 class WindowGraphConfig(Settings):
-    """What goes into a person's graph."""
+    """Settings of a person's graph."""
 
     rho_3d: Share = 1.0
-    """rho_3D of Eq. 4: joints whose mean confidence over all views is at most this are pulled by the body."""
+    """rho_3D of Eq. 4: joints with at most this mean confidence over all views are constrained by
+    the body."""
     weight_2d: Factor = 1.0
-    """w_2D of Eq. 5, multiplies the squared reprojection errors. With sigmas that are true, both weights are 1."""
+    """w_2D of Eq. 5, multiplies the squared reprojection errors. With correct sigmas both weights
+    are 1."""
     weight_shape: Factor = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model."""
     shape_sigma_m: MetresOrNone = 0.0
-    """Positive: the body pulls all joints alike, with this sigma, as in Eq. 3, which has one weight for all. 0:
-    with its own covariance, which differs from joint to joint and with direction."""
+    """Positive: common standard deviation of the body's constraint on all joints, as in Eq. 3 with
+    its single weight, m. 0: the body's own covariance, which differs by joint and direction."""
     max_iterations: Annotated[int, Interval(ge=1, le=1000)] = 20
-    """Levenberg-Marquardt steps at the most."""
+    """Maximum number of Levenberg-Marquardt steps."""
     tolerance: Factor = 1e-4
     """Relative change of the error at which Levenberg-Marquardt stops."""
 
     @classmethod
     def paper(cls) -> "WindowGraphConfig":
-        """As written in Eqs. 3 to 5. The paper does not say its weights; this one is the best of 1, 3 and 10 cm on
-        `tune`.
+        """The settings of Eqs. 3 to 5. The paper does not give its weights; this one is the best of
+        1, 3 and 10 cm on `tune`.
         """
         return cls(rho_3d=0.25, shape_sigma_m=0.03)
 
 
 @dataclass(frozen=True)
 class RefineConfig(Settings):
-    """How the alternation runs."""
+    """Settings of the alternation."""
 
     alternations: Repeats = 3
-    """N of Algorithm 1: how often the body is fitted and the joints are solved, at the most."""
+    """N of Algorithm 1: maximum number of body fits and joint solutions."""
     window_alternations: Repeats = 1
-    """N of Algorithm 1 for windows of several frames, which start from a draft of all joints (`draft`). Windows
-    with factors of the user's own take as many as frames alone: these may say what is far from what the views
-    said."""
+    """N of Algorithm 1 for windows of several frames, which start from initial estimates of all
+    joints (`draft`). Windows with user factors alternate as often as single frames, because these
+    factors may move joints far from the views' estimates."""
     settled_m: MetresOrNone = 0.002
-    """A window whose joints all moved less in a round is done: most frames are after one or two. 0: none is."""
+    """Maximum motion of joints per round in a converged window, m: most frames take one or two
+    rounds. 0: never."""
     max_sigma_m: Metres = 0.5
-    """A joint whose views leave it less certain than this in some direction is not determined by them."""
+    """Maximum standard deviation of a joint determined by its views, in the worst direction, m."""
     disagreement: Annotated[float, Interval(ge=0, le=1e6)] = 6.0
-    """A joint that its views put this many standard deviations from where the body can have it is seen wrongly:
-    its gates are decided anew from the body's place, and the body is fitted again. 4 threw away more joints that
-    were right than wrong ones, in simulated crowds. 0: nothing is thrown away, as in the paper."""
+    """Disagreement of a joint's views with the body, in standard deviations, above which the joint
+    is gated again at the body's position, and the body fitted again. With 4 more correct than wrong
+    joints were rejected in simulated crowds. 0: none is rejected, as in the paper."""
     complete_start: bool = True
-    """Whether frame by frame joints that two views saw and stage I did not place are triangulated for X_0. In the
-    paper they are missing until the body puts them somewhere."""
+    """Whether, in single frames, joints seen by two views but missing from stage I are triangulated
+    for X_0. In the paper they are missing until the body gives them a position."""
     body_from_views: bool = True
-    """Whether the body is fitted to what the views alone say of each joint, and what it says of a joint comes from
-    a fit without that joint's own views. In Algorithm 1 it is fitted to X_n, and its joints are the prior."""
+    """Whether the body is fitted to estimates of joints from the views only, and its constraint on
+    a joint is from a fit without that joint's own views. In Algorithm 1 it is fitted to X_n, and
+    its joints are the prior."""
 
     @classmethod
     def paper(cls) -> "RefineConfig":
@@ -72,25 +76,27 @@ class RefineConfig(Settings):
 
     @property
     def contradiction(self) -> float:
-        """Standard deviations from which on views and body contradict each other; infinite where none do."""
+        """Disagreement of views and body that is a contradiction, in standard deviations; infinite
+        if disabled.
+        """
         return self.disagreement if self.disagreement > 0 else np.inf
 
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """The settings of stage II."""
+    """All settings of stage II."""
 
     observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """How far a 2D observation is trusted."""
+    """Noise model of 2D observations."""
     graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
-    """What goes into the factor graph of a person."""
+    """Settings of the factor graph of a person."""
     refine: RefineConfig = field(default_factory=RefineConfig)
-    """How joints and bodies alternate."""
+    """Settings of the alternation of joints and bodies."""
     motion: MotionConfig = field(default_factory=MotionConfig)
-    """How frames hang together."""
+    """Settings of the links between frames."""
     law: Motion = CONSTANT_VELOCITY
-    """How joints move."""
+    """Motion model of the joints."""
     joints: tuple[str, ...] = BODY_25.joints
-    """What the detector calls its joints: motion, sigmas and limbs go by them."""
+    """Names of the detector's joints, for motion, sigmas and limbs."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """How far the detector's joints lie from the true ones, for covariances; weights are `observations`'."""
+    """The detector's noise law, for covariances only. Weights come from `observations`."""

@@ -1,4 +1,4 @@
-"""What factors of the user's own say of a joint, each in information form."""
+"""Information about a joint from user factors."""
 
 from dataclasses import dataclass
 
@@ -12,34 +12,35 @@ from shapepose_fg.estimation.window_graph import UserFactor, WindowGraph
 
 @dataclass(frozen=True)
 class FactorEvidence:
-    """What one factor of the user's own says of a joint."""
+    """Information about a joint from one user factor."""
 
     name: str
-    """The name of the function that made it."""
+    """Name of the function that created the factor."""
     others: tuple[tuple[int, int, int], ...]
-    """The joints that it ties this one to: person, joint and frame of each."""
+    """Joints that it connects this one to: person, joint and frame of each."""
     information: Array
-    """(3, 3) information on the joint's position, 1/m², from what is known of the factor's other variables without
-    this factor."""
+    """(3, 3) information on the joint's position, 1/m², given the covariance of the factor's other
+    variables without this factor."""
 
 
 def factor_evidence(window: WindowGraph, t: int, joint: int) -> list[FactorEvidence]:
-    """What the user's factors on a joint in row `t` of a solved window say of its position.
+    """Information on the position of a joint in row `t` of a solved window, from the user factors
+    on it.
 
-    The other variables of a factor are marginalised out with the covariance that they have in the graph without
-    the user's factors on this joint and frame. What factors in other frames say comes by motion.
+    The other variables of a factor are marginalised out with their covariance in the graph without
+    user factors on this joint and frame. Factors in other frames contribute by motion.
     """
     key, ties = int(window.keys[t, joint]), window.ties
     mine = [factor for factor in ties.active if key in factor.keys]
     if len(mine) == 0 or window.failure:
         return []
-    first = window.graph.size() - len(ties.active)  # the user's are the last
+    first = window.graph.size() - len(ties.active)  # user factors are last
     without = {first + n for n, factor in enumerate(ties.active) if key in factor.keys}
     rest = gtsam.NonlinearFactorGraph()
     for n in range(window.graph.size()):
         if n not in without:
             rest.push_back(window.graph.at(n))
-    wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)  # a joint that only these factors place
+    wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)  # for joints determined by these factors only
     for other in {other for factor in mine for other in factor.keys}:
         if window.ties.start.exists(other):
             continue
@@ -47,7 +48,7 @@ def factor_evidence(window: WindowGraph, t: int, joint: int) -> list[FactorEvide
     try:
         marginals = gtsam.Marginals(rest, window.values)
         return [_evidence(factor, key, window, marginals) for factor in mine]
-    except RuntimeError:  # a variable of the user's own that nothing else places: these factors say nothing
+    except RuntimeError:  # a user variable is otherwise undetermined
         return []
 
 

@@ -10,46 +10,49 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import basis_across
 
 LOOK_S = 1.5
-"""A foot that stands for so long is one look at the floor: so long errors are correlated
+"""Time for which a standing foot counts as one look, s: the correlation time of errors
 (`BodyConfig.correlation_s`)."""
 LEAST_LOOKS = 6
-"""Looks that a floor takes: two feet of one person over five seconds, or of three people at a time."""
+"""Minimum number of looks for a floor: two feet of one person over five seconds, or of three people
+at once."""
 AGREE = 0.6
-"""The share of all looks that a floor takes. The others may be of feet on chairs and of legs that are crossed."""
+"""Minimum share of looks that agree on the floor. The others may be feet on chairs, or crossed
+legs."""
 NEAR_M = 0.06
-"""A foot this near to the floor stands on it: in simulated recordings of 3 to 6 cameras 99 % of the bodies' lowest
-points are within 4 cm."""
+"""Distance from the floor within which a foot stands on it, m: in simulated recordings of 3 to 6
+cameras 99 % of the bodies' lowest points are within 4 cm."""
 UNDER_M = 0.1
-"""A foot this far below the floor stands on something else; nothing does below a floor."""
+"""Depth below the floor, m, at which a foot contradicts it."""
 UNDER_SHARE = 0.05
-"""Largest share of looks below the floor: bodies that are fitted badly; before two cameras that face each other as
-many as 4 in 100 are (simulated; of three and more cameras none). More are another floor, and then none is said."""
+"""Maximum share of looks below the floor, due to badly fitted bodies: with two cameras that face
+each other up to 4 in 100, with three and more none (simulated). With more, there is another floor,
+and none is reported."""
 SCALE_M = 0.015
-"""Width of the kernel: how much soles of bodies differ from the floor that they stand on, metres, one sigma."""
+"""Standard deviation of the soles of bodies from the floor, metres; width of the kernel."""
 TILT_RAD = np.deg2rad(0.5)
-"""How far the floor may lean from the level of the cameras' file, one sigma on either axis."""
+"""Standard deviation of the floor's tilt about either axis, rad, relative to the cameras' up."""
 SOLE_M = 0.01
-"""How far soles of all bodies together may be from the floor: shoes, and the offsets of the detector's joints. In
-simulated recordings the floor is found 2 to 6 mm too low."""
+"""Common error of all soles, m: shoes, and the offsets of the detector's joints. In simulated
+recordings the floor is found 2 to 6 mm too low."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """A plane that was found."""
+    """A floor plane."""
 
     normal: Array
     """(3,) unit vector that points up."""
     height_m: float
     """Height of all points of the floor along the normal, metres."""
     sigma_m: float
-    """How surely, under the middle of the feet that it was found from, metres."""
+    """Standard deviation of the height, below the centre of the feet used, metres."""
     looks: int
-    """From how many looks at standing feet."""
+    """Number of looks at standing feet used."""
     share: float
-    """Which share of these agrees."""
+    """Share of these that agree."""
 
     def above(self, points: Array) -> Array:
-        """(...,) how far points (..., 3) are above the floor, metres."""
+        """(...,) height of points (..., 3) above the floor, metres."""
         return np.asarray(points @ self.normal - self.height_m)
 
     def as_dict(self) -> dict[str, Any]:
@@ -60,7 +63,7 @@ class Floor:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any] | None) -> "Floor | None":
-        """What `as_dict` gave; None for a run that found none."""
+        """Inverse of `as_dict`; None for a run without a floor."""
         if values is None or not values["found"]:
             return None
         rest = {name: values[name] for name in ("height_m", "sigma_m", "looks", "share")}
@@ -68,10 +71,11 @@ class Floor:
 
 
 def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD) -> Floor | str:
-    """The floor under `points` (N, 3), the lowest of feet that stand; else in words why there is none.
+    """The floor under `points` (N, 3), the lowest points of standing feet; else the reason why
+    there is none.
 
-    `look` (N,) numbers what is seen as one. A robust plane, level but for `tilt_rad`, starts at the height where
-    most looks agree.
+    `look` (N,) numbers correlated observations. A robust fit of a plane, level up to `tilt_rad`,
+    starts at the height where most looks agree.
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
     if len(numbers) < LEAST_LOOKS:
@@ -100,7 +104,7 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
         return f"{under:.0%} of standing feet are below where most stand"
     normal = up - found[1:] @ across
     length = np.linalg.norm(normal)
-    # Of the points on the plane one is over the middle: up . x = found[0] + slope . across (x - middle).
+    # The plane's height at the middle, converted to the distance along the normal.
     height_m = (found[0] - found[1:] @ (across @ middle)) / length
     sigma_m = np.hypot(SCALE_M * np.sqrt(np.linalg.inv(information)[0, 0]), SOLE_M)
     return Floor(normal / length, float(height_m), float(sigma_m), len(numbers), share)

@@ -1,27 +1,30 @@
-"""Joints over the frames of a window: how fast, how long unseen, gaps closed, values smoothed."""
+"""Temporal operations on a window's joints: velocities, times since seen, gap filling,
+smoothing.
+"""
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SPEED_S = 0.1
-"""Time before and after a frame over which a velocity is taken, s."""
+"""Time before and after a frame for estimating a velocity, s."""
 _AROUND_S = 0.3
-"""Time before and after a step over which motion is averaged, s: what is wrong for a quarter of it does not
-count."""
+"""Time before and after a step over which motion is a median, s; errors for a quarter of it have no
+effect."""
 _HOP_S = 0.045
-"""Shortest time over which a displacement counts as motion, s: over less, noise is larger."""
+"""Minimum duration of a displacement for a speed, s; over less, noise dominates."""
 _KNOWN_M = 0.1
-"""Standard deviation along an axis above which a point says nothing of motion, m."""
+"""Maximum standard deviation along an axis of a point used for motion, m."""
 
 
 def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
-    """(T - 1, J) speed, m/s, and (T - 1, J) power spectral density of the acceleration along an axis, m²/s³, of
-    points (T, J, 3), metres, around each step.
+    """(T - 1, J) speed, m/s, and (T - 1, J) power spectral density of the acceleration along an
+    axis, m²/s³, of points (T, J, 3), metres, around each step.
 
-    The speed is the length of the path per second: a limb that swings to and fro is fast. The density is that of
-    second differences, without what noise of `variance` (T, J) along an axis, m², adds to them. Both are medians
-    over time, which a few wrong points do not change, from points known to `_KNOWN_M`; 0 where there are none.
+    The speed is the path length per second, so that a limb swinging back and forth is fast. The
+    density is computed from second differences, minus the contribution of noise with `variance` (T,
+    J) along an axis, m². Both are temporal medians, robust to a few wrong points, over points known
+    to `_KNOWN_M`; 0 without any.
     """
     at, joint = np.arange(len(times_s))[:, None], np.arange(points.shape[1])
     known = np.asarray(np.isfinite(points).all(axis=2) & (variance < _KNOWN_M**2))
@@ -40,8 +43,8 @@ def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Ar
 
 
 def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
-    """(T, J) the nearest frame at least `_HOP_S` before each in which a joint is `known` (T, J), and after it; the
-    frame itself where there is none.
+    """(T, J) for each frame, the nearest earlier and later frames, at least `_HOP_S` away, in which
+    a joint is `known` (T, J); the frame itself if none.
     """
     T, at = len(times_s), np.arange(len(times_s))[:, None]
     before = np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1
@@ -52,8 +55,8 @@ def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
 
 
 def _median(values: Array, first: Index, until: Index) -> Array:
-    """(S, J) medians of `values` (K, T, J), K alike, from frames `first` (S,) `until` (S,), at least 0; NaN does
-    not count, and without any value it is 0.
+    """(S, J) medians of `values` (K, T, J), over all K and frames from `first` (S,) to before
+    `until` (S,), at least 0; NaN is ignored, and the result is 0 without any value.
     """
     near = first[:, None] + np.arange(int((until - first).max(initial=1)))
     each = np.where((near < until[:, None])[..., None], values[:, np.minimum(near, values.shape[1] - 1)], np.nan)
@@ -63,7 +66,9 @@ def _median(values: Array, first: Index, until: Index) -> Array:
 
 
 def velocities(points: Array, times_s: Array) -> Array:
-    """(T, J, 3) how points (T, J, 3) move, m/s, over `SPEED_S` before and after; NaN in a single frame."""
+    """(T, J, 3) velocities of points (T, J, 3), m/s, over `SPEED_S` before and after; NaN for a
+    single frame.
+    """
     first = np.searchsorted(times_s, times_s - SPEED_S, side="left")
     last = np.searchsorted(times_s, times_s + SPEED_S, side="right") - 1
     lasts = np.where(last > first, times_s[last] - times_s[first], np.nan)
@@ -71,7 +76,7 @@ def velocities(points: Array, times_s: Array) -> Array:
 
 
 def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
-    """(T, J) which frames are at most `within_s` from one that is `marked` (T, J)."""
+    """(T, J) frames within `within_s` of one that is `marked` (T, J)."""
     first = np.searchsorted(times_s, times_s - within_s, side="left")
     last = np.searchsorted(times_s, times_s + within_s, side="right")
     count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
@@ -79,18 +84,22 @@ def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
 
 
 def spanned(marked: Mask) -> Mask:
-    """(T, J) which frames lie between the first and the last that are `marked` (T, J), these two included."""
+    """(T, J) frames from the first to the last that is `marked` (T, J), inclusive."""
     return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
 
 
 def waited_s(seen: Mask, times_s: Array) -> Array:
-    """(T, J) seconds to the nearest frame in which a joint is `seen` (T, J); infinite where there is none."""
+    """(T, J) time to the nearest frame in which a joint is `seen` (T, J), seconds; infinite if
+    never.
+    """
     at = np.broadcast_to(times_s[:, None], seen.shape)
     return np.where(seen.any(axis=0), np.abs(at - carried(at, seen, times_s)), np.inf)
 
 
 def carried(values: Array, seen: Mask, times_s: Array) -> Array:
-    """Values (T, J, ...) of joints, where they are not `seen` (T, J) from the nearest frame in which they are."""
+    """Values (T, J, ...), with those of joints not `seen` (T, J) copied from the nearest frame in
+    which they are.
+    """
     result = values.copy()
     for joint in np.flatnonzero(seen.any(axis=0) & ~seen.all(axis=0)).tolist():
         frames = np.flatnonzero(seen[:, joint])
@@ -100,7 +109,9 @@ def carried(values: Array, seen: Mask, times_s: Array) -> Array:
 
 
 def interpolated(points: Array, times_s: Array) -> Array:
-    """Points (T, J, 3) with gaps closed in a straight line, and the ends held; joints never known stay NaN."""
+    """Points (T, J, 3) with linearly interpolated gaps and constant ends; joints that are never
+    known stay NaN.
+    """
     known = np.asarray(np.isfinite(points).all(axis=2))
     result = points.copy()
     for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
@@ -111,8 +122,8 @@ def interpolated(points: Array, times_s: Array) -> Array:
 
 
 def smoothed_in_time(values: Array, times_s: Array, width_s: float, where: Mask | None = None) -> Array:
-    """Values (T, J, ...) averaged over time with a Gaussian of `width_s`, one sigma, from the frames in which they
-    are `where` (T, J); from frames however far off, where there are no others.
+    """Values (T, J, ...) smoothed by a Gaussian of `width_s`, one sigma, over frames with `where`
+    (T, J); over distant frames if there are no nearer ones.
     """
     where = np.ones(values.shape[:2], dtype=bool) if where is None else where
     near = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2) + 1e-9

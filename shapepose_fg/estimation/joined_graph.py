@@ -1,4 +1,6 @@
-"""Reconstructed people for a graph of yours: who was seen where in which frame, as increments to it."""
+"""Increments for your own graph from reconstructed people: joints with their observations, frame by
+frame.
+"""
 
 from collections.abc import Callable, Iterator
 
@@ -27,13 +29,16 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.trajectory_graph import Mounted, dilution
 
 _MAP_S = 15.0
-"""Landmarks hold a map together for as long as a detector's errors last, and longer."""
+"""Time over which landmarks keep a map consistent, s, longer than a detector's errors are
+correlated."""
 PoseKey = Callable[[str, int], int]
-"""Key of the `Pose3`, world from carrier, of a trajectory's name in a frame."""
+"""Function from a trajectory's name and a frame to the key of its `Pose3`, world from carrier."""
 
 
 class JoinedPeople:
-    """Turns rows of results, as they come, into factors and start values for a graph with the cameras' poses."""
+    """Converts rows of results, as they arrive, into factors and initial values for a graph with
+    camera poses.
+    """
 
     def __init__(
         self,
@@ -45,27 +50,29 @@ class JoinedPeople:
         config: ObservationConfig | None = None,
         link_s: float = 0.25,
     ) -> None:
-        """`rig` is the one that people were found with; its cameras with a `carrier` get their poses from your
-        graph, all others stand still. `step_s` is from frame to frame, of those that are given: detectors' errors
-        last, so frames near each other count as less, and joints' covariances, given the poses, are too wide.
-        `link_s` as in `PeopleInGraph`.
+        """`rig` is that of the reconstruction; its cameras with a `carrier` get their poses from
+        your graph, all others are static. `step_s` is the interval between the given frames: as
+        detectors' errors are correlated, closer frames have a smaller weight, and joint
+        covariances, given the poses, are too wide. `link_s` as in `PeopleInGraph`.
         """
         self._rig, self._pose_key = rig, pose_key
         self._config = ObservationConfig() if config is None else config
         self._together, name = dilution(step_s, _MAP_S), self._config.robust_kernel
         scale = np.sqrt(self._together)
-        # A lasting error is no outlier: in pixels the kernel is as wide as for the detector's own sigma.
+        # A correlated error is not an outlier: in pixels the kernel's width is that for the
+        # detector's own sigma.
         kernel = robust_kernel(name, None if name is None else DEFAULT_WIDTH_SIGMA[name] / scale)
         self._people = PeopleInGraph(space, kernel=kernel, link_s=link_s)
         self._lenses = [make_calibration(camera.K) for camera in rig.cameras]
         self._still = [make_camera(camera.K, camera.wTc) for camera in rig.cameras]
 
     def increments(self, people: Reconstruction) -> Iterator[tuple[int, Increment]]:
-        """Frame number and increment of each frame of `people`, which has what it was solved from, in order.
+        """Yield frame number and increment for each frame of `people`, in order; these need their
+        observations.
 
-        Beside the joints that tell of poses there are those that people were reported at
-        (`KeySpace.reported`): body, motion and all frames are in them, and they go with your poses. ValueError
-        where observations or times are missing.
+        Besides the joints that constrain poses, there are the reported ones (`KeySpace.reported`),
+        which include body, motion and all frames, and move with your poses. Raises ValueError if
+        observations or times are missing.
         """
         if len(people) == 0:
             return
@@ -74,13 +81,14 @@ class JoinedPeople:
                 "people need observations and times: reconstruct over time, and keep observations.npz"
             )
         table, motion = people.observations, MotionModel.load(tuple(people.joint_names.tolist()))
-        # As much as what is seen: joints are smoothed as they would be if errors were new in each frame.
+        # Scaled like the observations, so that joints are smoothed as if errors were independent in
+        # each frame.
         density = self._together * motion.density(np.linalg.norm(np.nan_to_num(people.velocity), axis=-1))
         rows = table.observations(people.joints, people.time_s)
         views = Views.of(self._rig, rows.time_s)
         seen = rows, people.joints, views, self._config, people.joint_names.tolist()
         sigmas = np.sqrt(self._together) * observation_sigmas(*seen)
-        # Where a joint would have been seen at the row's time, by the camera where it was at its own.
+        # Observation at the row's time, by the camera at its own exposure pose.
         xy = np.where(table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan)
         goes = reported_with_poses(*seen) if views.carried is not None else None
         for frame in np.unique(people.frame).tolist():
@@ -98,7 +106,7 @@ class JoinedPeople:
             yield frame, made
 
     def _report(self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment) -> None:
-        """Add the joints of a row as they are reported."""
+        """Add the reported joints of a row."""
         person, frame, time_s = int(people.person[n]), int(people.frame[n]), float(people.time_s[n])
         X, C = people.joints[n], people.covariance[n]
         keys = self._people.space.reported(person, np.arange(len(X)), frame)
@@ -110,7 +118,8 @@ class JoinedPeople:
                 for b in np.argsort(-moves, kind="stable")[:2][np.sort(-moves)[:2] < 0].tolist():
                     name = self._rig.trajectories[b].name
                     poses.append((self._pose_key(name, frame), gtsam.Pose3(carried.wTb[n, b]), goes[j, b]))
-                    # What comes of the poses is your graph's to say: no less than a tenth is the joint's own.
+                    # Your graph adds the uncertainty of poses; at least a tenth of the variance is
+                    # the joint's own.
                     own = own - goes[j, b] @ carried.covariance[n, b] @ goes[j, b].T
                 own = raise_eigenvalues(own, np.trace(C[j]) / 30)
             made.graph.push_back(reported_factor(key, X[j], own, poses))
@@ -118,7 +127,7 @@ class JoinedPeople:
             made.times_s[key] = time_s
 
     def _cameras(self, frame: int, time_s: Array) -> list[gtsam.PinholeCameraCal3_S2 | PosedCamera]:
-        """The cameras of a frame whose views are of `time_s` (V,)."""
+        """The cameras of a frame with exposure times `time_s` (V,)."""
         sensors = Mounted(self._rig, np.array([frame]), time_s[None]).sensors[0]
         cameras: list[gtsam.PinholeCameraCal3_S2 | PosedCamera] = list(self._still)
         for view in np.flatnonzero(self._rig.carrier >= 0).tolist():

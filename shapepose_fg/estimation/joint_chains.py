@@ -1,7 +1,8 @@
-"""A window's joints as chains over time: each joint's state hangs on those of the frames before and after it.
+"""A window's joints as chains over time: each joint's state is linked to those in adjacent frames.
 
-All of a window's graph is so but factors of the user's own, which these chains leave out. GTSAM starts where they
-end, and without such factors a step of it confirms that; linearised at its solution they give covariances.
+This is the whole graph of a window except for user factors, which these chains omit. GTSAM starts
+at their solution, and without such factors a single step confirms it; the linearisation there gives
+covariances.
 """
 
 from collections.abc import Iterable
@@ -21,92 +22,95 @@ from shapepose_fg.estimation.kernels import ready, solve_chains
 from shapepose_fg.estimation.motion_model import Lasting
 
 _SETTLED_M = 5e-4
-"""Chains are solved until no joint moves by more, metres."""
+"""Convergence: maximum motion of a joint in a step, metres."""
 _STEPS = 20
-"""Maximum number of steps: under a robust kernel the last ones halve what is left."""
+"""Maximum number of steps; with a robust kernel the last ones halve the remaining error."""
 _HELD = 1e-6
-"""Information that holds a joint of a frame by itself where it is, 1/m²: a kilometre."""
+"""Information of the prior that keeps single-frame joints in place, 1/m²: one kilometre."""
 UNDETERMINED_M = 10.0
-"""A variable that the problem leaves less certain than this in some direction, metres or m/s, is not
-determined."""
+"""Standard deviation, metres or m/s, above which a variable is undetermined, in its worst
+direction."""
 
 
 @dataclass(frozen=True)
 class Projections:
-    """The observations of a window's joints."""
+    """Observations of a window's joints."""
 
     views: Views
-    """The cameras, T rows of them where they move."""
+    """The cameras, by row (T) if they move."""
     xy: Array
     """(T, J, V, 2) undistorted pixels."""
     sigmas_px: Array
-    """(T, J, V) standard deviation of the error that is new in every frame, pixels."""
+    """(T, J, V) standard deviation of the white part of the error, pixels."""
     used: Mask
-    """(T, J, V) which observations count."""
+    """(T, J, V) mask of the used observations."""
     lead_s: Array
-    """(T, J, V) how long after the state each was exposed, seconds."""
+    """(T, J, V) exposure time of each observation relative to the state, seconds."""
     kernel: KernelName | None
     """The robust kernel."""
     scale: float
-    """What all sigmas were multiplied with; the kernel is as wide as if they were not."""
+    """Factor applied to all sigmas; the kernel's width is not affected by it."""
 
     @property
     def width(self) -> float:
-        """The kernel's width, standard deviations."""
+        """Width of the kernel, standard deviations."""
         return 1.0 if self.kernel is None else DEFAULT_WIDTH_SIGMA[self.kernel] / self.scale
 
     @cached_property
     def weight(self) -> Array:
-        """(T, J, V) 1 / sigma², 1/px²; 0 where an observation does not count."""
+        """(T, J, V) 1 / sigma², 1/px²; 0 for unused observations."""
         return np.where(self.used, 1.0 / np.where(self.used, self.sigmas_px, 1.0) ** 2, 0.0)
 
 
 @dataclass(frozen=True)
 class Said:
-    """A message about a window's joints whose error lasts."""
+    """Estimates of a window's joints with correlated errors."""
 
     message: JointTargets
-    """What is said, T rows."""
+    """The estimates in information form, T rows."""
     scale: float
-    """Covariances are multiplied with this."""
+    """Factor on the covariances."""
     errors: Lasting
-    """How its error lasts."""
+    """Temporal correlation of the error."""
     where: Mask
-    """(T, J) where it counts, with an offset."""
+    """(T, J) where the estimate is used, with an offset variable."""
 
 
 @dataclass(frozen=True)
 class Chains:
-    """C joints whose states have the same d numbers: three of each of their parts."""
+    """C joints with states of the same d numbers, three for each part."""
 
     joints: Index
-    """(C,) which of the window's."""
+    """(C,) indices of the window's joints."""
     parts: tuple[int, ...]
-    """Which columns of `WindowGraph.states` the parts are, position first."""
+    """Columns of `WindowGraph.states` of the parts, position first."""
     diagonal: Array
-    """(C, T, d, d) information of what is linear, of each state with itself."""
+    """(C, T, d, d) information of the linear terms, diagonal blocks."""
     below: Array
-    """(C, T - 1, d, d) information of each state, rows, with the one before it, columns."""
+    """(C, T - 1, d, d) information of the linear terms, blocks between each state (rows) and the
+    one before (columns)."""
     right: Array
-    """(C, T, d) information times what is expected."""
+    """(C, T, d) information vector."""
     there: Mask
-    """(T, C, p) which parts there are in which frames: offsets are not in all."""
+    """(T, C, p) mask of parts present in each frame; offsets may be absent."""
     seen: Projections
-    """What is not linear."""
+    """The non-linear terms."""
 
     def solved(self, initial: Array) -> Array:
-        """(C, T, d) states of least cost, from `initial` positions (T, J, 3); each chain by itself.
+        """(C, T, d) states of minimum cost, from `initial` positions (T, J, 3), independently for
+        each chain.
 
-        One that leads a joint farther away than `UNDETERMINED_M` stays where it is, at rest.
+        A chain that moves a joint by more than `UNDETERMINED_M` keeps its initial state, at rest.
         """
         states, start = self._solve(initial, _STEPS, np.empty((0, 1, 1, 1))), self._at(initial)
         lost = np.abs(states - start)[..., :3].max(axis=(1, 2)) > UNDETERMINED_M
         return np.where(lost[:, None, None], start, states)
 
     def covariances(self, points: Array) -> Array:
-        """(2, T, C, 3, 3) marginal covariances of positions and velocities where joints are at `points` (T, J, 3).
+        """(2, T, C, 3, 3) marginal covariances of positions and velocities with joints at `points`
+        (T, J, 3).
 
-        NaN in all of a chain that is singular, and where one is not determined.
+        NaN for all of a singular chain, and for undetermined variables.
         """
         found = np.empty(self.diagonal.shape)
         self._solve(points, 0, found)
@@ -127,26 +131,30 @@ class Chains:
         return states
 
     def put(self, states: Array, into: Array) -> None:
-        """Write `states` (C, T, d) `into` those of the window (T, J, S, 3), each part to its place."""
+        """Write `states` (C, T, d) into those of the window, `into` (T, J, S, 3), each part to its
+        column.
+        """
         parts = states.reshape(*states.shape[:2], -1, 3).swapaxes(0, 1)
         for n, part in enumerate(self.parts):
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
 
 
 def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: int, settled_m: float) -> Array:
-    """(R, J, 3) joints of least cost, metres, in R frames that have nothing to do with each other; NaN where
-    `initial` (R, J, 3) is. One that is led farther away than `UNDETERMINED_M` stays there. There are at the most
-    so many `steps`, until one is shorter than `settled_m`.
+    """(R, J, 3) joints of minimum cost, metres, in R independent frames; NaN where `initial` (R, J,
+    3) is.
+
+    A joint that moves by more than `UNDETERMINED_M` keeps its initial position. There are at most
+    `steps`, until one is shorter than `settled_m`.
     """
     R, J = initial.shape[:2]
     known = np.isfinite(initial).all(axis=-1, keepdims=True)
     start = np.where(known, initial, 0.0)
-    # Held where it is by next to nothing: with one view its depth would be nowhere.
+    # A very weak prior: with one view the depth would be undetermined.
     information = pulls.information + _HELD * np.eye(3)
     right = (pulls.information @ pulls.xyz[..., None])[..., 0] + _HELD * start
     found = start.copy()
     together = [slice(None)] if len(seen.views.projection) == 1 else [slice(n, n + 1) for n in range(R)]
-    for n, rows in enumerate(together):  # one state a chain
+    for n, rows in enumerate(together):  # one state per chain
         states, xy, weight, own, to = (
             ready(each[rows].reshape(-1, *each.shape[2:]))
             for each in (found, seen.xy, seen.weight, information, right)
@@ -163,10 +171,11 @@ def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: 
 
 
 def motion_information(law: Motion, dt_s: Array, density: Array) -> tuple[Array, Array]:
-    """What a law of motion says of C chains of T states, along one axis: information of each with itself
-    (C, T, n, n), and with the one before it (C, T - 1, n, n).
+    """Information of a motion model about C chains of T states, along one axis: diagonal blocks (C,
+    T, n, n), and blocks with the state before (C, T - 1, n, n).
 
-    Steps `dt_s` (T - 1,), densities (T - 1, C). The start says how wide derivatives are, and nothing of positions.
+    Steps `dt_s` (T - 1,), densities (T - 1, C). There is a prior on initial derivatives, none on
+    positions.
     """
     F = law.transition(dt_s)
     noise = np.linalg.inv(law.noise(dt_s)) / density.T[..., None, None]
@@ -179,25 +188,26 @@ def motion_information(law: Motion, dt_s: Array, density: Array) -> tuple[Array,
 
 @dataclass(frozen=True)
 class Problem:
-    """All that is known of a window's joints, each by itself."""
+    """Measurements and priors of a window's joints, independent for each joint."""
 
     times_s: Array
-    """(T,) times of the frames, rising, seconds."""
+    """(T,) times of the frames, ascending, seconds."""
     law: Motion
-    """How joints move."""
+    """Motion model of the joints."""
     density: Array
     """(T - 1, J) density of the noise in the motion."""
     seen: Projections
-    """Observations that count."""
+    """The used observations."""
     pulls: JointTargets
-    """What pulls joints and is new in every frame, T rows."""
+    """Constraints on joints with independent errors in every frame, T rows."""
     said: tuple[Said, Said]
-    """What views and body say with errors that last: an offset each."""
+    """Estimates from views and from the body with correlated errors: one offset variable each."""
     standing: Array
-    """(T - 1, J) how little joints walk in each step, m²/s; infinite where they do not stand."""
+    """(T - 1, J) density of the random walk of standing joints in each step, m²/s; infinite if not
+    standing."""
 
     def chains(self, joints: Iterable[int]) -> list[Chains]:
-        """The chains of some `joints`, those with the same parts together."""
+        """The chains of some `joints`, grouped by equal parts."""
         alike: dict[tuple[int, ...], list[int]] = {}
         offsets = [np.asarray(each.where.any(axis=0)) for each in self.said]
         for joint in joints:
@@ -230,7 +240,9 @@ class Problem:
         return Chains(joints, parts, *matrices, there, self.seen)
 
     def _add_offsets(self, joints: Index, said: Said, at: int, to: tuple[Array, Array, Array]) -> None:
-        """Add what is said with offsets, which are the states' part `at`; and these fade (`factors.lasting`)."""
+        """Add estimates with offset variables, the states' part `at`; offsets decay
+        (`factors.lasting`).
+        """
         diagonal, below, right = to
         message, span = said.message, spanned(said.where)[:, joints].T
         there = (said.where & message.known)[:, joints].T
@@ -246,15 +258,17 @@ class Problem:
         begins = span & (np.cumsum(span, axis=1) == 1)
         for axis in range(3):
             own = diagonal[:, :, at, axis, at, axis]
-            own += begins | ~span  # one that is not there is 0
+            own += begins | ~span  # an absent offset is 0
             own[:, 1:] += link
             own[:, :-1] += link * np.exp(-2.0 * passed)
             below[:, :, at, axis, at, axis] -= link * np.exp(-passed)
 
 
 def determined(covariance: Array) -> Array:
-    """Return covariances (..., 3, 3), NaN where one is more than `UNDETERMINED_M` in some direction."""
-    largest = np.trace(covariance, axis1=-2, axis2=-1)  # at the most
+    """Return covariances (..., 3, 3), with NaN for those above `UNDETERMINED_M` in some
+    direction.
+    """
+    largest = np.trace(covariance, axis1=-2, axis2=-1)  # upper bound
     doubtful = np.isfinite(largest) & (largest >= UNDETERMINED_M**2)
     largest[doubtful] = np.linalg.eigvalsh(covariance[doubtful])[..., -1]
     return np.where((largest < UNDETERMINED_M**2)[..., None, None], covariance, np.nan)

@@ -1,4 +1,4 @@
-"""The X step: people's joints, solved with what the views and the body say of them."""
+"""The X step: solves people's joints, given the views and the body."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 _SIGMA_M = 0.02
-"""Usual standard deviation of a joint that several views see, metres."""
+"""Usual standard deviation of a joint seen by several views, metres."""
 
 
 def solve_between(
@@ -28,9 +28,10 @@ def solve_between(
     of_body: JointTargets,
     config: EstimatorConfig,
 ) -> Array:
-    """X (R, J, 3) of people in frames by themselves, metres, without a graph: what goes from round to round.
+    """X (R, J, 3) of people in single frames, metres, without a graph, for the rounds before the
+    last.
 
-    About what GTSAM comes to from the same; it starts there when it has the last word.
+    The result is about that of GTSAM, which starts from it in the last round.
     """  # fmt: skip
     initial = _start(evidence.points, evidence.sigma_m, of_body, config)
     scale = 1.0 / np.sqrt(config.graph.weight_2d)  # as in `WindowGraph`
@@ -38,7 +39,7 @@ def solve_between(
     kernel, in_step = config.observations.robust_kernel, np.zeros(used.shape)
     seen = Projections(cameras, observed.xy, sigmas_px * scale, used, in_step, kernel, scale)
     pulls, solver = of_body.where(of_body.known, config.graph.weight_shape), config.graph
-    # The error changes with the square of a step: about one of a hundredth of a sigma is the tolerance of 1e-4.
+    # The error is quadratic in the step: a hundredth of a sigma corresponds to the tolerance 1e-4.
     return solved_apart(seen, pulls, initial, solver.max_iterations, _SIGMA_M * float(np.sqrt(solver.tolerance)))
 
 
@@ -49,10 +50,11 @@ def solve_joints(
     config: EstimatorConfig,
     near: Array | None = None,
 ) -> None:
-    """Solve people, each with the rows that are their part of those of views and body; `positions` has the result.
+    """Solve people's graphs, each with its part of the rows of views and body; results are in
+    `positions`.
 
-    People whom factors tie must be among them all. Of frames by themselves the solver may start `near` (R, J, 3)
-    what `solve_between` came to.
+    People coupled by factors must all be included. Single frames may start at `near` (R, J, 3), the
+    result of `solve_between`.
     """
     for person, part in parts:
         _prepare(person, evidence, of_body, part, config, None if near is None else near[part])
@@ -69,7 +71,7 @@ def _prepare(
     config: EstimatorConfig,
     near: Array | None,
 ) -> None:
-    """Make the problem of one person."""
+    """Set up the problem of one person."""
     views, body = evidence.message.rows(part), of_body.rows(part)
     inlier, sigma_m, points = evidence.inlier[part], evidence.sigma_m[part], evidence.points[part]
     initial = _start(points, sigma_m, body, config)
@@ -78,7 +80,7 @@ def _prepare(
         person.prepare(used, views, body, initial if near is None else near)
         return
     initial = interpolated(np.where(np.isfinite(points), points, initial), person.times_s)
-    # X_0 alone is no evidence: a joint that nobody says anything of has nothing that determines it.
+    # X_0 is not evidence: a joint without other information is undetermined.
     mentioned = (inlier.any(axis=-1) | body.known).any(axis=0) | person.touched
     initial[:, ~mentioned] = np.nan
     lost = sigma_m > LOST_M
@@ -87,6 +89,8 @@ def _prepare(
 
 
 def _start(points: Array, sigma_m: Array, body: JointTargets, config: EstimatorConfig) -> Array:
-    """Where joints (R, J, 3) start that views place, at `points`, or the body; NaN where neither does."""
+    """Initial positions of joints (R, J, 3) from the views, at `points`, or from the body; NaN if
+    neither.
+    """
     placed = sigma_m <= config.refine.max_sigma_m
     return np.where(placed[..., None], points, np.where(body.known[..., None], body.xyz, np.nan))

@@ -1,7 +1,7 @@
-"""The compiled loops of stage II: what views say of joints, and joints as chains of states over time.
+"""Compiled kernels of stage II: measurements of views about joints, and joints as chains of states.
 
-Rows or frames are N or T, joints J, views V, chains C. `cameras` (S, V, 3, 4) are K [R | t] of each view; S is 1
-where cameras stand still, else the number of rows.
+N are rows, T frames, J joints, V views, C chains. `cameras` (S, V, 3, 4) are K [R | t] of each
+view; S is 1 for static cameras, else the number of rows.
 """
 
 import math
@@ -14,21 +14,21 @@ from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, t
 
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _SINGULAR = 1e-11
-"""A pivot that is no larger share of what it was is rounding: a state that nothing determines."""
+"""Relative size of a pivot below which it is rounding: the state is undetermined."""
 _FARTHEST_M = 1e6
-"""A step that is longer, or not a number, is not taken."""
+"""Length of a step, m, above which it is rejected, as is NaN."""
 
 
 def ready(values: Array) -> Array:
-    """Return an array as kernels take it: other types and orders, and what must not be written, are compiled
-    anew.
+    """Return an array as kernels require: another type or order, or a read-only array, would
+    compile them again.
     """
     return np.require(values, np.float64, ("C", "W"))
 
 
 @part
 def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
-    """Add what `add_view` leaves out where the pixel is of x + lead v: the velocity v follows the position x."""
+    """Add the terms of velocity v that `add_view` omits, if the pixel is of x + lead v."""
     for a in range(3):
         ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
         gradient[3 + a] += lead * weight * (ua * to_u + va * to_v)
@@ -42,7 +42,9 @@ def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gr
 
 @kernel("f4 f2 f4 f3 f0 f0 f0 f3")
 def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, points):
-    """Fill in `points` (N, J, 3) that are NaN where two views see them and agree (`linearisation.triangulate`)."""
+    """Fill in `points` (N, J, 3) that are NaN if at least two views see and agree on them
+    (`linearisation.triangulate`).
+    """
     weight, x = np.empty(xy.shape[2]), np.empty(3)
     for n in range(len(points)):
         at = n if len(cameras) > 1 else 0
@@ -62,9 +64,10 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
 
 @part
 def add_detection(x, camera, focal, at, sigma, fixed_depth, least_depth, reach, by_reach, robust, width, H, g):
-    """Add what a detection `at` (2,), of this `sigma` in pixels, says of a joint at `x` to its information and
-    gradient, if it is within `reach`: whether it is, and the residual, NaN for a joint that is too near or behind
-    the camera. With `by_reach` all are, under a Geman-McClure kernel of that width.
+    """Add the measurement of a detection `at` (2,), with `sigma` in pixels, to the information and
+    gradient of a joint at `x`, if it is within `reach`; returns whether it is, and the residual,
+    NaN for a joint too near to or behind the camera. With `by_reach` all are, under a Geman-McClure
+    kernel of that width.
     """
     u, v, depth = project(camera, x)
     if not depth >= least_depth:
@@ -87,10 +90,11 @@ def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
     inlier, residual, information, gradient,
 ):  # fmt: skip
-    """`linearisation.linearise` into the last four: false, NaN, and zeros to begin with.
+    """Kernel of `linearisation.linearise`; fills in the last four arrays, initially false, NaN, and
+    zeros.
 
-    `sigmas` (N, J, V) are 0 where nothing is seen; `focal` (S, V) pixels. `reach` is the gate's, or
-    with `by_reach` the Geman-McClure kernel's, metres.
+    `sigmas` (N, J, V) are 0 if not seen; `focal` (S, V) pixels. `reach` is that of the gate, or
+    with `by_reach` of the Geman-McClure kernel, metres.
     """
     N, J, V = sigmas.shape
     for n in range(N):
@@ -107,9 +111,8 @@ def look(
 
 @part
 def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, width, H, g, at):
-    """Linearise one chain at `state` (T, d): the blocks H (T, d, d) on the diagonal, and the right side g.
-
-    `at` (3,) is anything.
+    """Linearise one chain at `state` (T, d): diagonal blocks H (T, d, d), and right side g. `at`
+    (3,) is workspace.
     """
     T, d = state.shape
     for t in range(T):
@@ -129,7 +132,7 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, wi
                 if depth > 0.0:
                     off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
                     w *= robust_weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
-                    # J x, without the product: the derivative of a quotient.
+                    # J x directly, as the derivative of a quotient.
                     at_u = (u * camera[2, 3] - camera[0, 3]) / depth - off_u
                     at_v = (v * camera[2, 3] - camera[1, 3]) / depth - off_v
                     add_view(camera, u, v, depth, at_u, at_v, w, H[t], g[t])
@@ -139,7 +142,9 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, wi
 
 @part
 def _factored(H, below, Z):
-    """Block Cholesky down a chain, in place: H_t = L_t L_t^T, Z_t = L_t^-1 B_t^T. False where it is singular."""
+    """Block Cholesky of a chain, in place: H_t = L_t L_t^T, Z_t = L_t^-1 B_t^T. Returns False if it
+    is singular.
+    """
     T, d = H.shape[:2]
     for t in range(T):
         L = H[t]
@@ -174,8 +179,8 @@ def _factored(H, below, Z):
 
 @part
 def _solve(H, Z, g, x):
-    """Put the solution of `_factored` blocks and the right side `g` (T + 1, d), which is lost, into `x` (T, d) if
-    it is near; how far positions move, metres.
+    """Solve with blocks of `_factored` and the right side `g` (T + 1, d), overwritten, and store
+    the solution in `x` (T, d) if it is close; returns the largest motion of a position, metres.
     """
     T, d = x.shape
     for t in range(T):
@@ -207,7 +212,9 @@ def _solve(H, Z, g, x):
 
 @part
 def _marginals(H, Z, M, G, S, covariance):
-    """The blocks on the diagonal of the inverse of `_factored` ones, `covariance` (T, d, d), from the end back."""
+    """Diagonal blocks of the inverse after `_factored`, `covariance` (T, d, d), by backward
+    recursion.
+    """
     T, d = H.shape[:2]
     for t in range(T - 1, -1, -1):
         for k in range(d):  # M = L^-T, upper
@@ -242,18 +249,19 @@ def _marginals(H, Z, M, G, S, covariance):
 def solve_chains(
     states, joints, diagonal, below, right, cameras, xy, weight, lead, robust, width, steps, tolerance, covariance
 ):
-    """Gauss-Newton of C chains by themselves, in place, and the marginal `covariance` (C, T, d, d) where it ends,
-    or of the first chains (0, ...): NaN where one is singular, which stays where it is.
+    """Gauss-Newton of C independent chains, in place, and marginal `covariance` (C, T, d, d) at the
+    end, or for the first chains only (0, ...): NaN for singular chains, which are not moved.
 
-    A chain's cost is x^T H x / 2 - right^T x, H block tridiagonal of `diagonal` (C, T, d, d) and `below`
-    (C, T - 1, d, d), and robust projections of its first three numbers: `xy` (T, J, V, 2), `weight` (T, J, V)
-    1/sigma² of those that count, `lead` (T, J, V) seconds by which they are after the state, whose next three are
-    the velocity. `states` (C, T, d) are of the `joints` (C,). There are at the most so many
-    `steps`, until one moves no position by more than `tolerance` metres; without any there are covariances only.
-    Robust weights are those of the step before, which no step makes worse but for the curvature of the projection.
+    A chain's cost is x^T H x / 2 - right^T x, with H block tridiagonal of `diagonal` (C, T, d, d)
+    and `below` (C, T - 1, d, d), plus robust reprojection errors of its first three numbers: `xy`
+    (T, J, V, 2), `weight` (T, J, V) 1/sigma² or 0, `lead` (T, J, V) exposure times relative to the
+    state, seconds, with the velocity in its next three numbers. `states` (C, T, d) are of the
+    `joints` (C,). There are at most `steps`, until one moves no position by more than `tolerance`
+    metres; with 0 only covariances are computed. Robust weights are those of the step before, so
+    that steps do not increase the cost, except by the curvature of the projection.
     """
     C, T, d = states.shape
-    # Zero at the end of Z and g, where nothing comes after the last state, nor before the first.
+    # Zeros at the end of Z and g stand for the missing neighbours of the first and last state.
     H, Z, g = np.empty((T, d, d)), np.zeros((T, d, d)), np.zeros((T + 1, d))
     M, G, S, at = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d)), np.empty(3)
     for c in range(C):

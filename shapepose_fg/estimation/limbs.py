@@ -1,4 +1,6 @@
-"""Where a body can have the joints that views hardly determine: with the body, and limbs as long as its own."""
+"""Corrects joints that views hardly determine to positions that a body can have, with its limb
+lengths.
+"""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,30 +14,32 @@ from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.state import State
 
 LIMB_SIGMA_M = 0.03
-"""Sigma of an unseen joint from which on it is more the body's than its own."""
+"""Standard deviation of an unseen joint, m, at which it moves half way to the body's."""
 STEP_S = 0.1
-"""Time over which what a body changes of unseen joints is averaged, seconds, one sigma."""
+"""Standard deviation of the temporal smoothing of the body's corrections, seconds."""
 LENGTH_SIGMA_M = 0.1
-"""How far a limb of a detector's joints may be from its length, metres, in one sweep: as far as the views may
-leave open a joint that counts as seen (`motion_model.LOST_M`). With `_SWEEPS` sweeps the length counts about four
-times, as if this were 5 cm: of what a limb lacks (s² / (v + s²))^4 is left, s being this and v the variance of its
-ends along it. Ends of 2 cm each close a quarter of it, ends of 10 cm each all but a hundredth. Results are
-measured so."""
+"""Standard deviation of a limb's length between a detector's joints, metres, per sweep, as large as
+the allowed uncertainty of a seen joint (`motion_model.LOST_M`). With `_SWEEPS` sweeps the length
+counts about four times, as if it were 5 cm: the share (s² / (v + s²))^4 of a length error remains,
+with s this value and v the variance of the ends along the limb. Ends of 2 cm each remove a quarter
+of it, ends of 10 cm each all but a hundredth. Reported accuracies include this."""
 ARMS_AND_LEGS = {
     ("Shoulder", "Elbow"): 0.06, ("Elbow", "Wrist"): 0.05, ("Hip", "Knee"): 0.09, ("Knee", "Ankle"): 0.07,
 }  # fmt: skip
-"""From the trunk outwards, on either side, and half their widths, metres."""
+"""Limbs on either side, from the trunk outwards, and half their widths, metres."""
 _FEET = (("Ankle", "Heel"), ("Ankle", "BigToe"), ("BigToe", "SmallToe"))
 _SWEEPS = 4
-"""How often all limbs are gone through, each time with the covariances of before the first: a wrist follows the
-elbow that the shoulder holds."""
+"""Number of sweeps over all limbs, each with the initial covariances, so that a wrist follows the
+elbow, and the elbow the shoulder."""
 
 
 def limbs_kept(state: State, covariance: Array, fitter: BodyFitter) -> Array:
-    """Joints (N, J, 3): those that no view saw, in windows of several frames, where a body can have them, and
-    limbs as long as the body's where views leave an end open. `covariance` (N, J, 3, 3) is the joints' own.
+    """Joints (N, J, 3) in windows of several frames, with unseen ones moved to positions possible
+    for a body, and limbs with an uncertain end set to the body's length. `covariance` (N, J, 3, 3)
+    is that of the joints.
 
-    Not those with factors of the user's own. Steps are averaged over time: bodies are fitted frame by frame.
+    Joints with user factors are excluded. Steps are smoothed over time, because bodies are fitted
+    frame by frame.
     """
     X, limbs = state.joints, limbs_of(state.config.joints)
     unseen = ~np.asarray(state.inlier.any(axis=-1))
@@ -57,11 +61,12 @@ def limbs_kept(state: State, covariance: Array, fitter: BodyFitter) -> Array:
 
 
 def limb_steps(joints: Array, covariance: Array, unseen: Mask, fitter: BodyFitter) -> Array:
-    """Steps (N, J, 3), metres, that take joints that no view saw, `unseen` (N, J), to where a body can have them.
+    """Steps (N, J, 3), metres, of `unseen` joints (N, J) towards positions possible for a body.
 
-    Motion carries each joint by itself: elbow and wrist, both hidden, drift apart. A body is fitted to all joints
-    as they are known, and an unseen one goes towards the body's, C (C + s² I)^-1 of the way, for its covariance C
-    and s = `LIMB_SIGMA_M`. Covariances stay: what the body says of the joint is in them already.
+    The motion model moves each joint independently, so that a hidden elbow and wrist drift apart. A
+    body is fitted to all joints with their covariances C, and an unseen joint moves by C (C + s²
+    I)^-1 of the distance to the body's, with s = `LIMB_SIGMA_M`. Covariances are unchanged: they
+    already include the body's information on the joint.
     """
     known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     moved = unseen & known
@@ -78,20 +83,21 @@ def limb_steps(joints: Array, covariance: Array, unseen: Mask, fitter: BodyFitte
 
 
 def limbs_of(joints: Sequence[str]) -> list[tuple[int, ...]]:
-    """The arms, legs and feet among a detector's joints, as pairs of their numbers."""
+    """Arms, legs and feet among a detector's joints, as pairs of indices."""
     return on_both_sides((*ARMS_AND_LEGS, *_FEET), joints)
 
 
 def on_both_sides(parts: Iterable[tuple[str, ...]], joints: Sequence[str]) -> list[tuple[int, ...]]:
-    """The numbers of the joints of `parts`, named without their side, right and left; those that a detector's
-    `joints` have all of.
+    """Indices of the joints of `parts`, named without side, right and left, if all are
+    in `joints`.
     """
     named = [tuple(f"{side}{name}" for name in part) for side in "RL" for part in parts]
     return [tuple(joints.index(name) for name in part) for part in named if {*part} <= {*joints}]
 
 
 def limb_lengths(body: Array, limbs: Sequence[tuple[int, ...]]) -> Array:
-    """(L,) length of each limb, metres: the median of those of one person's body in T frames; NaN where unknown.
+    """(L,) length of each limb, metres: the median over one person's body in T frames; NaN if
+    unknown.
 
     `body` (T, J, 3) are the body's joints, NaN in frames without a body.
     """
@@ -104,12 +110,12 @@ def limb_lengths(body: Array, limbs: Sequence[tuple[int, ...]]) -> Array:
 def with_lengths(
     joints: Array, covariance: Array, moved: Mask, lengths: Array, limbs: Sequence[tuple[int, ...]]
 ) -> Array:
-    """Joints (N, J, 3), metres, of which those `moved` (N, J) go where limbs have their `lengths` (L,).
+    """Joints (N, J, 3), metres, with the `moved` ones (N, J) adjusted to limb `lengths` (L,).
 
-    In each of `_SWEEPS` sweeps each limb is observed to have its length to `LENGTH_SIGMA_M`, and its ends share
-    what is missing by their `covariance` (N, J, 3, 3): a joint that one view saw moves along the ray, one that
-    nothing saw any way. The covariance does not shrink from sweep to sweep, so that a length counts once in each.
-    Joints that are not `moved` are held.
+    In each of `_SWEEPS` sweeps each limb's length is a measurement with `LENGTH_SIGMA_M`, and the
+    correction is shared by its ends according to their `covariance` (N, J, 3, 3): a joint seen by
+    one view moves along the ray, an unseen one in any direction. The covariance is not reduced
+    between sweeps, so that a length counts once in each. Joints that are not `moved` are fixed.
     """
     X = joints.copy()
     known = np.asarray(np.isfinite(X).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))

@@ -1,4 +1,4 @@
-"""What the views saw of each person, and what that says of each joint: gates, weights, information."""
+"""Measurements of the views about each person's joints: gates, weights, information."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,47 +18,50 @@ from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.kernels import complete, look, ready
 
 MIN_DEPTH_M = 0.2
-"""An observation counts only if the joint is at least this far in front of the camera."""
+"""Minimum depth of a joint in front of a camera for its observation to be used, m."""
 LEAST_PROBABILITY = 0.01
-"""An observation that is less probably the person's counts as if it were this."""
+"""Lower limit of an observation's probability."""
 _DAMPING = 1e-7
-"""Share of the information of the joint that is added in all directions: a ray's length stays as it is."""
+"""Share of a joint's information that is added in all directions, so that depth along a single ray
+does not change."""
 _DEPTH_M = 8.0
-"""Median depth of joints before the cameras of the `tune` sequences (7 to 10 m), metres: where lengths become
+"""Median depth of joints in the `tune` sequences (7 to 10 m), metres, for converting lengths to
 pixels in the paper's setting."""
 
 
 @dataclass(frozen=True)
 class ObservationConfig(Settings):
-    """How far a 2D observation is trusted."""
+    """Noise model of 2D observations."""
 
     sigma_m: Metres = 0.0105
-    """How far a detection of confidence 1 is from the joint, one sigma per axis, as a length at the joint's
-    depth: a person's image shrinks with distance, and so does the detector's error."""
+    """Standard deviation per axis of a detection with confidence 1, as a length at the joint's
+    depth, metres: like a person's image, the detector's error shrinks with distance."""
     confidence_power: Annotated[float, Interval(gt=0, le=100)] = 5.0
-    """p of w_ij, the weight in Eq. 1 of an observation of confidence c: w_ij = (c^p + w_0) / (1 + w_0). The
-    paper's weight is the confidence itself. Measured, sigma at 0.95 is a third of what it is under 0.4."""
+    """p of w_ij, the weight in Eq. 1 of an observation of confidence c: w_ij = (c^p + w_0) / (1 +
+    w_0). In the paper it is the confidence itself. Measured, sigma at 0.95 is a third of that below
+    0.4."""
     least_weight: Share = 0.077
-    """w_0 in it: what the least confident observation weighs."""
+    """w_0 of w_ij: the minimum weight of an observation."""
     by_joint: bool = True
-    """Whether sigma differs from joint to joint (`JOINT_SCATTER`): a detector knows an eye better than a hip."""
+    """Whether sigma differs by joint (`JOINT_SCATTER`): a detector localises an eye better than a
+    hip."""
     floor_rad: Share = 0.001
-    """What the detector's grid costs at any size: an angle, one pixel where the focal length is 1,000. A detector
-    scales a picture to its own size, so that it is no number of the picture's pixels."""
+    """Contribution of the detector's grid, rad: one pixel at a focal length of 1,000 px. It is an
+    angle, because a detector rescales pictures to its own size."""
     rho_2d_m: Factor = 0.15
-    """rho_2D of Eq. 2, as a length at the joint's depth: an observation farther from the projected joint is
-    discarded. Half the distance between a person's own shoulders or hips."""
+    """rho_2D of Eq. 2, as a length at the joint's depth, metres: observations farther from the
+    projected joint are rejected. Half the distance between a person's own shoulders or hips."""
     fixed_depth_m: MetresOrNone = 0.0
-    """Positive: `sigma_m` and `rho_2d_m` are lengths at this depth, wherever the joint is, so that d_2D is in
-    pixels, as in the paper. 0: at the joint's own depth."""
+    """Positive: fixed depth, metres, at which `sigma_m` and `rho_2d_m` are lengths, so that d_2D is
+    in pixels, as in the paper. 0: at the joint's own depth."""
     kernel: KernelName | Literal["none"] = "cauchy"
     """Robust kernel of the projection factors. The paper has none."""
 
     @classmethod
     def paper(cls) -> "ObservationConfig":
-        """As written in Eqs. 1 and 2: squared pixels times the confidence, of all that lies within rho_2D.
+        """The settings of Eqs. 1 and 2: squared pixels times the confidence, for all within rho_2D.
 
-        A detection has the measured sigma at a confidence of 0.7: 2 cm.
+        A detection with confidence 0.7 has the measured sigma: 2 cm.
         """
         return cls(
             sigma_m=0.02,
@@ -80,7 +83,7 @@ class ObservationConfig(Settings):
         return None if self.kernel == "none" else self.kernel
 
     def scatter(self, joints: Sequence[str]) -> Array:
-        """(J,) what sigma is multiplied with for each joint; 1 for names that are not known."""
+        """(J,) factor on sigma for each joint; 1 for unknown names."""
         return np.array([JOINT_SCATTER.get(name, 1.0) if self.by_joint else 1.0 for name in joints])
 
 
@@ -93,14 +96,14 @@ JOINT_SCATTER = {
     **_both("Elbow", 0.88), **_both("Wrist", 0.90), "MidHip": 1.33, **_both("Hip", 1.28), **_both("Knee", 1.18),
     **_both("Ankle", 1.00), **_both("BigToe", 0.90), **_both("SmallToe", 0.96), **_both("Heel", 1.02),
 }  # fmt: skip
-"""How much farther than the mean a detection of a joint is from it at the same confidence. As sigma by confidence,
-measured where simulated detections of the `tune` sequences lie beside the truth; the simulated detector draws from
-statistics of real ones, and these, each view of Shelf against the others, give the same within a few per cent
-(docs/evaluation.md)."""
+"""Ratio of each joint's detection error to the mean at the same confidence. Like sigma by
+confidence, measured on simulated detections of the `tune` sequences against the ground truth. The
+simulated detector uses statistics of real ones, and these, for each view of Shelf against the
+others, agree within a few per cent (docs/evaluation.md)."""
 
 
 def inverses(A: Array) -> Array:
-    """Inverses (..., 3, 3) of symmetric matrices, by their cofactors; nothing is raised for singular ones."""
+    """Inverses (..., 3, 3) of symmetric matrices, by cofactors; singular ones raise no error."""
     a, b, c, d, e, f = (A[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
     whole = np.stack(
@@ -112,12 +115,13 @@ def inverses(A: Array) -> Array:
 
 
 def squared_distance(said: JointTargets, xyz: Array, covariance: Array) -> Array:
-    """Squared Mahalanobis distance (N, J) of what is `said` of joints, whose information may be singular, from
-    Gaussians at `xyz` (N, J, 3) with this `covariance` (N, J, 3, 3); NaN where these are not known.
+    """Squared Mahalanobis distance (N, J) of estimates `said` of joints, with possibly singular
+    information, from Gaussians at `xyz` (N, J, 3) with `covariance` (N, J, 3, 3); NaN if these are
+    unknown.
     """
     known = np.asarray(np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     away = np.where(known[..., None], xyz - np.nan_to_num(said.xyz), 0.0)[..., None]
-    # (L^-1 + C)^-1 = (1 + L C)^-1 L, which holds for information L that is singular, too.
+    # (L^-1 + C)^-1 = (1 + L C)^-1 L, also valid for singular information L.
     both = np.eye(3) + said.information @ np.where(known[..., None, None], covariance, 0.0)
     squared = (away.mT @ np.linalg.solve(both, said.information @ away))[..., 0, 0]
     return np.where(known, squared, np.nan)
@@ -125,24 +129,26 @@ def squared_distance(said: JointTargets, xyz: Array, covariance: Array) -> Array
 
 @dataclass(frozen=True)
 class ViewEvidence:
-    """What the observations say of the joints when these are at `points`."""
+    """Linearised measurements of the views at joints `points`."""
 
     points: Array
-    """(N, J, 3) the joints, metres in the world; NaN where not known."""
+    """(N, J, 3) linearisation points, metres in the world; NaN if unknown."""
     inlier: Mask
-    """(N, J, V) delta_ij of Eq. 2: seen, in front of the camera and within rho_2D of the projection."""
+    """(N, J, V) delta_ij of Eq. 2: observed, in front of the camera and within rho_2D of the
+    projection."""
     residual_px: Array
     """(N, J, V, 2) projection minus observation; NaN where unseen or unknown."""
     information: Array
-    """(N, J, 3, 3) J^T W J over the inliers, robust weights included, 1/m²; zero where there is none."""
+    """(N, J, 3, 3) J^T W J over the inliers, including robust weights, 1/m²; zero without any."""
     gradient: Array
     """(N, J, 3) J^T W r over the inliers, 1/m."""
 
     @cached_property
     def target(self) -> Array:
-        """(N, J, 3) where the observations alone would put each joint: one Gauss-Newton step from `points`.
+        """(N, J, 3) estimate of each joint from the observations only: one Gauss-Newton step from
+        `points`.
 
-        A joint that one view saw stays at its depth and moves onto the ray. NaN where `points` is.
+        A joint seen by one view keeps its depth and moves onto the ray. NaN where `points` is.
         """
         scale = np.trace(self.information, axis1=-2, axis2=-1)[..., None, None]
         known = np.where(scale > 0, self.information + _DAMPING * scale * np.eye(3), np.eye(3))
@@ -150,21 +156,21 @@ class ViewEvidence:
 
     @cached_property
     def sigma_m(self) -> Array:
-        """(N, J) standard deviation along the direction that the views know least, metres; infinite for a ray."""
+        """(N, J) standard deviation in the worst direction, metres; infinite for a ray."""
         return weakest_sigma(self.information)
 
     @property
     def message(self) -> JointTargets:
-        """The evidence as Gaussians."""
+        """The measurements in information form."""
         return JointTargets(self.target, self.information)
 
 
 def weakest_sigma(information: Array) -> Array:
-    """Standard deviation (...,) along the direction that `information` (..., 3, 3) knows least; infinite for a
-    ray.
+    """Standard deviation (...,) in the worst direction for `information` (..., 3, 3); infinite for
+    a ray.
     """
     values = np.asarray(np.linalg.eigvalsh(information), dtype=np.float64)
-    # Under 1e-10 of the strongest is rounding: nothing.
+    # Below 1e-10 of the largest eigenvalue it is rounding.
     weakest = np.where(values[..., 0] > 1e-10 * values[..., 2], values[..., 0], 0.0)
     with np.errstate(divide="ignore"):
         return 1.0 / np.sqrt(weakest)
@@ -173,10 +179,11 @@ def weakest_sigma(information: Array) -> Array:
 def observation_sigmas(
     observations: Observations, points: Array, views: Views, config: ObservationConfig, joints: Sequence[str]
 ) -> Array:
-    """Sigma (N, J, V) in pixels of every observation, for joints near `points` (N, J, 3); 0 where unseen.
+    """Standard deviation (N, J, V) of every observation, pixels, for joints near `points` (N, J,
+    3); 0 if not observed.
 
-    `joints` are the J joints' names: some are seen more sharply than others. A joint whose place is not known
-    takes the mean depth of the person's known ones.
+    `joints` are the names of the J joints, with different accuracies. A joint of unknown position
+    is assumed at the mean depth of the person's known ones.
     """
     ahead = views.cTw[..., 2, :]
     ahead = ahead if ahead.ndim == 3 else ahead[None]
@@ -186,7 +193,7 @@ def observation_sigmas(
     depth = np.where(usable, depth, np.maximum(mean, MIN_DEPTH_M)[:, None, :])
     focal, scatter = views.focal[:, None], config.scatter(joints)[:, None]
     weight = config.weight(observations.confidence) / scatter**2
-    # What is as probably somebody else's says half as much.
+    # The information is multiplied by the probability that the observation is the person's.
     weight *= np.maximum(observations.probability, LEAST_PROBABILITY)
     at = config.fixed_depth_m if config.fixed_depth_m > 0 else depth
     sigma = np.hypot(config.floor_rad * focal, config.sigma_m * focal / at)
@@ -201,11 +208,13 @@ def linearise(
     config: ObservationConfig,
     reach_m: float | None = None,
 ) -> ViewEvidence:
-    """Decide the gates (Eq. 2) at `points` (N, J, 3) and sum up what the inliers say of each joint.
+    """Gate observations (Eq. 2) at `points` (N, J, 3), and sum the information of the inliers about
+    each joint.
 
-    `sigmas` (N, J, V) in pixels come from `observation_sigmas`. With `reach_m` a Geman-McClure kernel takes the
-    place of gates and kernel: a weight of a quarter at this distance from the projection, as a length at the
-    joint's depth. `inlier` is then every observation before its camera.
+    `sigmas` (N, J, V) in pixels are from `observation_sigmas`. With `reach_m` a Geman-McClure
+    kernel replaces gates and kernel: its weight is a quarter at this distance from the projection,
+    as a length at the joint's depth, metres. `inlier` is then every observation in front of its
+    camera.
     """
     shape, kernel = observations.confidence.shape, config.robust_kernel
     inlier, residual = np.zeros(shape, dtype=bool), np.full((*shape, 2), np.nan)
@@ -221,7 +230,7 @@ def linearise(
 
 
 def information_by_view(evidence: ViewEvidence, sigmas: Array, views: Views, config: ObservationConfig) -> Array:
-    """(N, J, V, 3, 3) what each observation says of its joint, robust weight included, 1/m²; zero for others."""
+    """(N, J, V, 3, 3) information of each used observation, times its robust weight, 1/m²; else zero."""
     _, _, slope = views.project(np.nan_to_num(evidence.points))
     used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
     sigma = np.where(used, sigmas, 1.0)
@@ -234,17 +243,17 @@ def information_by_view(evidence: ViewEvidence, sigmas: Array, views: Views, con
 def mean_confidence(observations: Observations, inlier: Mask) -> Array:
     """w_i of Eq. 4: (N, J) mean confidence of each joint over all views.
 
-    A view that did not see the joint counts 0, and so does one whose observation the gate discards: where the
-    views contradict each other the joint is doubtful, however sure each of them is.
+    Views without a detection of the joint, or with a rejected one, count as 0: where views
+    contradict each other, the joint is uncertain however confident each of them is.
     """
     return np.where(inlier, observations.confidence, 0.0).mean(axis=-1)
 
 
 def triangulate(observations: Observations, views: Views, config: ObservationConfig) -> Array:
-    """X_0 made complete: joints that at least two views saw but stage I did not place, (N, J, 3) metres.
+    """X_0 completed: joints seen by at least two views but missing from stage I, (N, J, 3) metres.
 
-    Linear triangulation, iterated with robust weights; joints that stage I placed keep their place, and what
-    fewer than two views saw, or views that disagree, stays NaN.
+    Linear triangulation, iterated with robust weights; joints of stage I keep their position, and
+    joints seen by fewer than two views, or by views that disagree, stay NaN.
     """
     points = np.array(observations.initial, dtype=float, order="C")
     given = views.projection, views.focal, ready(observations.xy), ready(observations.confidence)

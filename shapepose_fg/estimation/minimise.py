@@ -1,4 +1,6 @@
-"""A factor graph minimised by GTSAM: one Gauss-Newton step where that is enough, else Levenberg-Marquardt."""
+"""Minimises a factor graph by GTSAM: one Gauss-Newton step if that suffices, else
+Levenberg-Marquardt.
+"""
 
 import re
 
@@ -8,21 +10,23 @@ from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 
 
 class NotFinite(RuntimeError):
-    """The solver left the finite numbers."""
+    """The solution is not finite."""
 
 
 def confirmed(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, config: WindowGraphConfig
 ) -> gtsam.Values | None:
-    """The values after a Gauss-Newton step, where the error falls by no more than the tolerance; else None."""
+    """The values after a Gauss-Newton step if the error decreases by at most the tolerance; else
+    None.
+    """
     linear = graph.linearize(values)
     try:
         solved = linear.eliminateSequential(ordering)
         step = solved.optimize()
-    except RuntimeError:  # a joint is not determined: damped, the others are solved all the same
+    except RuntimeError:  # an undetermined joint; damping solves the others
         return None
     nowhere = gtsam.VectorValues.Zero(step)
-    # What is eliminated has no error left at the step: what it has without is what the step takes away.
+    # After elimination the error is zero at the step, so that the error without it is the decrease.
     settled = solved.error(nowhere) <= config.tolerance * linear.error(nowhere)
     return values.retract(step) if settled else None
 
@@ -35,13 +39,14 @@ def descend(
     *,
     over_time: bool,
 ) -> gtsam.Values:
-    """The minimum from `values` on, by Levenberg-Marquardt; without an `ordering` GTSAM finds one.
+    """The minimum by Levenberg-Marquardt, starting at `values`; without an `ordering` GTSAM finds
+    one.
 
-    RuntimeError where the system is singular, or leaves the finite numbers.
+    Raises RuntimeError if the system is singular, NotFinite if the error is not finite.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(config.max_iterations)
-    # Of hundreds of joints that hardly move any more, a few thousandths of a sigma.
+    # With hundreds of joints this tolerance is a few thousandths of a sigma.
     parameters.setRelativeErrorTol(config.tolerance * (10.0 if over_time else 1.0))
     if ordering is not None:
         parameters.setOrdering(ordering)
@@ -53,6 +58,6 @@ def descend(
 
 
 def undetermined_key(error: RuntimeError) -> int | None:
-    """The variable near which GTSAM found a system without a solution; None where the error is another."""
+    """The variable near which GTSAM found an indeterminate system; None for other errors."""
     found = re.search(r"[Ii]ndeterminate? linear system.*?variable\s+(\d+)", str(error), re.DOTALL)
     return None if found is None else int(found[1])

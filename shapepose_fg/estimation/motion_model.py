@@ -1,4 +1,4 @@
-"""How joints move, and how long the errors of what is known of them last: measured numbers, read from a file."""
+"""Motion of joints, and temporal correlation of errors: measured values, read from a file."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -16,88 +16,98 @@ FORMAT = "shapepose-fg motion model 1"
 GAP_S = 0.4
 """Length of the gaps across which densities of hidden joints were measured, seconds."""
 LOST_M = 0.1
-"""A joint whose views leave it less certain than this in some direction, metres, is lost from sight."""
+"""Standard deviation of a joint by its views, in the worst direction, above which the joint is
+lost, metres."""
 
 
 @dataclass(frozen=True)
 class MotionConfig(Settings):
-    """How the frames of a person are solved together."""
+    """Settings of the links between frames of a person."""
 
     model: str = ""
     """File of the motion model, with the entries of `estimation/data/motion.json`; empty: that one."""
     psd_scale: Factor = 1.0
-    """Multiplies the power spectral densities of the joints' accelerations: more follows faster and smooths
-    less."""
+    """Factor on the power spectral densities of the joints' accelerations: larger values follow
+    faster and smooth less."""
     around_s: Seconds = 0.5
-    """In frames where a joint is lost from sight (`LOST_M`), and so far around them, seconds, the difference
-    between joint and body is followed (`factors.motion`)."""
+    """Time around frames with a lost joint (`LOST_M`), seconds, in which the difference between
+    joint and body is estimated (`factors.motion`)."""
     contact: bool = True
-    """Whether feet that stand stay where they are from frame to frame (`estimation.contact`)."""
+    """Whether standing feet are constrained to stay in place between frames
+    (`estimation.contact`)."""
     floor: bool = True
-    """Whether a floor is sought under the feet that stand; where one is found, bodies over time stay above it."""
+    """Whether to search for a floor under standing feet; bodies over time then stay above it."""
     keep_limbs: bool = True
-    """Whether joints that no view saw go to where a body can have them, and limbs with an open end get the body's
-    length: motion carries each joint by itself."""
+    """Whether unseen joints are moved to positions possible for a body, and limbs with an uncertain
+    end get the body's length; the motion model moves each joint independently."""
 
 
 @dataclass(frozen=True)
 class Lasting:
-    """How the error of a message about a joint goes on from frame to frame."""
+    """Temporal correlation of the error of estimates of a joint."""
 
     white_share: float
-    """Share of its variance that is new in every frame, between 0 and 1."""
+    """Share of white noise in the variance, between 0 and 1."""
     correlation_s: float
-    """The rest has the autocorrelation exp(-t / this)."""
+    """Time constant of the rest, with the autocorrelation exp(-t / this), s."""
     kept: float = 0.0
-    """How much of the first share motion leaves in, because it lasts for a few frames after all, 0 to 1."""
+    """Share of the white part that smoothing does not remove, because it is correlated over a few
+    frames, 0 to 1."""
 
     @property
     def possible(self) -> bool:
-        """Whether these numbers are within their bounds, and finite."""
+        """Whether these values are finite and within their bounds."""
         return 0 < self.white_share < 1 and 0 < self.correlation_s < np.inf and 0 <= self.kept <= 1
 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """The numbers of a window's motion factors for J joints."""
+    """Parameters of a window's motion factors for J joints."""
 
     psd_still: Array
-    """(J,) power spectral density of the acceleration of a joint that hardly moves, m²/s³, per axis."""
+    """(J,) power spectral density of the acceleration of a joint nearly at rest, m²/s³,
+    per axis."""
     psd_speed: Array
-    """(J,) what is added to it for each (m/s)² of the joint's speed: fast joints turn faster, too."""
+    """(J,) increase of this density per (m/s)² of the joint's speed: fast joints also accelerate
+    more."""
     psd_lost: Array
-    """(J,) what it is at least while a joint is lost from sight, and its speed unknown: the mean over all
+    """(J,) minimum of this density while a joint is lost, with unknown speed: the mean over all
     speeds."""
     views: Lasting
-    """What the views of one frame say of a joint, taken together."""
+    """Error of estimates of a joint from all views of one frame."""
     body: Lasting
-    """What the body says of a joint without the joint's own views."""
+    """Error of estimates of a joint from the body, without the joint's own views."""
     around_s: float = 0.5
-    """How long before and after a joint is lost from sight the difference between joint and body is followed."""
+    """Time around frames with a lost joint in which the difference between joint and body is
+    estimated, s."""
     law: Motion = CONSTANT_VELOCITY
-    """How a state goes on."""
+    """Motion model of the states."""
 
     def density(self, speed_m_s: Array, within_s: float = MEASURED_S, turning: Array | float = 0.0) -> Array:
-        """Density (..., J) of the noise in the motion of joints of this speed (..., J), m/s, whose accelerations
-        have a power spectral density of at least `turning` (..., J), m²/s³; see `Motion.density`.
+        """Density (..., J) of the motion noise of joints with speed (..., J), m/s, and a power
+        spectral density of accelerations of at least `turning` (..., J), m²/s³; see
+        `Motion.density`.
         """
         return self.law.density(np.maximum(self.acceleration(speed_m_s), turning), within_s)
 
     def acceleration(self, speed_m_s: Array) -> Array:
-        """Power spectral density (..., J) of the accelerations of joints of this speed (..., J), m²/s³."""
+        """Power spectral density (..., J) of the accelerations of joints with this speed (..., J),
+        m²/s³.
+        """
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
     def density_lost(self, speed_m_s: Array) -> Array:
-        """Density (..., J) while joints are lost from sight, and their speed is a guess."""
+        """Density (..., J) while joints are lost, with uncertain speed."""
         return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 
     @classmethod
     def load(
         cls, joints: tuple[str, ...], config: MotionConfig | None = None, law: Motion = CONSTANT_VELOCITY
     ) -> "MotionModel":
-        """The numbers of the configuration's file for the `joints` of a detector, as the `law` has them.
+        """Read the parameters from the configuration's file for the `joints` of a detector and the
+        motion model `law`.
 
-        A joint that the file does not name moves as the mean of those that it does. InputError for a file that is
+        Joints missing from the file get the mean of the others. Raises InputError if the file is
         not a motion model.
         """
         config = MotionConfig() if config is None else config

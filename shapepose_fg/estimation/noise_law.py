@@ -1,8 +1,10 @@
-"""A detector's noise law: how far its joints lie from the true ones, by score, learnt from the recording itself.
+"""A detector's noise law: the distribution of its keypoint errors by score.
 
-Each joint of a person's 2D detections in one view, used or not, is compared with the place that good detections of
-the other views give it: detections that were used are cut off by gates. No ground truth is needed. What ships
-(`calibration.json`) is the prior, so that a short recording keeps it.
+The law is learnt from the recording itself, without ground truth. Each keypoint of a person in one
+view is compared with the position triangulated from confident detections of the other views.
+Keypoints that the solver rejected are compared too, since gates have removed the large errors of the
+others. The prior is the law shipped with the package (`calibration.json`), so a short recording
+changes it little.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,32 +30,32 @@ from shapepose_fg.estimation.linearisation import (
 )
 
 EDGES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)
-"""Scores that separate the K = 7 ranges of scores; relative to what ships, the law is constant within each."""
+"""Bounds between the K = 7 ranges of scores. Relative to the shipped law, a law is constant in each."""
 GROSS_M = 0.2
-"""Standard deviation of a gross error along an axis, m: another joint, or another person's."""
+"""Standard deviation of a gross error along an axis, m. It lies on another joint or person."""
 _MIDDLES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.85, 0.95)
 _GOOD_SCORE = 0.5
-"""Minimum score of the other views' detections."""
+"""Minimum score of a detection in another view to be used for triangulation."""
 _GOOD_M = 0.1
-"""Maximum standard deviation of the place that they give, m."""
+"""Maximum standard deviation of the triangulated position, m."""
 _AGREE_SIGMA = 3.5
-"""Maximum residual of each of them there, in standard deviations: otherwise they contradict each other."""
+"""Maximum residual of each triangulated detection, standard deviations. Above it, they disagree."""
 _PRIOR_COUNT = 30.0
-"""Weight of what ships, as a number of detections, in each range of scores."""
+"""Weight of the shipped law in each range of scores, as a number of detections."""
 _ROUNDS = 40
-"""Rounds of expectation maximisation."""
+"""Number of iterations of expectation maximisation."""
 
 
 @dataclass(frozen=True)
 class NoiseLaw:
-    """Errors of detections in K ranges of scores: a Gaussian core, and a share of gross errors."""
+    """Error distribution in K ranges of scores: a Gaussian core and a share of gross errors."""
 
     times: tuple[float, ...]
-    """(K,) standard deviation of the core, as a multiple of that in Eq. 1's weights (`ObservationConfig`)."""
+    """(K,) standard deviation of the core, as a multiple of that of Eq. 1's weights (`core_sigma_m`)."""
     gross: tuple[float, ...]
     """(K,) share of gross errors, 0 to 1."""
     count: tuple[int, ...] = (0,) * (len(EDGES) + 1)
-    """(K,) number of detections that it was learnt from; 0 in what ships."""
+    """(K,) number of detections from which the law was learnt; 0 in the shipped law."""
     COLUMNS: ClassVar = ("times", "gross", "count")
 
     def __post_init__(self) -> None:
@@ -68,24 +70,24 @@ class NoiseLaw:
     @classmethod
     @cache
     def shipped(cls) -> "NoiseLaw":
-        """The law that joints' covariances are calibrated for (`scripts/fit_covariances.py`)."""
+        """The law for which the covariances of joints are calibrated (`scripts/fit_covariances.py`)."""
         with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
             return cls.from_dict(read_json(path)["noise"])
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "NoiseLaw":
-        """What `as_dict` gave; KeyError, TypeError or ValueError for anything else."""
+        """The law from the result of `as_dict`; KeyError, TypeError or ValueError for other content."""
         times, gross, count = (content[name] for name in cls.COLUMNS)
         return cls(tuple(map(float, times)), tuple(map(float, gross)), tuple(map(int, count)))
 
     @classmethod
     def load(cls, path: str | Path) -> "NoiseLaw":
-        """The law in a run.json, what ships where it has none; InputError for a damaged one."""
+        """The law in a run.json, or the shipped law if it has none. InputError if the law is damaged."""
         return cls.read(read_json(Path(path)), Path(path))
 
     @classmethod
     def read(cls, run: Any, path: Path) -> "NoiseLaw":
-        """The law in the content `run` of a run.json at `path`, as `load`."""
+        """The law in `run`, the content of the run.json at `path`; otherwise as `load`."""
         told = run.get("noise_law") if isinstance(run, dict) else None
         try:
             return cls.shipped() if told is None else cls.from_dict(told)
@@ -93,7 +95,7 @@ class NoiseLaw:
             raise InputError(f"{path}: noise_law is damaged ({error}); reconstruct the recording again") from None
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, for run.json."""
+        """The law as JSON values, with the score and sigma of each range for readers of run.json."""
         sigma_m = [times * float(core_sigma_m(score)) for times, score in zip(self.times, _MIDDLES, strict=True)]
         return {
             "score": list(_MIDDLES),
@@ -102,10 +104,11 @@ class NoiseLaw:
         }
 
     def variances(self, scores: Array) -> tuple[Array, Array]:
-        """Variances (...) of detections of these `scores` (...): that of the core relative to what ships, and what
-        gross errors add to it, m².
+        """Variances (...) of detections with these `scores` (...).
 
-        Only the share of gross errors beyond that of good scores counts: that one lies with associations.
+        Returned are the variance of the core relative to the shipped law, and the variance added by
+        gross errors, m². Of gross errors, only the share above that of high scores counts, because
+        that of high scores is due to wrong associations, which are modelled separately.
         """
         score = np.digitize(scores, EDGES)
         core = np.square(np.divide(self.times, self.shipped().times))
@@ -115,25 +118,28 @@ class NoiseLaw:
 
 
 def core_sigma_m(scores: Array | float, config: ObservationConfig | None = None) -> Array:
-    """(...) standard deviation in Eq. 1's weights of detections of these `scores` (...), m, of the mean joint."""
+    """(...) standard deviation that Eq. 1 assumes for detections with these `scores` (...), m.
+
+    It is that of the mean joint.
+    """
     config = ObservationConfig() if config is None else config
     return config.sigma_m / np.sqrt(config.weight(np.asarray(scores, dtype=np.float64)))
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Detections of one view beside the places that others give their joints, R of them."""
+    """Residuals of R detections to their joints, triangulated from the other views."""
 
     score: Array
-    """(R,) the detector's score."""
+    """(R,) score of the detection."""
     scatter: Array
-    """(R,) standard deviation in Eq. 1's weights, as a length at the joint's depth, m."""
+    """(R,) standard deviation of the detection by Eq. 1's weights, at the depth of the joint, m."""
     squared: Array
-    """(R, 2) squared distances along the axes of the place's covariance, m²."""
+    """(R, 2) squared residuals along the principal axes of the triangulated covariance, m²."""
     others: Array
-    """(R, 2) variances of the place along these axes by Eq. 1's weights, rising, m²."""
+    """(R, 2) variances of the triangulated position along these axes by Eq. 1, ascending, m²."""
     of_others: Array
-    """(R, V) scores of the other views' detections; 0 for none."""
+    """(R, V) scores of the triangulated detections in the other views; 0 for none."""
 
     @classmethod
     def of(
@@ -144,7 +150,11 @@ class Residuals:
         config: ObservationConfig,
         joints: Sequence[str],
     ) -> "Residuals":
-        """Residuals of N rows: `chosen` are the detections of each person, `every` those of its 2D people."""
+        """Residuals of N rows, one for each person in a frame.
+
+        `chosen` has the detections assigned to the person. `every` has all keypoints of the 2D
+        people to which these belong.
+        """
         parts, scatter = [], config.scatter(joints)
         for view in range(len(views)):
             good = chosen.seen & (chosen.confidence >= _GOOD_SCORE)
@@ -183,7 +193,10 @@ class Residuals:
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def law(self, prior: NoiseLaw | None = None) -> NoiseLaw:
-        """The most probable law, by expectation maximisation from the `prior` (default: what ships)."""
+        """The most probable law with this `prior` (default: the shipped law).
+
+        It is found by expectation maximisation.
+        """
         prior = NoiseLaw.shipped() if prior is None else prior
         score, seen = np.digitize(self.score, EDGES), self.of_others > 0
         of_others = np.digitize(self.of_others, EDGES)
@@ -202,12 +215,12 @@ class Residuals:
             ]
             odds = gross[score] / np.maximum(1 - gross[score], 1e-9)
             core = 1 / (1 + odds * np.exp(np.clip(likely[1] - likely[0], -50.0, 50.0)))
-            # Expected square of the detection's own error, which is a part of the residual.
+            # Expected square of the error of the detection itself, which is part of the residual.
             share = own / (others + own)
             error = (share**2 * self.squared + share * others).mean(axis=1) / self.scatter**2
             squared_times = (_PRIOR_COUNT * expected + total(core * error)) / (_PRIOR_COUNT + total(core))
             gross = (_PRIOR_COUNT * np.array(prior.gross) + total(1 - core)) / (_PRIOR_COUNT + count)
-        # As in run.json, from which it is read again.
+        # Rounded as in run.json, from which a later run reads the law.
         times, gross = np.sqrt(squared_times).round(4), gross.round(4)
         return NoiseLaw(tuple(times.tolist()), tuple(gross.tolist()), tuple(count.astype(int).tolist()))
 
@@ -215,13 +228,14 @@ class Residuals:
 def variance_ratio(
     law: NoiseLaw, alone: Mask, scores: Array, sigma_m: Array, by_view: Array, body: Array
 ) -> Array:
-    """(N, J) ratio of joints' variances under this `law` to those with Eq. 1's weights, which solved them.
+    """(N, J) variance of joints under this `law`, relative to the variance by Eq. 1's weights.
 
-    `scores` (N, J, V) are those of observations, `sigma_m` (N, J, V) their standard deviations in Eq. 1's
-    weights, m, `by_view` (N, J, V, 3, 3) the information of those that were used, and `body` (N, J, 3, 3) the
-    body's, 1/m². A body is as wrong as its person's detections in the mean; over time, where it averages them, by
-    the root of that. In rows that stand `alone` (N,) gross errors count; covariances over time are calibrated with
-    them.
+    `scores` (N, J, V) are those of the observations, and `sigma_m` (N, J, V) their standard
+    deviations by Eq. 1's weights, m. `by_view` (N, J, V, 3, 3) is the information of the used
+    observations, and `body` (N, J, 3, 3) that of the body constraint, 1/m². The variance of the body
+    is scaled by the mean ratio of the person's detections; with temporal factors, which average
+    them, by the square root of this ratio. Gross errors count only in `alone` (N,) rows, which have
+    no temporal factors; in others, the calibration of covariances includes them.
     """
     core, gross_m2 = law.variances(scores)
     ratio = core + np.where(alone[:, None, None], gross_m2 / sigma_m**2, 0.0)

@@ -1,8 +1,9 @@
-"""Views that are exposed before or after the others of their frame: joints have moved by then.
+"""Asynchronous views: joints have moved when they are exposed before or after the others of their
+frame.
 
-The window's graph measures each joint where it is at the view's own time, from its position and velocity
-(`factors.moving_projection_factors`). Gates and bodies know positions only: for these, detections are carried to
-the frame's time by the velocity that is known so far.
+The window's graph models each joint at the view's own time, from its position and velocity
+(`factors.moving_projection_factors`). Gates and bodies use positions only: for these, detections
+are shifted to the frame's time by the current estimate of the velocity.
 """
 
 from dataclasses import replace
@@ -15,13 +16,16 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.in_time import velocities
 
 _AT_ONCE_S = 1e-3
-"""Views that are exposed nearer to each other are of one time: a hand at 5 m/s moves by 5 mm."""
+"""Difference of exposure times, s, below which views are synchronised: a hand at 5 m/s moves by 5
+mm."""
 
 
 def leads(observations: Observations, views: Views) -> Array:
-    """(N, J, V) how long after its frame, the mean of the views' times, each observation was exposed, seconds.
+    """(N, J, V) exposure time of each observation relative to its frame, the mean of the views'
+    times, seconds.
 
-    0 where the views of a frame are within a millisecond; and a rolling shutter exposes one row after the other.
+    0 if the views of a frame are within a millisecond; a rolling shutter exposes the rows one after
+    the other.
     """
     time_s = observations.time_s
     apart = np.ptp(time_s, axis=1, keepdims=True) > _AT_ONCE_S
@@ -35,7 +39,7 @@ def leads(observations: Observations, views: Views) -> Array:
 
 
 def velocities_of(observations: Observations, points: Array) -> Array:
-    """(N, J, 3) how the joints `points` (N, J, 3) of each track move, m/s; 0 where that is not known."""
+    """(N, J, 3) velocities of the joints `points` (N, J, 3) of each track, m/s; 0 if unknown."""
     velocity, time_s = np.zeros(points.shape), observations.time_s.mean(axis=1)
     order = np.lexsort((time_s, observations.track))
     for rows in np.split(order, np.flatnonzero(np.diff(observations.track[order])) + 1):
@@ -44,8 +48,8 @@ def velocities_of(observations: Observations, points: Array) -> Array:
 
 
 def carried_to_frames(observations: Observations, points: Array, velocity: Array, views: Views) -> Observations:
-    """The observations as they would be at their frames' time, of joints at `points` (N, J, 3), metres, that move
-    by `velocity` (N, J, 3), m/s.
+    """The observations shifted to their frames' time, for joints at `points` (N, J, 3), metres,
+    with `velocity` (N, J, 3), m/s.
     """
     lead_s = leads(observations, views)
     if not lead_s.any():
@@ -56,8 +60,8 @@ def carried_to_frames(observations: Observations, points: Array, velocity: Array
 
 
 def widened(covariance: Array, observations: Observations, points: Array, views: Views) -> Array:
-    """`covariance` (N, J, 3, 3) and how far the joints `points` (N, J, 3) are, in any view, from where they are at
-    their frame's time, m².
+    """`covariance` (N, J, 3, 3) plus the largest displacement, in any view, of the joints `points`
+    (N, J, 3) from the frame's time, m².
     """
     lead_s = leads(observations, views)
     if not lead_s.any():

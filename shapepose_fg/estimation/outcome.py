@@ -1,4 +1,6 @@
-"""What comes of a solved window: errors that last, doubts, how each joint is known, and what went wrong."""
+"""Results of a solved window: correlated errors, further uncertainty, how joints are known, and
+problems.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -41,19 +43,20 @@ from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
 
 RUNAWAY_M = 1.0
-"""A joint with a factor of the user's own that ends this far from where its views first put it has run away."""
+"""Distance of a joint with a user factor from its initial position at which it has diverged, m."""
 RUNAWAY_SIGMA = 20.0
-"""A joint that ends this many standard deviations, and half a metre, from what views and body say of it has run
-away."""
+"""Distance of a joint from its views and body, standard deviations, at which it has diverged, if
+also over 0.5 m."""
 _HALF_M = 0.5
 WEAK_SCORE = 0.3
-"""Detections of a lower score are weak: in simulated crowds one in 18 is not the person's, of others one in 60."""
+"""Score below which a detection is weak: in simulated crowds one in 18 is not the person's, of
+others one in 60."""
 WEAK_PROBABILITY = 0.5
-"""Detections that are less probably the person's are weak."""
+"""Probability below which a detection is weak."""
 
 
 def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
-    """What is reported of a window whose joints are solved: covariances with all doubts, codes, statuses."""
+    """Results of a window with solved joints: covariances with all uncertainty, codes, statuses."""
     rows, people, shape = state.observations, state.people, state.joints.shape
     solved, covariance, velocity_covariance = (np.full((*shape, 3), np.nan) for _ in range(3))
     velocity = np.full(shape, np.nan)
@@ -111,7 +114,7 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
 
 
 def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
-    """How many factors each function of the user's made, and how many were inactive in the last problem."""
+    """Number of factors by user function, and how many were inactive in the last problem."""
     ties = {id(person.ties): person.ties for person in people}.values()
     made, active = (
         Counter(factor.name for each in ties for factor in of(each))
@@ -121,9 +124,9 @@ def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:
-    """The bodies that are returned: where there are factors of the user's own, fitted to the joints as solved.
+    """The bodies to return. For people with user factors, they are fitted to the solved joints.
 
-    The bodies follow these factors so. What they say goes nowhere else: joints and covariances are done.
+    In this way, the bodies follow these factors. Joints and covariances are final and not affected.
     """
     fit = state.fit
     chosen = [
@@ -139,10 +142,11 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
 
 
 def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
-    """Covariances (N, J, 3, 3) with all doubts, as large as the detector's errors make them.
+    """Covariances (N, J, 3, 3) of the joints `X` with all uncertainty, for the detector's noise law.
 
-    `covariance` is that of the graph, errors that last in it; `final` what the views say around the joints `X`.
-    Those of rows that stand alone are no smaller than the graph's.
+    `covariance` is that of the graph, with correlated errors, and `final` the linearised
+    observations at `X`. In rows without temporal factors, the result is not smaller than
+    `covariance`.
     """
     rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
     config, alone = state.config.observations, np.ones(len(X), dtype=bool)
@@ -170,12 +174,13 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
 
 
 def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
-    """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, and the errors that it left out.
+    """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, plus the errors it
+    omits.
 
-    Added is the share that lasts, of what views and body leave in one frame; and of the share that motion smooths,
-    the part that it does not take away in truth, because errors fade over a few frames (`Lasting.kept`). Where a
-    joint is not seen, what was left in the nearest frame in which it was is carried along. What is solved with
-    offsets has its own lasting error in `marginal`.
+    Added are the correlated share of the single-frame covariance by views and body; and of the
+    white share, the part that smoothing does not really remove, because errors are correlated over
+    a few frames (`Lasting.kept`). For unseen joints this is taken from the nearest frame in which
+    they are seen. For joints solved with offsets, `marginal` already includes the correlated error.
     """
     said = state.of_views.information[person.rows]
     information = said + state.of_body.information[person.rows]
@@ -190,17 +195,17 @@ def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
 
 
 def strong(state: State) -> Mask:
-    """(N, J, V) the observations that are used and not weak."""
+    """(N, J, V) mask of used observations that are not weak."""
     observations = state.observations
     sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
     return state.inlier & sure
 
 
 def how_known(state: State, covariance: Array) -> NDArray[np.uint8]:
-    """(N, J) a `Known` for each joint, `covariance` (N, J, 3, 3) being its own.
+    """(N, J) code of `Known` for each joint, with `covariance` (N, J, 3, 3).
 
-    It is seen where two views' detections are used that are not weak. A joint that no view saw is carried by
-    motion where it is known much better (half the variance) than the body knows it.
+    It is SEEN if two views have used detections that are not weak. An unseen joint is MOTION if its
+    variance is less than half that of the body's constraint.
     """
     pulled = state.of_body.known
     information = np.where(pulled[..., None, None], state.of_body.information, np.eye(3))
@@ -242,5 +247,5 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
 
 
 def _pull(message: JointTargets, X: Array) -> Array:
-    """(N, J, 3) information times the way from `X` to where the message has the joint, 1/m."""
+    """(N, J, 3) information times displacement from `X` to the estimate, 1/m."""
     return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))

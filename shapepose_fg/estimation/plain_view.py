@@ -1,4 +1,4 @@
-"""Joints that a detector ought to report and does not: evidence that they are not where the body has them."""
+"""Joints in plain view without detections: evidence that they are not where the body has them."""
 
 from collections.abc import Sequence
 
@@ -9,28 +9,30 @@ from shapepose_fg.core.camera import Views, beside_segment
 from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 
 LEAST_VIEWS = 3
-"""Minimum number of views that must look at the joint in plain view and report nothing: fewer often miss it by
+"""Minimum number of views with the joint in plain view but no detection; fewer often miss it by
 chance."""
 MISSED = 0.2
-"""Share of joints in plain view that a view does not report, or weakly, in simulated crowds. One, two, three, four
-views all miss 0.18, 0.046, 0.010 and 0.003 of them, as if by themselves."""
+"""Share of joints in plain view with a missing or weak detection, in simulated crowds. One, two,
+three, four views miss 0.18, 0.046, 0.010 and 0.003 of them simultaneously, as if independent."""
 UNUSUAL = 3e-4
-"""Share of joints in a pose that the detector does not know: reasoned, since the simulation has none. Three views
-that miss a joint widen it by 5 cm, four by 10."""
+"""Prior share of joints in poses unknown to the detector: an assumption, since the simulation has
+none. Three views that miss a joint add 5 cm, four 10 cm."""
 ELSEWHERE_M = 0.25
-"""Where the joint then is, sigma per axis, metres: somewhere within reach of its neighbour. Reasoned as well:
-in simulated crowds before three and four cameras, whose detector knows every pose, the log score gives all of this
-no weight; an arm that is stretched out on real footage is what speaks for it."""
+"""Standard deviation per axis of such a joint, metres: within reach of its neighbour. Also an
+assumption: in simulated crowds with three and four cameras and a detector that knows every pose,
+the log score gives this no weight; the evidence is a stretched arm on real footage."""
 SPEED_M_S = 2.0
-"""Speed at which a joint may have moved since a view reported it, m/s: `factors.CONSTANT_VELOCITY.start`."""
+"""Speed of a joint since a view last detected it, m/s: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
-"""Limbs hide what is this much behind them."""
+"""Minimum depth behind a limb for occlusion, m."""
 _TRUNK = {("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, ("RShoulder", "RHip"): 0.1, ("LShoulder", "LHip"): 0.1}
-"""What hides others' joints beside arms and legs: from joint to joint, half its width in metres."""
+"""Occluders other than arms and legs: from joint to joint, with half their width in metres."""
 
 
 def limbs_that_hide(joints: Sequence[str]) -> tuple[Index, Array]:
-    """(L, 2) the ends of the limbs of a detector's joints, and (L,) half their widths, metres."""
+    """(L, 2) ends of occluding limbs among a detector's joints, and (L,) half their
+    widths, metres.
+    """
     limbs = _TRUNK | {(f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()}
     there = [(joints.index(a), joints.index(b), w) for (a, b), w in limbs.items() if {a, b} <= set(joints)]
     table = np.array(there).reshape(-1, 3)
@@ -40,11 +42,11 @@ def limbs_that_hide(joints: Sequence[str]) -> tuple[Index, Array]:
 def elsewhere_variance(
     joints: Array, frame: Whole, strong: Mask, views: Views, limbs: tuple[Index, Array]
 ) -> Array:
-    """(N, J) variance that is added on every axis to joints that views ought to see and do not, m².
+    """(N, J) variance, m², added on every axis to joints that views should detect but do not.
 
-    Of `joints` (N, J, 3) in the `frame` (N,) those that no view reports surely, `strong` (N, J, V): if m views
-    look at the joint in plain view, not behind anybody's limbs, either all have missed it, `MISSED` to the power
-    of m, or it is elsewhere.
+    For `joints` (N, J, 3) in the `frame` (N,) without any strong detection, `strong` (N, J, V): if
+    m views have the joint in plain view, not behind any limb, either all have missed it, with
+    probability `MISSED` to the power of m, or it is elsewhere.
     """
     xy, depth = views.pixels(joints)
     inside = (depth > 0) & ((xy >= 0) & (xy < views.image_sizes)).all(axis=-1) & ~strong
@@ -66,8 +68,8 @@ def _behind_limbs(
     focal_px: Array,
     limbs: tuple[Index, Array],
 ) -> Mask:
-    """(K, V) whether joints, the rows and columns `places` (K,), lie behind a limb of the `people` (P,), theirs
-    included; `projected` pixels and depths of all, `focal_px` (K, V).
+    """(K, V) whether joints at rows and columns `places` (K,) are behind a limb of any of the
+    `people` (P,), themselves included; `projected` pixels and depths of all, `focal_px` (K, V).
     """
     (xy, depth), (row, joint), (ends, radius) = projected, places, limbs
     coordinates = xy[..., 0], xy[..., 1], depth

@@ -1,4 +1,6 @@
-"""Drafts of joints, frame by frame, smoothed over time: what a few frames' wrong detections do not lead away."""
+"""Temporal smoothing of single-frame initial estimates, robust to wrong detections in a
+few frames.
+"""
 
 import numpy as np
 
@@ -9,11 +11,13 @@ from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_model import MotionModel
 
 SPEED_M_S = 1.5
-"""Least speed of a joint for the density of its accelerations: a walker's, m/s."""
+"""Minimum speed of a joint for the density of its accelerations: that of a walker, m/s."""
 LEAST_SIGMA_M = 0.03
-"""A draft's error is not new in every frame: its sigma counts twice, and this much is added."""
+"""Added standard deviation, m, besides a factor of two, since errors of initial estimates are
+correlated over time."""
 KERNEL = 6.0
-"""A draft whose squared distance from the smoothed joint, in its variances, is this counts half."""
+"""Squared distance from the smoothed joint, in variances, at which an initial estimate has half its
+weight."""
 _ROUNDS = 3
 _UNKNOWN = 1e6
 
@@ -21,11 +25,12 @@ _UNKNOWN = 1e6
 def smoothed(
     joints: Array, covariance: Array, track: Whole, time_s: Array, motion: MotionModel
 ) -> tuple[Array, Array]:
-    """Draft `joints` (N, J, 3), metres, known to `covariance` (N, J, 3, 3), smoothed along each `track` (N,).
+    """Smooth initial estimates `joints` (N, J, 3), metres, with `covariance` (N, J, 3, 3), along
+    each `track` (N,).
 
-    Every joint by itself, alike along all axes, as a chain of states; drafts far from it lose weight (Cauchy), and
-    it is solved again. `time_s` (N,) seconds. Joints without a draft in some frames are carried through these; NaN
-    where a track never has one.
+    Every joint is an independent, isotropic chain of states; distant estimates are down-weighted
+    (Cauchy), and it is solved again. `time_s` (N,) seconds. Gaps are bridged by the motion model;
+    NaN for joints of a track that are never estimated.
     """
     times, at = np.unique(time_s, return_inverse=True)
     people, who = np.unique(track, return_inverse=True)

@@ -1,4 +1,4 @@
-"""People of a window on their way through Algorithm 1."""
+"""State of the people of a window during Algorithm 1."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,38 +18,39 @@ from shapepose_fg.estimation.window_graph import FactorFunction, WindowGraph, ad
 
 @dataclass
 class State:
-    """N rows: what is given, and what each round changes."""
+    """N rows: inputs, and results of the rounds."""
 
     observations: Observations
-    """Which detections each row has."""
+    """Observations with the assigned detections of each row."""
     views: Views
     """The cameras."""
     sigmas: Array
-    """(N, J, V) standard deviations of the observations, pixels; 0 where there are none."""
+    """(N, J, V) standard deviations of the observations, pixels; 0 without one."""
     first: Array
-    """(N, J, 3) X_0, metres; NaN where unknown."""
+    """(N, J, 3) X_0, metres; NaN if unknown."""
     config: EstimatorConfig
-    """How."""
+    """Settings of stage II."""
     motion: MotionModel
-    """How joints move, and how long errors last."""
+    """Motion model of joints, and temporal correlation of errors."""
     people: list[WindowGraph]
-    """Everybody's factors."""
+    """Graphs of the people."""
     joints: Array
-    """(N, J, 3) X, metres; NaN where unknown."""
+    """(N, J, 3) X, metres; NaN if unknown."""
     inlier: Mask
-    """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    """(N, J, V) delta_ij of Eq. 2: the used observations."""
     contradicts: Mask
-    """(N, J) joints whose views the body contradicts (`disagreement`): gated anew from the body's place."""
+    """(N, J) joints with views that contradict the body (`disagreement`), gated again at the body's
+    position."""
     of_views: JointTargets
-    """What the views alone say of N rows, all of the error in it."""
+    """Estimates from the views only, N rows, including all of the error."""
     of_body: JointTargets
-    """What the body says of each joint without the joint's own views; zero where it does not pull."""
+    """Constraints from the body without each joint's own views; zero where it is not used."""
     enough: Mask
-    """(N,) rows whose views place enough joints to place a person."""
+    """(N,) rows with enough joints determined by the views."""
     fit: BodyFit
     """Theta: the bodies, N rows."""
     told: JointTargets
-    """What they were fitted to."""
+    """Targets of the body fits."""
 
     @classmethod
     def start(
@@ -61,7 +62,9 @@ class State:
         motion: MotionModel,
         extra_factors: Sequence[FactorFunction] = (),
     ) -> "State":
-        """X_0, the observations' sigmas there, and a graph for everybody, with the user's factors in it."""
+        """Initial state: X_0, standard deviations of the observations there, and graphs including
+        user factors.
+        """
         first = first_places(observations, views, fitter, config)
         sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
         people = list[WindowGraph]()
@@ -83,7 +86,7 @@ class State:
     def put(
         self, rows: Index, joints: Array, evidence: ViewEvidence, wrong: Mask, of_body: JointTargets, fit: BodyFit
     ) -> None:
-        """What a round found of some `rows` (R,)."""
+        """Store the results of a round for some `rows` (R,)."""
         self.joints[rows], self.inlier[rows] = joints, evidence.inlier
         self.contradicts[rows] |= wrong
         for kept, new in ((self.of_views, evidence.message), (self.of_body, of_body)):
@@ -92,13 +95,15 @@ class State:
 
 
 def parts_of(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
-    """Everybody with their place among the rows of all these people."""
+    """People with the slices of their rows in the concatenation of all."""
     ends = np.cumsum([len(person) for person in people]).tolist()
     return [(person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)]
 
 
 def window_rows(observations: Observations) -> list[Index]:
-    """Rows of each window, frames rising: those of one track. ValueError where a person is twice in a frame."""
+    """Rows of each window, i.e. track, with ascending frames. Raises ValueError if a track has two
+    rows in a frame.
+    """
     order = np.lexsort((observations.frame, observations.track))
     track, frame = observations.track[order], observations.frame[order]
     if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):

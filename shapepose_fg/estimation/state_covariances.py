@@ -1,7 +1,8 @@
-"""Covariances of all joints of solved windows: each joint is a chain of states, one compiled pass along it.
+"""Covariances of all joints of solved windows: each joint is a chain of states, processed by one
+compiled pass.
 
-GTSAM's `Marginals` gives the same numbers for any graph, one variable a call. It is asked for frames that stand
-alone, and for joints with a factor of the user's own.
+GTSAM's `Marginals` gives the same values for any graph, one variable per call. It is used for
+single frames, and for joints with user factors.
 """
 
 from collections.abc import Sequence
@@ -16,10 +17,11 @@ from shapepose_fg.estimation.window_graph import WindowGraph
 
 
 def state_covariances(graphs: Sequence[WindowGraph]) -> list[tuple[Array, Array]]:
-    """For each solved graph of T frames the covariances (T, J, 3, 3) of positions, m², and of velocities, m²/s².
+    """For each solved graph of T frames, covariances (T, J, 3, 3) of positions, m², and of
+    velocities, m²/s².
 
-    NaN where a variable is not in the problem, and where the problem leaves it undetermined
-    (`joint_chains.UNDETERMINED_M`): singular systems raise no error.
+    NaN for variables not in the problem, and for undetermined ones (`joint_chains.UNDETERMINED_M`):
+    singular systems raise no error.
     """
     asked = dict[int, gtsam.Marginals]()
     return [_of_graph(graph, asked) for graph in graphs]
@@ -43,9 +45,9 @@ def _of_graph(graph: WindowGraph, known: dict[int, gtsam.Marginals]) -> tuple[Ar
 
 
 def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64], known: dict[int, gtsam.Marginals]) -> Array:
-    """Marginal covariance (K, D, 3, 3) of `keys` (K, D), one variable after the other, of whatever graph.
+    """Marginal covariances (K, D, 3, 3) of `keys` (K, D), one variable at a time, for any graph.
 
-    People who are tied have one graph, which is factorised once: `known` keeps it.
+    Coupled people share one graph, which is factorised once: `known` is the cache.
     """
     for make in (lambda: graph.graph, lambda: _damped(graph)):
         try:
@@ -60,7 +62,9 @@ def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64], known: dict[int, gtsa
 
 
 def _damped(graph: WindowGraph) -> gtsam.NonlinearFactorGraph:
-    """The problem with a prior of 100 m on all variables: what is then wider than 10 m is not determined."""
+    """The problem with a prior of 100 m on all variables; results wider than 10 m are then
+    undetermined.
+    """
     damped = gtsam.NonlinearFactorGraph(graph.graph)
     wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
     for key in (key for person in graph.ties.people for key in person.states.ravel().tolist()):

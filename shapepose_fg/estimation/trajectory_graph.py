@@ -1,9 +1,9 @@
-"""Poses of what carries cameras, from the people in a window: joints and poses together in one factor graph.
+"""Poses of camera carriers from the people in a window: joints and poses in one factor graph.
 
-Joints of a frame are points; every camera that sees one is a projection factor, robust: of a camera that stands
-still on the joint, of one that is carried on the joint and its carrier's pose. Between the poses are the steps of
-the odometry. `Trajectories` keeps what each window says of the poses, its joints eliminated, for the whole
-recording.
+Joints of a frame are points; every detection is a robust projection factor: for a static camera on
+the joint, for a carried one on the joint and its carrier's pose. Odometry factors connect
+consecutive poses. `Trajectories` keeps each window's marginal on the poses, with joints eliminated,
+for the whole recording.
 """
 
 from collections import deque
@@ -35,29 +35,36 @@ from shapepose_fg.estimation.carried_error import POSES_LAST_S
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 
 CameraFactors = Callable[["TrajectoryGraph", NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
-"""Your own factors on poses, made from a window's keys (T, B), T frames and B carriers."""
+"""Function that makes your own factors on poses, from a window's keys (T, B), T frames and B
+carriers."""
 _REACHES_M = (0.5, 0.15, 0.15)
-"""How far, round by round, a detection may be from a joint and still counts: at first an odometry may be off."""
+"""Maximum distance of a used detection from its joint, by round, m; the odometry may be wrong at
+first."""
 _WEAKEST_M = 0.15
-"""A joint that its views place worse than this, in its worst direction, says nothing of cameras."""
+"""Maximum standard deviation, in the worst direction, of a joint used for camera poses, m."""
 _SAME_PERSON = 2.5
-"""Joints of one person in one view err together: what so many say is one."""
+"""Number of joints of a person in a view that count as one, because their errors are correlated."""
 _ERRORS = ((0.45, 3.5), (0.25, 0.25))
-"""Shares of a detector's errors that last, and how long, seconds; all as in `calibration/refinement.py`."""
+"""Shares of a detector's correlated errors, and their time constants, seconds, as in
+`calibration/refinement.py`."""
 _AVERAGED_S = 1.0
-"""Time for which an odometry of 1 % is better than what people say of a pose: over this, errors would average
-out."""
+"""Time, s, over which an odometry of 1 % is more accurate than people's constraints on a pose;
+errors average out over it."""
 _ANYWHERE_M = 10.0
-"""Joints are about there: without it one that ends behind its cameras would make the system singular."""
+"""Standard deviation of a weak prior on joints, m; one behind its cameras would make the system
+singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
-"""Where no camera stands still, the world is that in which the first carrier starts."""
+"""Without a static camera, the world is the first carrier's initial frame; this is its prior
+covariance."""
 _LEAST = np.diag([1e-6**2] * 3 + [1e-5**2] * 3)
-"""A carrier that stands still in an odometry that says so; rad and m."""
+"""Minimum covariance of an odometry step, for carriers at rest; rad² and m²."""
 
 
 def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
-    """How many of the errors of one detection, of joints and of frames `step_s` apart, are one error, where poses
-    up to `over_s` apart are known against each other better than by people.
+    """Number of correlated detection errors that count as one independent error.
+
+    Errors are correlated between joints, and between frames, which are `step_s` apart. `over_s` is
+    the time within which odometry gives relative poses more accurately than people do.
     """
     lags = np.arange(1, max(int(over_s / step_s), 1) + 1) * step_s
     lasting = sum(share * np.exp(-lags / lasts).sum() for share, lasts in _ERRORS)
@@ -66,14 +73,14 @@ def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
 
 @dataclass(frozen=True)
 class Mounted:
-    """How the cameras of T frames stand on their carriers, and what the odometry says of these."""
+    """Cameras of T frames on their carriers, with the odometry."""
 
     rig: Rig
-    """The cameras, with the trajectories as they were given."""
+    """The cameras, with the given trajectories."""
     frames: Whole
-    """(T,) rising."""
+    """(T,) frames, ascending."""
     time_s: Array
-    """(T, V) when each view was taken."""
+    """(T, V) exposure time of each view, seconds."""
 
     @cached_property
     def odometry(self) -> Array:
@@ -82,7 +89,9 @@ class Mounted:
 
     @cached_property
     def sensors(self) -> Array:
-        """(T, V, 4, 4) from carrier, at its frame's time, to camera, at its own; unit where it stands still."""
+        """(T, V, 4, 4) carrier, at its frame's time, from camera, at its own time; identity for
+        static cameras.
+        """
         sensors, on = np.tile(np.eye(4), (*self.time_s.shape, 1, 1)), self.rig.carrier
         own = self.rig.poses(self.time_s)[:, on >= 0]
         sensors[:, on >= 0] = np.linalg.inv(self.odometry[:, on[on >= 0]]) @ own
@@ -93,7 +102,9 @@ class Mounted:
         return np.stack([camera_keys(each, self.frames) for each in range(self.odometry.shape[1])], axis=1)
 
     def views(self, poses: Array, at: Index) -> Views:
-        """The cameras of N rows at frames `at` (N,), places in `frames`, when the carriers are at `poses`."""
+        """The cameras of N rows at frames `at` (N,), indices in `frames`, with carriers
+        at `poses`.
+        """
         on, wTc = self.rig.carrier, np.stack([camera.wTc for camera in self.rig.cameras])
         wTc = np.tile(wTc, (len(at), 1, 1, 1))
         wTc[:, on >= 0] = poses[at][:, on[on >= 0]] @ self.sensors[at][:, on >= 0]
@@ -101,13 +112,13 @@ class Mounted:
         return Views(self.rig.K, cTw, self.rig.image_sizes)
 
     def steps(self, carrier: int) -> list[gtsam.NonlinearFactor]:
-        """The odometry of one carrier, frame by frame."""
+        """Odometry factors of one carrier, frame by frame."""
         poses, trajectory = self.odometry[:, carrier], self.rig.trajectories[carrier]
         covariances = trajectory.drifted(poses, self.time_s.mean(axis=1)) + _LEAST
         return odometry_factors(self.keys()[:, carrier], poses, covariances)
 
     def known(self, carrier: int) -> list[gtsam.NonlinearFactor]:
-        """What is known of one carrier's poses: where it starts; where SLAM has it, every few seconds."""
+        """Priors on one carrier's poses: its start, and poses from SLAM every few seconds."""
         trajectory, keys, middle = (
             self.rig.trajectories[carrier],
             self.keys()[:, carrier],
@@ -130,7 +141,7 @@ class Mounted:
 
 
 class TrajectoryGraph:
-    """The carriers of cameras in T frames, and the joints that tell where these are."""
+    """Poses of the carriers of cameras in T frames, with the joints that constrain them."""
 
     def __init__(
         self,
@@ -141,19 +152,21 @@ class TrajectoryGraph:
         joints: Sequence[str],
         camera_factors: CameraFactors | None = None,
     ) -> None:
-        """`rows` are N people of the frames of `mounted`, whose carriers are about at `start` (T, B, 4, 4)."""
+        """`rows` are N people in the frames of `mounted`, with carriers initially at `start` (T, B,
+        4, 4).
+        """
         self.mounted = mounted
         """Frames, cameras, odometry."""
         self.rows = rows
-        """Who was seen."""
+        """The observed people."""
         self.keys = mounted.keys()
         """(T, B) keys of the poses."""
         self.poses = start.copy()
         """(T, B, 4, 4) the solution, world from carrier."""
         self.graph = gtsam.NonlinearFactorGraph()
-        """What people, and factors of your own, say of poses and joints: no odometry."""
+        """Factors of people, and your own, on poses and joints, without odometry."""
         self.values = gtsam.Values()
-        """Poses, and the joints that are in the graph."""
+        """Poses, and the joints in the graph."""
         self._config, self._names, self._own = config, joints, camera_factors
         self._at = np.searchsorted(mounted.frames, rows.frame)
         self._joint_keys = np.zeros(rows.confidence.shape[:2], dtype=np.int64)
@@ -165,14 +178,17 @@ class TrajectoryGraph:
         self._still = [make_camera(camera.K, camera.wTc) for camera in mounted.rig.cameras]
 
     def solve(self, anchors: gtsam.NonlinearFactorGraph) -> None:
-        """Poses and joints together, by Levenberg-Marquardt; `anchors` are odometry and what was known before."""
+        """Solve poses and joints jointly, by Levenberg-Marquardt; `anchors` are odometry and
+        earlier marginals.
+        """
         for reach_m in _REACHES_M:
             joints = self._build(reach_m)
             if len(joints) == 0 and self._own is None:
                 return
             both = gtsam.NonlinearFactorGraph(anchors)
             both.push_back(self.graph)
-            # Ceres's way damps each parameter by its own information: radians and metres stand side by side.
+            # Ceres' damping uses each parameter's own information, since radians and metres are
+            # mixed.
             parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
             parameters.setMaxIterations(10)
             parameters.setRelativeErrorTol(1e-4)
@@ -181,7 +197,9 @@ class TrajectoryGraph:
             self.poses = poses_of(self.values, self.keys)
 
     def of_poses(self) -> list[gtsam.NonlinearFactor]:
-        """What the graph says of the poses alone, linear around the solution, all joints eliminated."""
+        """Marginal of the graph on the poses, linearised at the solution, with all joints
+        eliminated.
+        """
         joints = sorted(set(self.graph.keyVector()) - set(self.keys.ravel().tolist()))
         if self.graph.size() == 0:
             return []
@@ -196,7 +214,7 @@ class TrajectoryGraph:
         ]
 
     def _build(self, reach_m: float) -> list[int]:
-        """Make graph and values around the present poses; returns the keys of the joints that are in it."""
+        """Build graph and values at the current poses; returns the keys of the joints used."""
         rows, mounted, config = self.rows, self.mounted, self._config
         self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key, pose in zip(self.keys.ravel().tolist(), self.poses.reshape(-1, 4, 4), strict=True):
@@ -206,7 +224,7 @@ class TrajectoryGraph:
         at, on = self._at[row], mounted.rig.carrier[view]
         step_s = float(np.median(np.diff(mounted.time_s.mean(axis=1)))) if len(mounted.frames) > 1 else 1.0
         scale = np.sqrt(dilution(step_s))
-        # A lasting error is no outlier: in pixels the kernel is as wide as before.
+        # A correlated error is not an outlier: the kernel's width in pixels is unchanged.
         name = config.robust_kernel
         kernel = robust_kernel(name, None if name is None else DEFAULT_WIDTH_SIGMA[name] / scale)
         keys, xy, sigma = self._joint_keys[row, joint], rows.xy[chosen], scale * sigmas[chosen]
@@ -228,9 +246,10 @@ class TrajectoryGraph:
         return joints
 
     def _chosen(self, reach_m: float) -> tuple[Mask, Array, Array]:
-        """(N, J, V) the observations that tell of poses, and the joints (N, J, 3) and sigmas (N, J, V) in pixels.
+        """(N, J, V) observations that constrain camera poses, and the joints (N, J, 3), metres, and
+        sigmas (N, J, V), pixels.
 
-        A joint tells of them if two see it that do not move together.
+        A joint does if two cameras that are not rigidly connected see it.
         """
         rows, views = self.rows, self.mounted.views(self.poses, self._at)
         placed = Observations(rows.xy, rows.confidence, np.full(rows.initial.shape, np.nan))
@@ -254,5 +273,5 @@ def poses_of(values: gtsam.Values, keys: NDArray[np.int64]) -> Array:
 
 
 def symmetric(covariance: Array) -> Array:
-    """Return a covariance without what rounding left on one side of the diagonal."""
+    """Return a covariance with rounding errors symmetrised."""
     return (covariance + covariance.swapaxes(-1, -2)) / 2

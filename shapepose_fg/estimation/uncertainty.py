@@ -1,6 +1,6 @@
-"""What may be asked of joints that are known with errors: together, how far apart, and how near to what.
+"""Probabilistic queries on uncertain joints: joint distributions, and distances.
 
-Of any `Reconstruction`: saved, handed out by `OnlineReconstructor.people`, or solved with factors of your own.
+For any `Reconstruction`: saved, from `OnlineReconstructor.people`, or solved with user factors.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,26 +24,29 @@ if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
 _LASTS, _LASTS_S, _FADES_S = 0.62, 2.2, 0.115
-"""Errors of a joint, in standard deviations, have over time the correlation of a part that lasts, exp(-t / 2.2 s),
-and of one that motion smooths, (1 + t / 0.115 s) exp(-t / 0.115 s): measured 0.97, 0.84, 0.68, 0.52, 0.39, 0.25,
-0.16 after 1, 4, 8, 16, 30, 60, 90 frames at 30 Hz, alike for two to six cameras and however many views see it
-(simulated: the recordings of `scripts/fit_covariances.py`)."""
+"""Temporal correlation of a joint's errors, in standard deviations: a slow part, exp(-t / 2.2 s),
+and a part smoothed by motion, (1 + t / 0.115 s) exp(-t / 0.115 s). Measured: 0.97, 0.84, 0.68,
+0.52, 0.39, 0.25, 0.16 after 1, 4, 8, 16, 30, 60, 90 frames at 30 Hz, for two to six cameras and any
+number of views (simulated: the recordings of `scripts/fit_covariances.py`)."""
 _LIMBS = {
     ("Neck", "MidHip"): 0.50, ("Nose", "Neck"): 0.30, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.44,
     ("Shoulder", "Neck"): 0.71, ("Elbow", "Shoulder"): 0.23, ("Wrist", "Elbow"): 0.39, ("Hip", "MidHip"): 0.85,
     ("Knee", "Hip"): 0.53, ("Ankle", "Knee"): 0.47, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.43,
     ("SmallToe", "BigToe"): 0.77,
 }  # fmt: skip
-"""Correlation of the errors of two joints of a person in one frame, in standard deviations, along a limb; else the
-product along the way from one to the other. Measured as above. Two people's are -0.02: taken as 0."""
+"""Correlation of the errors of two joints of a person in one frame, in standard deviations, along a
+limb; for other pairs the product along the path between them. Measured as above. Between two people
+it is -0.02, approximated by 0."""
 SURFACE_M = 0.015
-"""What a point of a body's surface is known less well than the joints around it, one sigma, metres."""
+"""Additional standard deviation of a point on a body's surface relative to the surrounding joints,
+metres."""
 _REACH_M = 0.15
-"""Joints within about this of a point of the surface carry it."""
+"""Scale of the distance of joints that determine a surface point, m."""
 _NODES, _WIDE = 24, 6.0
-"""Number of nodes of the quadrature, per axis; and how many standard deviations it spans on either side."""
+"""Number of nodes of the quadrature per axis, and its range in standard deviations on
+either side."""
 _STEPS = 64
-"""Limits at which a distance's probabilities are tabled for its quantiles."""
+"""Number of limits at which a distance's distribution is tabulated for quantiles."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,12 @@ class JointAt:
 
 @dataclass(frozen=True)
 class Marginal:
-    """K joints together, as one Gaussian; its blocks are the reported covariances."""
+    """Joint Gaussian of K joints; its diagonal blocks are the reported covariances."""
 
     mean: Array
-    """(K, 3) metres, world."""
+    """(K, 3) positions, metres, world."""
     covariance: Array
-    """(3 K, 3 K) m², joint by joint."""
+    """(3 K, 3 K) covariance, m², ordered by joint."""
 
     def block(self, one: int, other: int) -> Array:
         """(3, 3) covariance of two of them, m²."""
@@ -71,22 +74,23 @@ class Marginal:
 
 @dataclass(frozen=True)
 class Distance:
-    """Distances (...,) between pairs of places, from the Gaussians of what lies between them.
+    """Distances (...,) between pairs of points, with a Gaussian displacement.
 
-    Near zero a distance is no Gaussian: its probabilities are integrals of the three-dimensional one over balls,
-    by quadrature, right in the tails too, where noncentral chi-square or fits of moments to it are not.
+    Near zero a distance is not Gaussian: its probabilities are integrals of the three-dimensional
+    Gaussian over balls, by quadrature, which is also accurate in the tails, unlike noncentral
+    chi-square or moment fits.
     """
 
     apart: Array
-    """(..., 3) from one to the other, metres."""
+    """(..., 3) displacement from one point to the other, metres."""
     covariance: Array
     """(..., 3, 3) covariance of `apart`, m²."""
 
     def below(self, limit_m: ArrayLike) -> Array:
-        """Probability (...,) that the distance is under a limit (...,), metres.
+        """Probability (...,) that the distance is below a limit (...,), metres.
 
-        Along the axis of least spread the integral is a normal distribution's, over the two others it is summed by
-        Gauss and Legendre's rule.
+        Along the axis of smallest spread the integral is that of a normal distribution, over the
+        two others by Gauss-Legendre quadrature.
         """
         limit = np.asarray(limit_m, dtype=np.float64)
         values, axes = principal_axes(self.covariance)
@@ -106,16 +110,16 @@ class Distance:
         return np.clip(np.einsum("...i,...ij,...ij->...", at_z, at_y, inside), 0.0, 1.0)
 
     def quantile(self, probability: ArrayLike) -> Array:
-        """Distance (...,), metres, that is under what is asked with this probability, one number."""
+        """Quantile of the distance (...,), metres, for a single probability."""
         limits, under = self._table()
         return _reached(float(np.asarray(probability)), under, limits)
 
     def interval(self, probability: float = 0.95) -> tuple[Array, Array]:
-        """Distances that would not have made the measured one improbable, by Neyman's construction.
+        """Confidence interval of the distance, metres, by Neyman's construction.
 
-        It holds the true one as often as it says however near it is; quantiles do not near zero, where errors in
-        three dimensions only ever make a distance longer. Where the measured one is shorter than errors let it
-        be, next to nothing would be left: the upper end is no less than the quantile.
+        It has the stated coverage at any true distance; quantiles do not near zero, where errors in
+        three dimensions can only increase a distance. If the measured distance is shorter than
+        errors allow, the interval would be nearly empty: the upper end is at least the quantile.
         """
         away = np.linalg.norm(self.apart, axis=-1)
         way = np.where(away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0])
@@ -127,7 +131,7 @@ class Distance:
 
     @property
     def mean_m(self) -> Array:
-        """(...,) expected distance, metres: more than that of the means."""
+        """(...,) expected distance, metres; larger than the distance of the means."""
         limits, under = self._table()
         return limits[0] + np.trapezoid(1.0 - under, limits, axis=0)
 
@@ -138,35 +142,35 @@ class Distance:
         return np.sqrt(np.maximum(square - self.mean_m**2, 0.0))
 
     def _span(self) -> Array:
-        """Limits (S, ...) from under to over all that the distances may be."""
+        """Limits (S, ...) that cover the range of the distances."""
         away = np.linalg.norm(self.apart, axis=-1)
         wide = 5.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance)[..., -1], 1e-12))
         first, last = np.maximum(away - wide, 0.0), away + wide
         return first + (last - first) * np.linspace(0, 1, _STEPS).reshape(-1, *(1,) * away.ndim)
 
     def _table(self) -> tuple[Array, Array]:
-        """Limits (S, ...) and how probably the distances are under them."""
+        """Limits (S, ...) and the probabilities of distances below them."""
         limits = self._span()
         return limits, np.maximum.accumulate(np.stack([self.below(each) for each in limits]), axis=0)
 
 
 @dataclass(frozen=True)
 class SurfaceDistance:
-    """Distance of a point from a body's surface, which is taken to be plane within the errors."""
+    """Distance of a point from a body's surface, which is assumed planar within the errors."""
 
     signed_m: float
-    """Metres; negative inside the body."""
+    """Signed distance, metres; negative inside the body."""
     sigma_m: float
     """Standard deviation, metres."""
     nearest: Array
-    """(3,) point of the surface, metres."""
+    """(3,) nearest point on the surface, metres."""
 
     def below(self, limit_m: float) -> float:
-        """Probability that the point is nearer than a limit, metres, or inside."""
+        """Probability that the point is closer than a limit, metres, or inside."""
         return float(_normal(np.asarray((limit_m - self.signed_m) / self.sigma_m)))
 
     def interval(self) -> tuple[float, float]:
-        """95 % of what the distance may be, metres; what is inside is at 0."""
+        """95 % interval of the distance, metres; 0 inside the body."""
         away = 1.959964 * self.sigma_m
         return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
 
@@ -174,14 +178,14 @@ class SurfaceDistance:
 def marginal(
     people: Reconstruction, *joints: JointAt, rig: Rig | None = None, graphs: Iterable[PersonGraph] = ()
 ) -> Marginal:
-    """Joints of any people and frames together.
+    """Joint distribution of joints of any people and frames.
 
-    Each one's own covariance is as it is reported; between two of a person the errors, in standard deviations,
-    correlate as was measured (`correlation`). With the `rig` that people were solved with (`cameras.json`), what
-    comes of the poses of cameras that move is shared by all that they see. With the `graphs` of a result that was
-    solved with factors of your own (`window_solutions(people, rig, extra_factors=...)`), joints that these tie to
-    each other correlate as the graph has it, also those of two people. NotDetermined for a joint without a place,
-    ValueError for one that is not there.
+    The covariance of each is as reported; errors of two joints of a person, in standard deviations,
+    have the measured correlation (`correlation`). With the `rig` of the reconstruction
+    (`cameras.json`), errors from poses of moving cameras are common to all that they see. With the
+    `graphs` of a result with user factors (`window_solutions(people, rig, extra_factors=...)`),
+    joints coupled by these, also of two people, have the graph's correlation. Raises NotDetermined
+    for a joint without a position, ValueError for one that does not exist.
     """
     rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
     K = len(joints)
@@ -200,8 +204,8 @@ def marginal(
 
 
 def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers: Index, errors: Array) -> Array:
-    """Correlations `errors` (K, 3, K, 3) of K joints, in standard deviations; from the graph where factors of the
-    user's own tie two of them.
+    """Correlations `errors` (K, 3, K, 3) of K joints, in standard deviations; replaced by the
+    graph's for pairs coupled by user factors.
     """
     K, found, tied = len(joints), errors.copy(), False
     for graph in {id(each.window.ties): each for each in graphs if len(each.window.ties.active) > 0}.values():
@@ -227,15 +231,15 @@ def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers
             found[a, :, b], found[b, :, a] = across, across.T
     if not tied:
         return errors
-    # Correlations from two sources: no stronger than leaves the whole positive definite.
+    # Correlations from two sources are scaled so that the whole is positive semi-definite.
     apart = found.reshape(3 * K, 3 * K) - np.eye(3 * K)
     least = np.linalg.eigvalsh(apart).min(initial=0.0)
     return (np.eye(3 * K) + apart / max(1.0, -least)).reshape(K, 3, K, 3)
 
 
 def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
-    """(K, 3, K, 3) what the errors of K joints have from poses of cameras that move: all that one carries errs
-    with it, and for a while. In no direction it is more than is `reported` (K, 3, 3).
+    """(K, 3, K, 3) error covariance of K joints from poses of moving cameras: common to all on one
+    carrier, and correlated over time. In no direction it exceeds `reported` (K, 3, 3).
     """
     own = people.rows(rows)
     if own.observations is None:
@@ -262,8 +266,8 @@ def distance(
     rig: Rig | None = None,
     graphs: Iterable[PersonGraph] = (),
 ) -> Distance:
-    """From a joint to another, or to a point (3,) in the world, metres, or to many (..., 3); `rig` and `graphs` as
-    of `marginal`.
+    """Distance from a joint to another, or to a point (3,) in the world, metres, or to many (...,
+    3); `rig` and `graphs` as in `marginal`.
     """
     if isinstance(other, JointAt):
         both = marginal(people, one, other, rig=rig, graphs=graphs)
@@ -276,7 +280,9 @@ def distance(
 
 
 def distances(people: Reconstruction, point: ArrayLike) -> Distance:
-    """From all joints (N, J) to a point (3,) in the world, or to one of each row (N, 3); NaN where unknown."""
+    """Distances from all joints (N, J) to a point (3,) in the world, or one per row (N, 3), metres;
+    NaN if unknown.
+    """
     points = np.broadcast_to(np.asarray(point, dtype=np.float64), (len(people), 3))
     return Distance(points[:, None] - people.joints, people.covariance)
 
@@ -284,10 +290,10 @@ def distances(people: Reconstruction, point: ArrayLike) -> Distance:
 def surface_distance(
     people: Reconstruction, body: "BodyModel", person: int, frame: int, point: ArrayLike
 ) -> SurfaceDistance:
-    """From a person's body surface to a point (3,) in the world, metres.
+    """Distance from a person's body surface to a point (3,) in the world, metres.
 
-    The surface errs as the joints around its nearest place do, together, and by `SURFACE_M`. NotDetermined where
-    the person has no body in the frame.
+    The surface's error is that of the joints around its nearest point, plus `SURFACE_M`. Raises
+    NotDetermined if the person has no body in the frame.
     """
     from shapepose_fg.body.model.body_model import BodyParameters
 
@@ -304,7 +310,7 @@ def surface_distance(
     normal = normals.sum(axis=0) / max(np.linalg.norm(normals.sum(axis=0)), 1e-12)
     nearest, away = vertices[near], where - vertices[near]
     signed, length = float(away @ normal), float(np.linalg.norm(away))
-    # Beside the vertex by less than its triangles are wide, the plane counts; else the way from the vertex.
+    # Within the triangles around the vertex the distance is to the plane, else to the vertex.
     beside = np.sqrt(max(length**2 - signed**2, 0.0)) > np.sqrt(((around - nearest) ** 2).sum(axis=-1).max())
     if beside and length > 0:
         normal, signed = away / length * (1.0 if signed >= 0 else -1.0), length * (1.0 if signed >= 0 else -1.0)
@@ -324,27 +330,27 @@ def surface_distance(
 
 
 def correlation(one: Sequence[str], other: Sequence[str]) -> Array:
-    """(A, B) correlation of the errors of joints of one person in one frame, by their names; those
-    that are no part of a body known here correlate with themselves alone.
+    """(A, B) correlation of the errors of joints of one person in one frame, by names; unknown
+    joints are correlated only with themselves.
     """
     return np.array([[_together(a, b) for b in other] for a in one]).reshape(len(one), len(other))
 
 
 def _over_time(apart_s: Array) -> Array:
-    """Correlation (...) of the errors of one joint at times so far apart (...), seconds."""
+    """Correlation (...) of a joint's errors at time differences `apart_s` (...), seconds."""
     fading = apart_s / _FADES_S
     return (1 - _LASTS) * (1 + fading) * np.exp(-fading) + _LASTS * np.exp(-apart_s / _LASTS_S)
 
 
 def _together(one: str, other: str) -> float:
-    """Correlation of two joints: the product along the limbs between them, 0 where there are none."""
+    """Correlation of two joints: the product along the limbs between them, 0 if not connected."""
     ways = _way_up(one), _way_up(other)
     common = next((name for name in ways[0] if name in ways[1]), None)
     return 0.0 if common is None else ways[0][common] * ways[1][common]
 
 
 def _way_up(joint: str) -> dict[str, float]:
-    """The joints from one to the middle of the hips, and the correlation with each."""
+    """Joints on the path from one to the middle of the hips, with the correlation to each."""
     way, side, correlation = {joint: 1.0}, joint[0] if joint[:1] in ("R", "L") else "", 1.0
     table = {f"{s}{a}": (b if b in ("Neck", "MidHip", "Nose") else f"{s}{b}", r)
              for (a, b), r in _LIMBS.items() for s in (("",) if a in ("Neck", "Nose") else (side,))}  # fmt: skip
@@ -362,7 +368,7 @@ def _row(people: Reconstruction, person: int, frame: int) -> int:
 
 
 def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
-    """Row and number of a joint that has a place."""
+    """Row and index of a joint with a position."""
     row, names = _row(people, asked.person, asked.frame), people.joint_names.tolist()
     if asked.joint not in names:
         raise ValueError(f"joint {asked.joint}: there is no joint of this name; there are {' '.join(names)}")
@@ -375,7 +381,7 @@ def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
 
 
 def _missing(people: Reconstruction, row: int, joint: int) -> str:
-    """What a joint without a place lacks."""
+    """The missing evidence for a joint without a position."""
     table, body = people.observations, "" if np.isfinite(people.transl[row]).all() else ", and no body was fitted"
     if table is None:
         return f"the row's status is {people.status[row]}{body}"
@@ -385,7 +391,9 @@ def _missing(people: Reconstruction, row: int, joint: int) -> str:
 
 
 def _reached(probability: float, rising: Array, limits: Array) -> Array:
-    """Limits (...,) at which probabilities (S, ...) of `limits` (S, ...) come to one value, interpolated."""
+    """Limits (...,) at which probabilities (S, ...) of `limits` (S, ...) reach one value,
+    interpolated.
+    """
     columns = zip(rising.reshape(len(rising), -1).T, limits.reshape(len(limits), -1).T, strict=True)
     return np.array([np.interp(probability, *each) for each in columns]).reshape(limits.shape[1:])
 
@@ -394,7 +402,7 @@ _AT, _WEIGHT = np.polynomial.legendre.leggauss(_NODES)
 
 
 def _nodes(low: Array, high: Array, mean: Array, sigma: Array) -> tuple[Array, Array]:
-    """Nodes (..., n) of the part of a normal distribution between two limits, and their weights."""
+    """Quadrature nodes (..., n) and weights for a normal distribution between two limits."""
     first = np.clip(mean - _WIDE * sigma, low, high)[..., None]
     last = np.clip(mean + _WIDE * sigma, low, high)[..., None]
     x = (first + last) / 2 + (last - first) / 2 * _AT

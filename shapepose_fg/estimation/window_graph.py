@@ -1,7 +1,7 @@
-"""A person over a window of frames as one factor graph: a position of every joint in every frame.
+"""Factor graph of a person over a window of frames: a position of every joint in every frame.
 
-Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Theta) with Theta fixed; with
-more than one frame, joints have velocities too, and motion factors between their states.
+Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Theta) with fixed Theta.
+With several frames, joints also have velocities, and motion factors between their states.
 """
 
 from collections import deque
@@ -43,46 +43,47 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.out_of_step import leads
 
 _OF_VIEWS, _OF_BODY = 0, 1
-"""Sources of messages about joints, for the keys of their offsets."""
+"""Numbers of the sources of estimates, for the keys of their offsets."""
 
 
 @dataclass(frozen=True)
 class UserFactor:
-    """A factor of the user's own."""
+    """A user factor."""
 
     factor: gtsam.NonlinearFactor
     keys: tuple[int, ...]
-    """Its variables: joints' states of people of the window, and variables of the user's own."""
+    """Variables of the factor: states of joints of people in the window, and user variables."""
     name: str
-    """The name of the function that made it."""
+    """Name of the function that created the factor."""
 
 
 @dataclass
 class Ties:
-    """What factors of the user's own tie together, solved as one graph: people of a window, and further variables.
+    """People of a window, and user variables, that user factors couple, and that are solved as one
+    graph.
 
-    A person without such factors is alone.
+    A person without such factors is separate.
     """
 
     people: list["WindowGraph"]
-    """Whose graphs are one."""
+    """The people in this graph."""
     factors: list[UserFactor] = field(default_factory=list)
-    """The user's own factors on them."""
+    """The user factors that couple these people."""
     start: gtsam.Values = field(default_factory=gtsam.Values)
-    """Where variables of the user's own start."""
+    """Initial values of user variables."""
     parts: list[frozenset[tuple[int, int]]] = field(default_factory=list)
-    """Variables that are tied to each other, sets without overlap: (track, joint), or (-1, key) of the user's."""
+    """Disjoint sets of coupled variables: (track, joint), or (-1, key) for user variables."""
     active: list[UserFactor] = field(default_factory=list)
-    """Factors whose variables are all in the last problem; the others are inactive in it."""
+    """Factors with all variables in the last problem; the others were inactive."""
 
     def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
-        """Note that a factor joins these variables."""
+        """Record that a factor couples these variables."""
         joined = frozenset(nodes)
         apart = [each for each in self.parts if not each & joined]
         self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]
 
     def take_in(self, other: "Ties") -> None:
-        """Merge with the ties of other people, who share these from now on."""
+        """Merge with the coupling of other people, who share this object from now on."""
         if other is self:
             return
         for key in other.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
@@ -98,21 +99,25 @@ class Ties:
 
 
 class WindowGraph:
-    """The graph of one person in T frames; T = 1 is a frame by itself, without velocities.
+    """Graph of one person in T frames; T = 1 is a single frame, without velocities.
 
-    Joints are not tied to each other, and people not to people, but by factors of your own, which keeps marginal
-    covariances cheap. People who are tied (`ties`) are one graph, and `graph` and `values` are that of them all.
+    Joints, and people, are coupled only by user factors, so that marginal covariances are cheap.
+    Coupled people (`ties`) are one graph; `graph` and `values` are then of all of them.
 
-    **Correlated errors.** A detector that is 2 cm off is so in the next frame too, and so is the body's guess. In
-    a window of several frames therefore
+    **Correlated errors.** A detector that is wrong by 2 cm is so in the next frame too, and so is
+    the body's estimate. In a window of several frames therefore
 
-    - projections and body priors count with the share of their variance that is new in every frame, so that motion
-      smooths that only; `state_covariances` have nothing of the rest (`outcome.with_lasting` adds it);
-    - where a joint is lost from sight (`lost` of `solve`) the body's prior gets an offset that decays slowly
-      (`factors.motion`): the difference between joint and body when it was seen; and so does what its views say,
-      which, where they hardly cross, would else be averaged over time as if it were new in every frame;
-    - joints with factors of your own are solved with offsets of views and body both, and what the views say is one
-      Gaussian each: your factor is weighed against all of the error, and the covariances hold it.
+    - projections and body priors have only the white share of their variance, so that motion
+      smooths only that;
+      `state_covariances` exclude the rest (`outcome.with_lasting` adds it);
+    - where a joint is lost (`lost` of `solve`) the body's prior gets a slowly decaying offset
+      (`factors.motion`): the
+      difference between joint and body when it was seen; and so do the views' estimates, which,
+      with nearly parallel
+      rays, would otherwise be averaged over time as if independent in every frame;
+    - joints with user factors are solved with offsets of both views and body, and the views'
+      estimates are one Gaussian
+      each: a user factor is weighed against all of the error, and the covariances include it.
     """
 
     def __init__(
@@ -125,34 +130,34 @@ class WindowGraph:
         rows: Index | None = None,
         first: Array | None = None,
     ) -> None:
-        """Make the factors of all observations: T rows of one person, frames rising.
+        """Build the factors of all observations: T rows of one person, ascending frames.
 
-        `sigmas_px` (T, J, V), 0 where the view did not see the joint; `views` are their cameras; `rows` (T,) says
-        which rows of a larger problem they are, `first` (T, J, 3) where joints are
-        before anything is solved.
+        `sigmas_px` (T, J, V), 0 if the view has no detection of the joint; `views` are their
+        cameras; `rows` (T,) are the indices in a larger problem, `first` (T, J, 3) the initial
+        joints.
         """
         T, J, _ = sigmas_px.shape
         if np.any(np.diff(observations.frame) <= 0):
             raise ValueError(f"frames of a person must increase, got {observations.frame}")
         self.config = config.graph
         self.rows = np.arange(T) if rows is None else rows
-        """(T,) which rows of the whole problem these are."""
+        """(T,) row indices in the whole problem."""
         self.track = int(observations.track[0])
-        """Who it is."""
+        """Track number of the person."""
         self.frames = observations.frame
         """(T,) frame of each row."""
         self.times_s = observations.time_s.mean(axis=1)
         """(T,) time of each frame, seconds."""
         joints = np.arange(J)
         self.state_keys = state_keys(self.track, joints, self.frames[:, None], motion.law.order)
-        """(T, J, n) keys of each joint's state, `Point3` each: position, velocity, and what the model of motion
-        has beside these; in the graph of a single frame, positions only."""
+        """(T, J, n) keys of each joint's state, a `Point3` each: position, velocity, and further
+        derivatives of the motion model; in the graph of a single frame, positions only."""
         self.graph = gtsam.NonlinearFactorGraph()
         """The factors of the last solution."""
         self.values = gtsam.Values()
-        """The last solution, for `gtsam.Marginals` and for graphs that this one is added to."""
+        """The last solution, for `gtsam.Marginals` and for graphs to which this one is added."""
         self.failure = ""
-        """Why the last solution is none; empty where it is one."""
+        """Reason why the last solution failed; empty on success."""
         self._motion = motion
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
         self._names = config.joints
@@ -162,20 +167,21 @@ class WindowGraph:
             [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
         )
         self.first: Array = np.full((T, J, 3), np.nan) if first is None else first
-        """(T, J, 3) where joints are before anything is solved, to within decimetres, metres; NaN where unknown.
-        Functions may choose by it what their factors join."""
+        """(T, J, 3) initial joints, accurate to decimetres, metres; NaN if unknown. Functions may
+        use them to choose what their factors connect."""
         self.people: list[WindowGraph] = [self]
-        """Everybody in the window, this person too; frame by frame, in the frame."""
+        """All people in the window, including this one; for single frames, in the frame."""
         self.ties = Ties([self])
-        """The people to whom factors of your own tie this one, and these factors."""
+        """The people coupled to this one by user factors, and these factors."""
         self.touched: Mask = np.zeros(J, dtype=bool)
-        """(J,) joints on which there is a factor of your own."""
+        """(J,) joints with a user factor."""
         self.present: Mask = np.zeros((T, J), dtype=bool)
-        """(T, J) which joints were in the last problem."""
+        """(T, J) joints in the last problem."""
         self.positions = self.velocity = np.full((T, J, 3), np.nan)
-        """(T, J, 3) positions and velocities of the last solution, metres and m/s; NaN where there are none."""
+        """(T, J, 3) positions and velocities of the last solution, metres and m/s; NaN if not in
+        it."""
         self.chains: list[Chains] = []
-        """The last problem of several frames joint by joint, but for factors of your own."""
+        """The last problem of several frames by joint, without user factors."""
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -188,13 +194,13 @@ class WindowGraph:
         return self.state_keys[..., 1]
 
     def __len__(self) -> int:
-        """T, the number of frames."""
+        """Number of frames, T."""
         return len(self.frames)
 
     @property
     def states(self) -> NDArray[np.int64]:
-        """(T, J, n + 2) keys of all that belongs to a joint in a frame: its state, offset of the views and offset
-        of the body; not all of them are in every problem.
+        """(T, J, n + 2) keys of all variables of a joint in a frame: state, offset of the views,
+        offset of the body.
         """
         return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
 
@@ -205,26 +211,28 @@ class WindowGraph:
 
     @property
     def temporal(self) -> bool:
-        """Whether there is more than one frame: then joints have velocities and motion factors."""
+        """Whether there are several frames, so that joints have velocities and motion factors."""
         return len(self) > 1
 
     @property
     def partners(self) -> "list[WindowGraph]":
-        """Those of the window's people who come after this one: so each pair of people comes once."""
+        """The window's people after this one, so that each pair occurs once."""
         return self.people[next(n for n, each in enumerate(self.people) if each is self) + 1 :]
 
     def shared(self, other: "WindowGraph") -> tuple[Index, Index]:
-        """Rows (S,) of this person, and those of another, of the frames in which both are."""
+        """Rows (S,) of this person and of another in their common frames."""
         _, mine, theirs = np.intersect1d(self.frames, other.frames, assume_unique=True, return_indices=True)
         return mine, theirs
 
     def add(self, item: gtsam.NonlinearFactor | gtsam.Values, name: str = "") -> None:
-        """Append a factor of your own; it stays through all alternations. Or where variables of your own start.
+        """Add a user factor, which stays through all alternations, or initial values of user
+        variables.
 
-        A factor may be on `state_keys` of this person and of all others of the window (`people`), who are solved
-        together then, and on variables of your own that `Values` gave before. While one of its variables is not in
-        the problem, because neither views nor body nor motion place it, it is inactive, and `run` counts it under
-        the `name` of what made it. ValueError if it is on any other key, and for a start that is a joint's.
+        A factor may be on `state_keys` of this person and of all others of the window (`people`),
+        who are then solved jointly, and on user variables with initial values given before. It is
+        inactive while one of its variables is not in the problem, because neither views nor body
+        nor motion determine it, and `run` counts it under `name`, the function that created it.
+        Raises ValueError for any other key, and for initial values of a joint.
         """
         if isinstance(item, gtsam.Values):
             self._add_start(item)
@@ -256,7 +264,7 @@ class WindowGraph:
         self.ties.tie(nodes)
 
     def _add_start(self, start: gtsam.Values) -> None:
-        """Where variables of the user's own start; one that has a start keeps it."""
+        """Add initial values of user variables; existing ones are kept."""
         new = gtsam.Values(start)
         for key in start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             if any(key in person._own for person in self.people):
@@ -266,7 +274,7 @@ class WindowGraph:
         self.ties.start.insert(new)
 
     def _holder(self, key: int) -> Ties | None:
-        """The ties that a variable of the user's own is in."""
+        """The coupling that contains a user variable."""
         return next((each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None)
 
     @cached_property
@@ -275,13 +283,15 @@ class WindowGraph:
 
     @property
     def coupled(self) -> list[frozenset[int]]:
-        """The person's joints that factors of your own tie to each other: sets of two or more, without overlap."""
+        """Disjoint sets of two or more joints of the person coupled by user factors."""
         mine = [frozenset(joint for track, joint in part if track == self.track) for part in self.ties.parts]
         return [each for each in mine if len(each) > 1]
 
     @property
     def with_offsets(self) -> Mask:
-        """(J,) joints with a factor of your own, in a window of several frames: solved with offsets throughout."""
+        """(J,) joints with a user factor, in a window of several frames: always solved with
+        offsets.
+        """
         return self.touched if self.temporal else np.zeros_like(self.touched)
 
     def solve(
@@ -293,7 +303,9 @@ class WindowGraph:
         lost: Mask | None = None,
         feet: Index | None = None,
     ) -> Array:
-        """`prepare` and `optimise`, of a person who is alone; returns joints (T, J, 3), metres."""
+        """`prepare` and `optimise` for a person without coupling; returns joints (T, J,
+        3), metres.
+        """
         self.prepare(inlier, views, body, initial, lost, feet)
         self.optimise()
         return self.positions
@@ -307,15 +319,14 @@ class WindowGraph:
         lost: Mask | None = None,
         feet: Index | None = None,
     ) -> None:
-        """Make the problem of this person's joints, from `initial` (T, J, 3) metres on.
+        """Build the problem of this person's joints, starting at `initial` (T, J, 3) metres.
 
-        `inlier` (T, J, V) are the observations that count (delta_ij of Eq. 2), `views` what they say together at
-        `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem and stays NaN; in
-        a window of several frames that goes for all frames of the joint. `lost` (T, J): where joints are hardly
-        seen. `feet` (F,): joints that may stand (`contact.walking`).
-
-        In a window of several frames each joint is solved by itself first (`joint_chains`), without factors of
-        your own, and GTSAM starts there.
+        `inlier` (T, J, V) are the used observations (delta_ij of Eq. 2), `views` their estimates at
+        `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem
+        and stays NaN; in a window of several frames this applies to all frames of the joint. `lost`
+        (T, J): weakly observed joints. `feet` (F,): joints that may stand (`contact.walking`). In a
+        window of several frames each joint is first solved independently (`joint_chains`), without
+        user factors, and GTSAM starts there.
         """
         self.failure, self.chains = "", []
         self.present = np.asarray(np.isfinite(initial).all(axis=2))
@@ -343,10 +354,11 @@ class WindowGraph:
             self._add(self._moving(problem))
 
     def optimise(self) -> None:
-        """Minimise over the joints of this person and of all who are tied to them, who must be prepared, too.
+        """Minimise over the joints of this person and all coupled people, who must be prepared,
+        too.
 
-        GTSAM takes one last step, or as many as Levenberg-Marquardt needs. `graph` and `values` of all of them are
-        those of the whole problem then.
+        GTSAM takes a single step if that suffices, else Levenberg-Marquardt steps. `graph` and
+        `values` of all of them are then those of the whole problem.
         """
         ties, people = self.ties, self.ties.people
         graph, values = self.graph, self.values
@@ -384,7 +396,9 @@ class WindowGraph:
     def _problem(
         self, inlier: Mask, views: JointTargets, body: JointTargets, near: Array, lost: Mask | None
     ) -> Problem:
-        """What `solve` is asked; how far joints may turn goes by their speed `near` where they are."""
+        """The problem of `solve`; the noise of accelerations depends on speeds at the positions
+        `near`.
+        """
         of_views = of_body = self.present & self.with_offsets
         density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
         if self.temporal:
@@ -397,8 +411,8 @@ class WindowGraph:
                 of_body = self.present & (self.with_offsets | around)
                 of_views = self.present & (self.with_offsets | lost)
                 density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
-        # A lasting error is no outlier, and a weight multiplies the kernel's cost, too: in pixels the kernel is as
-        # wide as before either changed the sigma.
+        # A correlated error is not an outlier, and a weight also multiplies the kernel's cost: in
+        # pixels the kernel's width is as before either scaled the sigma.
         scale, weight, xy = np.sqrt(share / self.config.weight_2d), self.config.weight_shape, self._observations.xy
         lead = leads(self._observations, self._views) if self.temporal else np.zeros(inlier.shape)
         used = inlier & (self._sigmas_px > 0) & (self.present & ~of_views)[..., None]
@@ -416,7 +430,7 @@ class WindowGraph:
         )
 
     def _minimum(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-        """The solution from `values` on; RuntimeError where there is none."""
+        """The solution, starting at `values`; raises RuntimeError if there is none."""
         if len(self.ties.factors) > 0:
             chains = all(len(part) == 1 for part in self.ties.parts) and len(self.ties.people) == 1
             over_time = any(person.temporal for person in self.ties.people)
@@ -429,14 +443,14 @@ class WindowGraph:
         return descend(graph, values, ordering, self.config, over_time=self.temporal) if found is None else found
 
     def _ordering(self) -> gtsam.Ordering:
-        """Joint by joint, each from frame to frame: what is eliminated so fills nothing in."""
+        """Elimination by joint, then frame, which causes no fill-in."""
         return gtsam.Ordering(self.states.swapaxes(0, 1)[self._there.swapaxes(0, 1)].tolist())
 
     def _add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         deque(map(self.graph.add, factors), maxlen=0)
 
     def _seen(self, seen: Projections) -> Sequence[gtsam.NonlinearFactor]:
-        """The observations that count and are of the time of a state."""
+        """Projection factors of used observations exposed at the frame's time."""
         frame, joint, view = chosen = np.nonzero(seen.used & (seen.lead_s == 0.0))
         return projection_factors(
             self._cameras,
@@ -448,7 +462,7 @@ class WindowGraph:
         )
 
     def _seen_between(self, seen: Projections, states: Array) -> list[gtsam.NonlinearFactor]:
-        """Those of other times, linear around `states` (T, J, S, 3): all of a joint and frame are one factor."""
+        """Factors of the others, linearised at `states` (T, J, S, 3): one per joint and frame."""
         used = seen.used & (seen.lead_s != 0.0)
         position, velocity = np.nan_to_num(states[:, :, 0]), np.nan_to_num(states[:, :, 1])
         moved = position[:, :, None] + seen.lead_s[..., None] * velocity[:, :, None]
@@ -461,21 +475,21 @@ class WindowGraph:
         )  # fmt: skip
 
     def _pulled(self, pulls: JointTargets) -> list[gtsam.NonlinearFactor]:
-        """The body's pull on joints."""
+        """Body prior factors on joints."""
         known = pulls.known
         covariances = np.linalg.inv(pulls.information[known])
         symmetric = (covariances + covariances.swapaxes(1, 2)) / 2
         return list(body_prior_factors(self.keys[known], pulls.xyz[known], symmetric))
 
     def _lasting(self, said: Said, source: int) -> list[gtsam.NonlinearFactor]:
-        """What is said of joints with an offset each that decays slowly."""
+        """Factors of estimates with correlated errors, with a slowly decaying offset each."""
         if not said.where.any():
             return []
         known, keys = said.message.known & said.where, self._offset_keys[source]
         roots = symmetric_root(said.message.information[known] / said.scale)
         xyz, share = said.message.xyz[known], said.errors.white_share
         factors = lasting_prior_factors(self.keys[known], keys[known], xyz, roots, share)
-        # An offset in every frame between two, so that a joint's states are a chain.
+        # An offset in every frame of the span, so that a joint's states are a chain.
         chain = spanned(said.where)
         for joint in np.flatnonzero(chain.any(axis=0)).tolist():
             there = chain[:, joint]
@@ -483,7 +497,7 @@ class WindowGraph:
         return factors
 
     def _moving(self, problem: Problem) -> list[gtsam.NonlinearFactor]:
-        """Motion of the joints that are in the problem, and feet that stand."""
+        """Motion factors of the joints in the problem, and factors of standing feet."""
         factors = list[gtsam.NonlinearFactor]()
         unknown = [diagonal(np.full(3, sigma)) for sigma in problem.law.start]
         for joint in np.flatnonzero(self.present[0]).tolist():
@@ -496,7 +510,7 @@ class WindowGraph:
         return factors + standing_factors(before, after, np.diff(self.times_s)[step], held)
 
     def _start(self, states: Array) -> None:
-        """Make `values` of `states` (T, J, S, 3), NaN where there are none."""
+        """Set `values` from `states` (T, J, S, 3), NaN where absent."""
         self._there = np.isfinite(states[..., 0])
         self.values = gtsam.Values()
         deque(map(self.values.insert, self.states[self._there].tolist(), states[self._there]), maxlen=0)
@@ -511,7 +525,7 @@ class WindowGraph:
             for into, keys in kinds:
                 into[self.present] = [self.values.atPoint3(key) for key in keys[self.present].tolist()]
             return positions, speeds
-        # Values are sorted as keys are: by kind, joint, then frame.
+        # Values are sorted by key: kind, joint, frame.
         points, count = gtsam.utilities.extractPoint3(self.values), int(self.present.sum())
         for n, (into, _) in enumerate(kinds):
             into.swapaxes(0, 1)[self.present.T] = points[n * count : (n + 1) * count]
@@ -519,14 +533,15 @@ class WindowGraph:
 
 
 FactorFunction = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor | gtsam.Values]]
-"""Your own factors for a person's window, made from its keys (T, J), and from those of `window.people`."""
+"""Function that makes your own factors for a person's window, from its keys (T, J) and those of
+`window.people`."""
 ExtraFactors = FactorFunction | Sequence[FactorFunction]
-"""One such function or several."""
+"""One function for user factors, or several."""
 
 
 def add_factors(people: Sequence[WindowGraph], functions: Sequence[FactorFunction]) -> None:
-    """Add the factors of the user's functions to the people of a window, who are those of one frame each where all
-    have a single frame.
+    """Add the factors of user functions to the people of a window; if all have a single frame, to
+    those of each frame.
     """
     alone = all(len(person) == 1 for person in people)
     together: dict[int, list[WindowGraph]] = {}
@@ -541,20 +556,20 @@ def add_factors(people: Sequence[WindowGraph], functions: Sequence[FactorFunctio
 
 
 def functions_of(given: ExtraFactors | None) -> tuple[FactorFunction, ...]:
-    """One function of the user's, several, or none, as several."""
+    """User functions as a tuple."""
     if given is None:
         return ()
     return (given,) if callable(given) else tuple(given)
 
 
 def name_of(function: FactorFunction) -> str:
-    """What a function of the user's is called."""
+    """Name of a user function."""
     inner = getattr(function, "func", function)  # of functools.partial
     return str(getattr(inner, "__name__", type(inner).__name__))
 
 
 def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
-    """Name the joint that a singular system leaves open."""
+    """Description of the joint that a singular system leaves undetermined."""
     key = undetermined_key(error)
     if key is None or all(key not in set(person.states.ravel().tolist()) for person in people):
         return ""
@@ -564,7 +579,7 @@ def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
 
 
 def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
-    """GTSAM's cameras: V of them, or T V where they move, row by row."""
+    """GTSAM cameras: V of them, or T V by row if they move."""
     last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*views.cTw.shape[:-2], 1, 4))
     wTc = np.linalg.inv(np.concatenate([views.cTw, last], axis=-2))
     shape = np.broadcast_shapes(views.K.shape[:-2], wTc.shape[:-2])

@@ -1,4 +1,4 @@
-"""A solved window: everybody's joints, covariances and bodies, and one graph a person that says all of it."""
+"""A solved window: joints, covariances and bodies, and a graph of each person."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -25,61 +25,61 @@ from shapepose_fg.estimation.out_of_step import carried_to_frames
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 LEAST_M = 1e-4
-"""Where the solver's graph leaves a joint no less certain than it is reported, its error is taken to be this much
-larger, metres."""
+"""Minimum additional standard deviation of the reported joint relative to the solver's graph,
+metres, where the report is not less certain."""
 _OF_SOLUTION = 2
-"""Source of the offset of the whole solution, for keys."""
+"""Number of the source of the whole solution's offset, for keys."""
 
 
 @dataclass(frozen=True)
 class WindowSolution(Rows):
-    """N rows of a window after stage II, in the order of the observations."""
+    """Results of stage II for N rows of a window, in the order of the observations."""
 
     observations: Observations
-    """Who, when, and from which detections, as they were assigned last."""
+    """Track, frame and final detections of each row."""
     joints: Array
-    """(N, J, 3) X, metres in the world; NaN where unknown."""
+    """(N, J, 3) X, metres in the world; NaN if unknown."""
     covariance: Array
-    """(N, J, 3, 3) covariance of each joint, m², errors that last in it; NaN where unknown."""
+    """(N, J, 3, 3) covariance of each joint, including correlated errors, m²; NaN if unknown."""
     velocity: Array
-    """(N, J, 3) m/s; NaN where unknown, and in rows that stand alone."""
+    """(N, J, 3) velocities, m/s; NaN if unknown, and for single frames."""
     velocity_covariance: Array
-    """(N, J, 3, 3) m²/s²; NaN where the velocity is."""
+    """(N, J, 3, 3) covariance of the velocity, m²/s²; NaN like the velocity."""
     confidence: Array
-    """(N, J) w_i of Eq. 4, mean confidence over all views of the observations that were kept."""
+    """(N, J) w_i of Eq. 4, mean confidence over all views of the used observations."""
     inlier: Mask
-    """(N, J, V) delta_ij of Eq. 2: which observations were kept."""
+    """(N, J, V) delta_ij of Eq. 2: the used observations."""
     contradicts: Mask
-    """(N, J) joints whose views the body contradicts."""
+    """(N, J) joints with views that contradict the body."""
     residual_px: Array
-    """(N, J, V, 2) projection of the joint minus observation; NaN where unseen or unknown."""
+    """(N, J, V, 2) projection of the joint minus observation; NaN if unseen or unknown."""
     known: NDArray[np.uint8]
-    """(N, J) a `Known` each."""
+    """(N, J) code of `Known` for each joint."""
     fit: BodyFit
     """Theta: the bodies, N rows."""
     status: NDArray[np.str_]
-    """(N,) a `Status` each."""
+    """(N,) `Status` of each row."""
     problems: tuple[Problem, ...] = ()
-    """What went wrong, joint by joint; rows of these have the status `not solved`."""
+    """Problems by joint; rows with one have the status `not solved`."""
     people: "tuple[PersonGraph, ...]" = ()
-    """Everybody's graph; none where some rows were taken."""
+    """Graphs of the people; empty after selecting rows."""
     factors: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """How many factors each function of the user's made, and how many of them were inactive at the end, because a
-    joint had no place."""
+    """Number of factors by user function, and how many of them were inactive at the end, because a
+    joint had no position."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """What it took, by stage."""
+    """Computing time by stage, s."""
 
     def rows(self, index: Index) -> "WindowSolution":
-        """Some of the rows, without graphs: plain data, which can be sent to another process."""
+        """Some of the rows, without graphs: plain data that can be sent to another process."""
         place = {row: n for n, row in enumerate(index.tolist())}
         problems = tuple(replace(each, row=place[each.row]) for each in self.problems if each.row in place)
         observations = self.observations.rows(index)
         return replace(super().rows(index), observations=observations, problems=problems, people=())
 
     def result(self, place: Whole, rig: Rig, joint_names: Sequence[str]) -> Reconstruction:
-        """The rows as those of a result; bodies that were not fitted are NaN there.
+        """The rows as those of a result, with NaN for bodies that were not fitted.
 
-        `place` (N, J, V) is each detection's place among those of its view in the recording.
+        `place` (N, J, V) is the index of each detection among those of its view in the recording.
         """
         rows = self.observations
         body = {name: getattr(self.fit, name).copy() for name in BODY}
@@ -103,36 +103,37 @@ class WindowSolution(Rows):
 
 @dataclass(frozen=True)
 class PersonGraph:
-    """One person in T frames, solved.
+    """Solved graph of one person in T frames.
 
-    The graph that is solved holds the share of all errors that is new in every frame. `graph` holds all of it:
-    beside each position of the solver's graph there is a reported one, which differs by what was found after
-    solving, with an error that lasts. Its marginal covariances, of `keys`, are the reported ones, and its values
-    the reported joints.
+    The solver's graph has only the white share of all errors. `graph` has all of it: besides each
+    position of the solver's graph there is a reported one, which differs by corrections after
+    solving, with a correlated error. Its marginal covariances, for `keys`, are the reported ones,
+    and its values the reported joints.
     """
 
     window: WindowGraph
-    """What the solver solved."""
+    """The solver's problem."""
     joints: Array
-    """(T, J, 3) where the joints are reported, metres in the world; NaN where unknown."""
+    """(T, J, 3) reported joints, metres in the world; NaN if unknown."""
     covariance: Array
-    """(T, J, 3, 3) as it is reported, m²; NaN where unknown."""
+    """(T, J, 3, 3) reported covariance, m²; NaN if unknown."""
     bodies: BodyFit
     """The bodies, T rows."""
     solved: Array
-    """(T, J, 3) where the solver has the joints, metres."""
+    """(T, J, 3) joints of the solver, metres."""
     solved_covariance: Array
-    """(T, J, 3, 3) covariance of `solved`: marginals of its graph, m²."""
+    """(T, J, 3, 3) covariance of `solved`: marginals of the solver's graph, m²."""
     lasting: Lasting
-    """How the error goes on that is in the report and not in the solver's graph."""
+    """Temporal correlation of the error that is in the report but not in the solver's graph."""
     body: JointTargets
-    """(T, J) what the body says of each joint without the joint's own views; nothing where it does not pull."""
+    """(T, J) constraints from the body without each joint's own views; none where it is
+    not used."""
     together: "list[PersonGraph]" = field(default_factory=list, repr=False)
-    """The people whom factors of your own tie to this one, and this one (`tied`); none where nobody is."""
+    """People coupled by user factors, including this one (`tied`); empty if none."""
 
     @property
     def person(self) -> int:
-        """Who it is: the person number in all keys."""
+        """Person number, as in all keys."""
         return self.window.track
 
     @property
@@ -142,13 +143,13 @@ class PersonGraph:
 
     @property
     def rows(self) -> Index:
-        """(T,) rows of the solution, frames rising."""
+        """(T,) rows of the solution, ascending frames."""
         return self.window.rows
 
     @property
     def keys(self) -> NDArray[np.int64]:
-        """(T, J) keys of the reported positions, `Point3`, metres; those of joints that are unknown (NaN) are not
-        in the graph.
+        """(T, J) keys of the reported positions, `Point3`, metres; unknown joints (NaN) are not in
+        the graph.
         """
         return reported_keys(self.person, np.arange(self.joints.shape[1]), self.frames[:, None])
 
@@ -159,9 +160,9 @@ class PersonGraph:
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All factors: projections, bodies, motion, your own, and the errors that last. Joint by joint it is a
-        chain over time, unless factors of your own tie joints. People whom they tie (`together`) are one graph,
-        with the keys of all of them.
+        """All factors: projections, bodies, motion, user factors, and the correlated errors. It is
+        a chain over time for each joint, unless user factors couple joints. Coupled people
+        (`together`) are one graph, with the keys of all of them.
         """
         graph = gtsam.NonlinearFactorGraph(self.window.graph)
         for person in self.together or [self]:
@@ -170,7 +171,7 @@ class PersonGraph:
         return graph
 
     def _differences(self) -> list[gtsam.NonlinearFactor]:
-        """What the reported positions differ by from the solver's, with an error that lasts."""
+        """Factors between the reported positions and the solver's, with a correlated error."""
         reported, offsets, known = self.keys, self._offset_keys, self._known
         factors = lasting_difference_factors(
             reported[known],
@@ -189,7 +190,9 @@ class PersonGraph:
 
     @cached_property
     def values(self) -> gtsam.Values:
-        """The solution: the solver's variables, the reported positions, and their offsets, which are 0."""
+        """The solution: the solver's variables, the reported positions, and their offsets, which
+        are 0.
+        """
         values, zero = gtsam.Values(self.window.values), np.zeros(3)
         for person in self.together or [self]:
             known = person._known
@@ -200,8 +203,8 @@ class PersonGraph:
         return values
 
     def not_determined(self, error: RuntimeError, joint_names: list[str]) -> NotDetermined | None:
-        """What GTSAM's `error` is about, where this graph, or one that it was added to, has no solution: which
-        joint, when, and what is missing. None where it is about something else.
+        """The joint, time and missing evidence for GTSAM's `error`, if this graph, or one that
+        includes it, has no solution. None if the error concerns another variable.
         """
         key = undetermined_key(error)
         keys = np.concatenate([self.window.states, self.keys[..., None], self._offset_keys[..., None]], axis=-1)
@@ -221,7 +224,7 @@ class PersonGraph:
 
     @property
     def _known(self) -> Mask:
-        """(T, J) joints that are reported, and how surely."""
+        """(T, J) joints that are reported with covariance."""
         finite = np.isfinite(self.covariance).all(axis=(2, 3)) & np.isfinite(self.solved_covariance).all(
             axis=(2, 3)
         )
@@ -229,13 +232,13 @@ class PersonGraph:
 
     @property
     def _more(self) -> Array:
-        """(T, J, 3, 3) what the reported covariances are larger by, m²: positive definite."""
+        """(T, J, 3, 3) reported minus solver's covariance, m²: positive definite."""
         more = np.where(self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3))
         return raise_eigenvalues(more, LEAST_M**2)
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
-    """Return the people, each with the others to whom factors of the user's own tie them."""
+    """Return the people, each with those coupled to it by user factors."""
     together, found = dict[int, list[PersonGraph]](), list[PersonGraph]()
     for person in people:
         group = together.setdefault(id(person.window.ties), [])

@@ -1,4 +1,6 @@
-"""Is a camera off with whatever it sees? Residuals against the other views, before and after a pose gives way."""
+"""Detects a camera with a wrong pose: residuals against the other views, before and after a change
+of its pose.
+"""
 
 from dataclasses import dataclass
 
@@ -11,58 +13,61 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.linearisation import ObservationConfig, inverses
 
 _REST_M = 0.05
-"""What body and motion say of a joint, about, one sigma per axis."""
+"""Approximate standard deviation of a joint by body and motion, per axis, m."""
 _MOST = 36.0
-"""Squared distances count up to 6 sigmas: some detections are somebody else's."""
+"""Upper limit of squared distances, 6 sigmas: some detections are other people's."""
 _WIDTH, _ROUNDS = 3.0, 12
-"""Width of Cauchy's kernel, in sigmas, and rounds of reweighting in which a pose gives way."""
+"""Width of Cauchy's kernel, in sigmas, and number of reweighting rounds for a pose."""
 _TURN_RAD, _SHIFT_M = np.radians(5.0), 0.5
-"""How far a camera may have come off, one sigma per axis."""
+"""Prior standard deviations of a camera's pose change per axis, rad and m."""
 _TOGETHER = 50.0
-"""Number of detections that tell as much as one: errors last from frame to frame and go through a whole person."""
+"""Number of detections that count as one: errors are correlated over frames and over a person."""
 _LEAST = 30
-"""Detections by which a camera is judged."""
+"""Minimum number of detections of a tested camera."""
 _BETTER = 1.2
-"""The mean squared distance falls by this factor, at the least, where a camera is wrong: by 1.4 and more in 32
-set-ups with a camera turned by 0.7 to 3 degrees or moved by 8 to 30 cm, by 1.03 in sound ones (simulated)."""
+"""Minimum factor by which the mean squared distance falls for a wrong camera: 1.4 and more in 32
+set-ups with a camera rotated by 0.7 to 3 degrees or moved by 8 to 30 cm, 1.03 in correct ones
+(simulated)."""
 
 
 @dataclass(frozen=True)
 class WrongView:
-    """A view whose pose does not fit what the others see."""
+    """A view with a pose that does not fit the others."""
 
     view: int
-    """Which."""
+    """Index of the view."""
     turn_deg: tuple[float, float]
-    """How far turning it would make it fit, and the sigma of that."""
+    """Rotation that would make it fit, and its standard deviation, degrees."""
     shift_m: tuple[float, float]
-    """How far moving it, together with that turn, and the sigma of that."""
+    """Translation that, with this rotation, would make it fit, and its standard
+    deviation, metres."""
     before: float
-    """Mean squared distance of its detections from what the others say, in sigmas, up to 36; 2 is usual."""
+    """Mean squared distance of its detections from the other views' prediction, in variances, up to
+    36; 2 is usual."""
     after: float
-    """Mean squared distance if its pose gave way."""
+    """Mean squared distance after the change of its pose."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """All detections of N rows, and the joints as they are."""
+    """All detections of N rows, relative to the current joints."""
 
     residual_px: Array
-    """(N, J, V, 2) projected joint minus detection; anything where there is none."""
+    """(N, J, V, 2) projected joint minus detection, pixels; arbitrary without a detection."""
     sigmas_px: Array
-    """(N, J, V)"""
+    """(N, J, V) standard deviations, pixels."""
     there: Mask
-    """(N, J, V) whether there is a detection of a placed joint."""
+    """(N, J, V) whether there is a detection of a joint with a position."""
     used: Mask
-    """(N, J, V) which are part of the solution."""
+    """(N, J, V) mask of the used detections."""
 
 
 def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfig) -> WrongView | None:
-    """The view whose pose, let go, makes all views agree best on `joints` (N, J, 3); None where none does so by
-    much.
+    """The view with the pose change that best makes all views agree on `joints` (N, J, 3); None if
+    no change is significant.
 
-    Each detection is compared with the joint as it is without that view, and each view's pose gets one
-    Gauss-Newton step from there, robust by iterated reweighting. Then all joints are solved once more, linearly,
+    Each detection is compared with the joint predicted without that view, and each view's pose is
+    changed by Gauss-Newton with iterative reweighting. Then all joints are solved again, linearly,
     with that pose.
     """
     points = np.nan_to_num(joints)
@@ -82,7 +87,7 @@ def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfi
     root = np.linalg.inv(np.linalg.cholesky(spread))
 
     def whitened(residual: Array) -> Array:
-        """(N, J, V, 2) residuals from where the other views have the joint, in sigmas."""
+        """(N, J, V, 2) residuals from the other views' prediction, in sigmas."""
         pull = np.einsum("njv,njvki,njvk->njvi", weight, slope, residual)
         away = residual + np.einsum("njvki,njvil,njvl->njvk", slope, without, pull)
         return np.einsum("njvik,njvk->njvi", root, away)
@@ -115,7 +120,9 @@ def _cost(off: Array, there: Mask) -> float:
 
 
 def _slope_of_pose(points: Array, slope: Array, views: Views, view: int) -> Array:
-    """(N, J, 2, 6) how pixels go with a turn, radians, and a shift, metres, of the world before a camera."""
+    """(N, J, 2, 6) derivatives of pixels by a rotation, radians, and a translation, metres, of the
+    world in the camera.
+    """
     cTw = views.cTw[..., view, :, :]
     R, t = cTw[..., :3], cTw[..., 3]
     before = points @ R.mT + (t[:, None] if cTw.ndim == 3 else t)
@@ -124,7 +131,9 @@ def _slope_of_pose(points: Array, slope: Array, views: Views, view: int) -> Arra
 
 
 def _pose_step(slope: Array, off: Array, there: Mask) -> tuple[Array, Array]:
-    """(6,) the turn and shift that take most of `off` away, whitened, and their covariance (6, 6)."""
+    """(6,) rotation and translation that best reduce the whitened `off`, and their covariance (6,
+    6).
+    """
     slope, off = slope[there], off[there]
     prior = np.diag([_TURN_RAD**-2.0] * 3 + [_SHIFT_M**-2.0] * 3)
     step, normal = np.zeros(6), prior

@@ -117,7 +117,7 @@ CORRECT_M = 0.2
 """Largest distance of a correct joint from the true one, m (the protocol of Zhang et al.)."""
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
-"""Levels at which `covariance_calibration` counts the truths inside the ellipsoid."""
+"""Probabilities for which `covariance_calibration` computes the coverage of the ellipsoids."""
 _LEAST_LOG_SCORE = -50.0
 """Minimum log score of a joint in the mean, reached at an error of ten sigma, so that a single
 exchanged limb does not dominate the mean."""

@@ -180,10 +180,10 @@ def shelf_joints(body25: Array) -> Array:
     """Map BODY_25 joints (N, 25, 3), metres, z up, to Shelf's (N, 15, 3); NaN stays NaN.
 
     The hips, limbs and MidHip are the joints of the same name. With s and e the midpoints of
-    shoulders and ears, Neck is s + 0.5 (e - s) and HeadTop is Neck + 0.125 f + 0.145 z, f the unit
-    vector of (neck - midhip) x (RShoulder - LShoulder). The mapping is fixed: tuning it on the
-    annotation would overfit. If one ear is unknown, e is the other ear projected on the plane
-    halfway between the shoulders, in which the midpoint of two mirrored ears lies.
+    shoulders and ears, Neck is s + 0.5 (e - s) and HeadTop is Neck + 0.125 f + 0.145 z, metres,
+    with f the unit vector of (neck - midhip) x (RShoulder - LShoulder). The mapping is fixed:
+    tuning it on the annotation would overfit. If one ear is unknown, e is the other ear projected
+    on the plane halfway between the shoulders, in which the midpoint of two mirrored ears lies.
     """
     body25 = np.asarray(body25, dtype=np.float64)
     if body25.ndim != 3 or body25.shape[1:] != (25, 3):

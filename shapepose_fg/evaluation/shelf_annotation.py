@@ -52,7 +52,9 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
 
 
 class _Lines:
-    """The lines of a text file that are not blank, one after the other, with the current position."""
+    """Iterates over the non-blank lines of a text file, and tracks the current position for error
+    messages.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -85,7 +85,7 @@ class Moment:
 
     @property
     def named(self) -> Mask:
-        """(A,) which tracks have an identity."""
+        """(A,) mask of the tracks that have an identity."""
         return self.identity != ON_TRIAL
 
     def rows(self, index: NDArray) -> "Moment":

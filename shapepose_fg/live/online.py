@@ -82,9 +82,10 @@ class LiveReport:
     frames: int
     """Number of frames that were processed."""
     late: int
-    """Number of these frames that came after a later one."""
+    """Number of processed frames that arrived after a later frame."""
     dropped: int
-    """Number of frames, or detections of one camera, that were left out because they came too late, or twice."""
+    """Number of frames, or detections of one camera, that were left out because they arrived too late
+    or twice."""
     unrefined: int
     """Number of frames that were settled without refinement, because solving did not keep up."""
     not_taken: int

@@ -42,7 +42,7 @@ and affinity."""
 _LEAST_VARIANCE = 1e-12
 """Minimum variance of a position in any direction, m²: smaller ones have no finite inverse."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
-"""Names of the counts of a state."""
+"""Names of the counters in a saved state."""
 _COLUMNS = {
     "slots": Column("T 8", _WHOLE),
     "times": Column("T 2"),

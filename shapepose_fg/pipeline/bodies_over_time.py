@@ -22,39 +22,38 @@ from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.pipeline.keyframes import bodies_between, spaced
 
 SEGMENT_ROWS = 4000
-"""Maximum number of a person's rows that are fitted together. The shape of a longer track is fitted to this
-many of its rows, in pieces spread evenly over it; poses are then fitted with that shape, segment by segment.
-Neither memory nor the time per row grows with the recording."""
+"""Maximum number of a person's rows fitted together. For a longer track, the shape is fitted to
+this many rows in pieces spread evenly over it; poses are then fitted with that shape, segment by
+segment, so that neither memory nor the time per row grows with the recording."""
 PIECE_ROWS = 160
-"""Rows of such a piece: some seconds, so that poses are linked in time there, too."""
+"""Rows of such a piece: some seconds, so that poses within it are linked in time."""
 _OVERLAP_ROWS = 32
 """Rows that a segment shares with its neighbours, on either side, when poses are fitted."""
 
 
 @dataclass(frozen=True)
 class Person:
-    """The data that one person's bodies are fitted to, N rows; plain data, which can be sent to another
-    process.
+    """Data for fitting one person's bodies, N rows; plain data that can be sent to
+    another process.
     """
 
     number: int
     """Number of the person."""
     targets: JointTargets
-    """The joints as they were solved."""
+    """Solved joints as targets of the fit."""
     time_s: Array
-    """(N,) seconds."""
+    """(N,) times, seconds."""
     shapes: Shapes | None = None
     """The known shape, one row; None where none is known."""
     fixed_shapes: bool = False
     """Whether the shape is kept fixed."""
     kept: range | None = None
-    """The rows whose bodies are returned, None for all. Others overlap with neighbouring segments, or
-    contribute to the shape only."""
+    """The rows for which bodies are returned, None for all. Others overlap with neighbouring
+    segments, or contribute to the shape only."""
     floor: Floor | None = None
-    """Floor that bodies do not sink into; None where none was found."""
+    """Floor that bodies must not sink into; None for none."""
     keyframe_s: float = 0.0
-    """Maximum time between the rows that bodies are fitted to, s, with poses interpolated between them; 0:
-    every row."""
+    """Maximum time between fitted rows, s, with poses interpolated between them; 0: every row."""
 
     @classmethod
     def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
@@ -62,8 +61,9 @@ class Person:
         return cls(number, JointTargets.solved(joints, covariance), time_s)
 
     def fitted(self, fitter: BodyFitter) -> dict[str, NDArray[Any]]:
-        """Fit the bodies; returns arrays: `ok` (N,) which rows have one, `betas` to `transl` as in
-        `Reconstruction`; and the common shape, `mean` (1, 10) and `information` (1, 10, 10), from all rows.
+        """Fit the bodies; returns arrays: `ok` (N,) rows with a body, `betas` to `transl` as in
+        `Reconstruction`; and the common shape, `mean` (1, 10) and `information` (1, 10, 10), from
+        all rows.
         """
         rows = np.flatnonzero(spaced(self.time_s, self.keyframe_s))
         targets, time_s, group = self.targets.rows(rows), self.time_s[rows], np.full(len(rows), self.number)
@@ -99,17 +99,17 @@ class BodiesOverTime:
     kept: KeptArrays
     """Storage of the segments."""
     places: Mapping[int, Mapping[str, range]]
-    """For each person the names of the stored segments, and the range of the person's own rows in each, in
-    order."""
+    """For each person the names of the stored segments, and the range of the person's rows in each,
+    in order."""
     shapes: SubjectShapes
-    """The shapes of all people; recognised people have their known names."""
+    """The shapes of all people; recognised people keep their known names."""
 
     def filled(self, column: str, values: NDArray[Any], person: Whole, before: Mapping[int, int]) -> NDArray[Any]:
-        """Rows of a column of a result with these bodies, where there are any; `status` becomes that of a row with
-        a body.
+        """Rows of a column of a result with these bodies, where available; `status` changes to that
+        of a row with a body.
 
-        `values` (R, ...) are the rows as they were, `person` (R,) their people, and `before` the number of rows of
-        each person in front of them. Other columns stay as they are.
+        `values` (R, ...) are the rows before, `person` (R,) their people, and `before` the number
+        of preceding rows of each person. Other columns are unchanged.
         """
         if column not in (*BODY, "status"):
             return values
@@ -144,19 +144,21 @@ def fit_everybody(
     known: SubjectShapes,
     lengths: tuple[int, int] = (SEGMENT_ROWS, PIECE_ROWS),
 ) -> BodiesOverTime:
-    """Fit one body per person to the joints as they were solved; stored segments are not fitted again.
+    """Fit one body per person to the solved joints; stored segments are not fitted again.
 
-    `counts` is the number of rows per person; `person` returns the data of a person in some of these rows, one
-    range after the other, and `fits` fits several people, in parallel if it can. `known` are people from other
-    recordings: a person who is recognised by shape (`recognise`) is fitted again with the known shape as the
-    prior. `lengths` are the rows of a segment and of a piece.
+    `counts` is the number of rows per person; `person` returns the data of a person in some of
+    these rows, as ranges in order, and `fits` fits several people, in parallel if possible. `known`
+    are people from other recordings: a person who is recognised by shape (`recognise`) is fitted
+    again with the known shape as the prior. `lengths` are the rows of a segment and of a piece.
     """
     most, piece = lengths
     long = [number for number, count in counts.items() if count > most]
     places: dict[int, dict[str, range]] = {}
 
     def fit(jobs: Mapping[str, tuple[int, Callable[[], Person]]]) -> None:
-        """Fit what is not stored yet under these names: the number of rows, and their data."""
+        """Fit the jobs that are not stored yet, by name: number of rows, and function for their
+        data.
+        """
         there = set(kept.names(""))
         for name in jobs.keys() & there:
             bodies = kept.columns(name, _BODIES, {"N": jobs[name][0]})
@@ -167,14 +169,14 @@ def fit_everybody(
             kept.keep(name, bodies)
 
     def whole(number: int, prior: Shapes | None) -> Person:
-        """The data that the shape is fitted to, and the bodies where the track is short."""
+        """Data for fitting the shape, and for short tracks the bodies."""
         if number in long:
             rows = person(number, _spread(counts[number], most, piece))
             return replace(rows, shapes=prior, kept=range(0))
         return replace(person(number, [range(counts[number])]), shapes=prior)
 
     def found(kind: str, prior: Mapping[int, Shapes | None]) -> dict[int, Shapes]:
-        """Shapes of some people, and their bodies where the track is short."""
+        """Shapes of some people, and for short tracks their bodies."""
         names = {number: f"{kind}-{number}" for number in prior}
         rows = {number: 0 if number in long else counts[number] for number in names}
         fit({name: (rows[number], partial(whole, number, prior[number])) for number, name in names.items()})
@@ -226,10 +228,12 @@ def with_bodies_over_time(
     floor: Floor | None = None,
     keyframe_s: float = 0.0,
 ) -> Reconstruction:
-    """Return the rows with one body per person, fitted to the joints as they were solved, and each person's shape.
+    """Return the rows with one body per person, fitted to the solved joints, and each person's
+    shape.
 
-    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Joints and their covariances do not change.
-    Rows that get no body keep the body that they had. `shapes` of the result are those of all people.
+    `known`: see `fit_everybody`; `floor`, `keyframe_s`: see `Person`. Joints and their covariances
+    do not change. Rows without a new body keep their previous one. `shapes` of the result are those
+    of all people.
     """
     if len(people) == 0:
         return people

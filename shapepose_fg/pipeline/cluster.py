@@ -20,11 +20,11 @@ from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, pac
 Shared = TypeVar("Shared")
 
 RETRIES = 2
-"""Number of times that an item is tried again after it failed or its process was lost."""
+"""Maximum number of retries of an item after it failed or its process was lost."""
 _LEAST = 2
-"""Minimum number of items under way, so that the next one does not wait for the last."""
+"""Minimum number of submitted items, so that processes do not wait for the next one."""
 _SECONDS = 10
-"""Time within which a cluster must answer, s."""
+"""Time limit for an answer of a cluster, s."""
 _ITSELF = "shapepose-fg itself"
 
 
@@ -32,20 +32,21 @@ _ITSELF = "shapepose-fg itself"
 def cluster(
     address: str | None, count: int, shared: Shared, ahead: int = 2, *, sharing: int = 1
 ) -> Iterator[Pool[Shared]]:
-    """The processes of a Dask cluster, each of which has `shared`: the counterpart of `workers` on many machines.
+    """The processes of a Dask cluster, each with `shared`: the counterpart of `workers` for many
+    machines.
 
-    The scheduler is at `address`, `tcp://host:8786`; None: one of `count` processes here, while the block runs.
-    `ahead` items a process are under way, for all runs that are `sharing` the cluster together; they wait in the
-    scheduler's memory. Results depend neither on the process nor on the number of processes; an item whose process
-    is lost is repeated by another. InputError where Dask is not installed; `WorkLost` where processes are lost too
-    often, or the scheduler is gone.
+    The scheduler is at `address`, `tcp://host:8786`; None: a temporary one with `count` processes
+    on this machine. `ahead` items per process are submitted in total by all runs `sharing` the
+    cluster; they wait in the scheduler's memory. Results depend neither on the process nor on the
+    number of processes; items of lost processes are repeated. Raises InputError if Dask is not
+    installed; `WorkLost` if processes are lost too often, or the scheduler is lost.
     """
     with ExitStack() as opened:
         at = opened.enter_context(local_cluster(count)).address if address is None else address
         client = opened.enter_context(_client(at))
         if address is not None:
             refuse_other_programs(client, at)
-        # A task, not data that was scattered: what is lost with a process can be made again.
+        # A task instead of scattered data, since it can be repeated after a process is lost.
         there = client.submit(cloudpickle.loads, packed(shared), pure=False)
         call = (one_item, tuple(this_program().items()), there)
         with _naming_lost_work():
@@ -53,14 +54,14 @@ def cluster(
 
 
 def pool_of(client: Any, call: tuple[Any, ...], ahead: float) -> Pool[Any]:
-    """A pool of a client's processes, of which each has `ahead` items ready, and all of them some."""
+    """A pool of a client's processes, with `ahead` submitted items each, and a minimum in total."""
     executor = client.get_executor(pure=False, retries=RETRIES)
     return Pool(executor, call, lambda: max(_LEAST, ahead * len(client.nthreads())))
 
 
 @contextmanager
 def _naming_lost_work() -> Iterator[None]:
-    """Raise `WorkLost` where the work that the block waits for is lost."""
+    """Raise `WorkLost` if work in the block is lost."""
     from distributed import KilledWorker
 
     try:
@@ -76,41 +77,44 @@ def _naming_lost_work() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Scheduler:
-    """A Dask scheduler that answers."""
+    """A responding Dask scheduler."""
 
     address: str
     """`tcp://host:8786`."""
     processes: int
-    """Number of its processes at present."""
+    """Current number of its processes."""
     dashboard: str | None
-    """Address of its dashboard; None where it has none."""
+    """Address of its dashboard; None if there is none."""
 
 
 @contextmanager
 def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]:
-    """`count` processes of this machine, out of reach of others, while the block runs.
+    """A cluster of `count` processes on this machine, inaccessible to others, for the duration of
+    the block.
 
-    InputError where Dask is not installed. With `dashboard`, and bokeh installed, the scheduler has one.
+    Raises InputError if Dask is not installed. With `dashboard`, and bokeh installed, the scheduler
+    has one.
     """
     _dask()
-    # Dask imports `__main__` in its processes, which not every notebook or script allows: that of ours does.
+    # Dask's processes import `__main__`, which fails for some notebooks and scripts: an own process
+    # leads them.
     with Processes(1, _nothing) as one, naming_lost_work():
         yield one.submit(_local_cluster, count, dashboard and has_dashboard()).result()
         one.submit(_end_local_cluster).result()
 
 
 _running: list[Any] = []
-"""The cluster of this machine, in the process that leads it."""
+"""The cluster of this machine, in its leading process."""
 
 
 def _local_cluster(count: int, dashboard: bool) -> Scheduler:
     import dask.config
     from distributed import LocalCluster
 
-    multiprocessing.set_start_method("spawn", force=True)  # that of loky's own processes is unknown to others
-    # One thread a process: GTSAM holds Python's lock, and Dask leaves linear algebra one by itself.
+    multiprocessing.set_start_method("spawn", force=True)  # loky's own start method is unknown to others
+    # One thread per process: GTSAM holds the GIL, and Dask gives linear algebra a single one.
     with dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # another port is taken where the dashboard's usual one is
+        warnings.simplefilter("ignore")  # the dashboard's usual port may be in use
         cluster = LocalCluster(
             n_workers=count,
             threads_per_worker=1,
@@ -128,7 +132,7 @@ def _end_local_cluster() -> None:
 
 
 def _nothing() -> None:
-    """Do nothing: the process that leads a cluster needs no preparation."""
+    """No-op initialiser for the process that leads a cluster."""
 
 
 def has_dashboard() -> bool:
@@ -137,7 +141,9 @@ def has_dashboard() -> bool:
 
 
 def look_at(address: str) -> Scheduler:
-    """The scheduler at an address; InputError where its processes do not have this version of the program."""
+    """The scheduler at an address. Raises InputError if its processes have another version of the
+    program.
+    """
     with _client(address) as client:
         refuse_other_programs(client, address)
         shown = "dashboard" in client.scheduler_info().get("services", {})
@@ -146,7 +152,7 @@ def look_at(address: str) -> Scheduler:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """A connection to the scheduler at an address, for large tasks such as bodies and minutes of recordings."""
+    """A connection to the scheduler at an address, configured for large tasks."""
     Client = _dask()
     import dask.config
 
@@ -163,7 +169,9 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def refuse_other_programs(client: Any, address: str) -> None:
-    """InputError where a process has another version of this program, or of a package that affects the numbers."""
+    """Raise InputError if a process has another version of this program, or of a package that
+    affects results.
+    """
     for process, theirs in client.run(this_program, on_error="return").items():
         if not isinstance(theirs, dict):
             raise InputError(
@@ -174,7 +182,7 @@ def refuse_other_programs(client: Any, address: str) -> None:
 
 
 def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> None:
-    """InputError where the program of a process has another version of anything than `own`."""
+    """Raise InputError if a process has other versions than `own`."""
     other = next((name for name in own if theirs.get(name) != own[name]), None)
     if other is not None:
         which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
@@ -186,12 +194,12 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
 
 @cache
 def this_program() -> dict[str, str]:
-    """Versions of everything that affects the numbers of this process."""
+    """Versions of everything that affects the results of this process."""
     return {**versions(), _ITSELF: program_digest()}
 
 
 def _dask() -> Any:
-    """Dask's client; InputError where it is not installed."""
+    """Dask's client class; raises InputError if it is not installed."""
     try:
         from distributed import Client
     except ImportError:
@@ -202,8 +210,8 @@ def _dask() -> Any:
 
 
 def one_item(program: tuple[tuple[str, str], ...], shared: Any, work: Callable[[Any, Any], Any], item: Any) -> Any:
-    """Process one item in a process of the cluster; InputError where its `program` differs from that of the
-    caller.
+    """Process one item in a process of the cluster. Raises InputError if its `program` differs from
+    the caller's.
 
     Processes may join at any time, after the others were checked.
     """

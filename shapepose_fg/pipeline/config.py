@@ -1,4 +1,6 @@
-"""The settings of the pipeline, and the paper's; constants of the steps stand beside the code that uses them."""
+"""Settings of the pipeline, and those of the paper; constants of the steps are next to
+their code.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal, TypeVar
@@ -24,8 +26,9 @@ class PeopleConfig(Settings):
     """Settings of the search for people, and of the time for which a person is tracked without detections."""
 
     gate_m: Metres = 0.07
-    """Largest reprojection error of a point of two views, as a length at its depth, m: over three times the 2
-    cm of a detector's error. Increase it where calibrations are worse than a pixel or two."""
+    """Largest reprojection error of a point of two views, as a length at its depth, m: over three
+    times the 2 cm of a detector's error. Increase it if calibration errors exceed a pixel or
+    two."""
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
     """Maximum number of pairs of detections of one joint in a frame; beyond it, each view keeps its most
     confident detections (18 a view of 30 cameras, 47 of 12, 122 of 5). Increase it for denser crowds, decrease

@@ -12,32 +12,37 @@ Shared = TypeVar("Shared")
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all frames."""
 _FRAMES_WORTH_A_WORKER = 100
-"""Minimum number of frames of a recording per worker: work is distributed in windows of a hundred."""
+"""Minimum number of frames of a recording per worker; work is distributed in windows of
+a hundred."""
 
 
 @dataclass(frozen=True)
 class Execution:
-    """How a reconstruction is executed. Only `chunk_frames` may change the result."""
+    """Execution settings of a reconstruction. Only `chunk_frames` may change the result."""
 
     workers: int | None = 1
-    """Processes that solve windows; 1: this process only, None: as many as pay off."""
+    """Number of processes that solve windows; 1: this process only, None: as many as useful."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose processes solve instead; `local` for `workers` processes of Dask's own."""
+    """Address of a Dask scheduler to solve on; `local` for `workers` processes of a temporary Dask
+    cluster."""
     sharing: int = 1
     """Number of runs that share the cluster: each keeps its share of work submitted."""
     chunk_frames: int | None = None
-    """Length of chunks whose people are tracked in parallel, frames; identities are joined across the borders
-    (`runs/chunks.py`). The result may differ where people are hidden at a border. None: no chunks."""
+    """Length of chunks with people tracked in parallel, frames; identities are joined across the
+    borders (`runs/chunks.py`). The result may differ if people are occluded at a border. None: no
+    chunks."""
     progress: Progress | None = None
     """Called while frames are solved."""
 
     def worth(self, frames: int) -> "Execution":
-        """Return a copy with the number of workers that pays for this many frames, where none is given."""
+        """Return a copy with a suitable number of workers for this many frames, if none
+        is given.
+        """
         count = suitable_workers(frames, _FRAMES_WORTH_A_WORKER) if self.workers is None else self.workers
         return replace(self, workers=count)
 
     def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:
-        """The processes that solve this many frames; all of them have `shared`."""
+        """The processes for solving this many frames, each with `shared`."""
         count = self.worth(frames).workers or 0
         if self.cluster is None:
             return workers(count, shared)

@@ -1,4 +1,4 @@
-"""Explains why a joint is where it is: the contributions of views, body and motion, and contradictions."""
+"""Explains the estimate of a joint: contributions of views, body and motion, and contradictions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,19 +29,19 @@ from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, FactorR
 from shapepose_fg.pipeline.solving import Solver, solved_around
 
 OFF_SIGMA = 3.0
-"""Distance of a detection from where everything else puts the joint, in standard deviations, above which it is
-reported: one in 90 exceeds it by chance."""
+"""Distance of a detection from the prediction by all else, in standard deviations, above which it
+is reported: one in 90 exceeds it by chance."""
 _WINDOW_FRAMES = 48
-"""Number of frames before and after from which it is decided whether a camera is wrong."""
+"""Number of frames before and after that are used to decide whether a camera is wrong."""
 _ASTRAY_RAD, _BESIDE_RAD, _BIN_RAD = 0.15, 0.03, 0.01
-"""Angle around joints within which unassigned detections are searched; angle from there within which they match
-once the most frequent of these shifts, found in bins of the third angle, is subtracted: a camera that rolled
-moves some parts of its picture."""
+"""Angle around joints within which unassigned detections are searched for, rad; residual angle for
+a match after subtracting the mode of these shifts; and bin size for the mode. A rolled camera
+shifts only some parts of its picture."""
 _NEAR_M = 0.5
-"""Distance from a joint without a detection within which an unassigned detection is reported, m."""
+"""Distance from a joint, m, within which an unassigned detection is reported."""
 _APART = 0.5
-"""Ratio of the distance from another person's joint to that from this one, below which a detection belongs to
-the other."""
+"""Ratio of the distances from another person's joint and this one's below which a detection is the
+other's."""
 
 
 class _Problem(BaseModel):
@@ -68,7 +68,7 @@ class _Said(BaseModel):
 
 
 class _Setup(BaseModel):
-    """The part of run.json's `setup` that is read here."""
+    """The used part of run.json's `setup`."""
 
     left_out: list[_Spell] = []
     doubted: list[_Spell] = []
@@ -76,13 +76,13 @@ class _Setup(BaseModel):
 
 
 class _People(BaseModel):
-    """The part of run.json's `people` that is read here."""
+    """The used part of run.json's `people`."""
 
     problems: list[_Problem] = []
 
 
 class _Run(BaseModel):
-    """The part of run.json that is read here."""
+    """The used part of run.json."""
 
     setup: _Setup = _Setup()
     people: _People = _People()
@@ -100,15 +100,15 @@ def explain(
     detections: DetectionSequence | None = None,
     extra_factors: ExtraFactors | None = None,
 ) -> Explanation:
-    """Explain why a joint of a result is where it is, in a `frame`, or in the person's frame nearest to `time_s`,
-    seconds.
+    """Explain the estimate of a joint in a result, in a `frame`, or in the person's frame nearest
+    to `time_s`, seconds.
 
-    The person's window is solved once more, from its detections in `people.observations` and with the cameras
-    `rig`; joints, covariances and gates are those of the result. With the recording's `detections`, detections are
-    reported too that the detector joins with the person's and that were not assigned to the person.
-    `extra_factors` are those that the result was solved with, if any; their `window.track` is the result's person.
-    InputError where the person, the joint or the frame is not in the result, or where the result has no
-    observations.
+    The person's window is solved again, from its detections in `people.observations` and with the
+    cameras `rig`; joints, covariances and gates are those of the result. If the recording's
+    `detections` are given, the findings include detections that have affinities to the person's but
+    were not assigned to the person. `extra_factors` are those with which the result was solved, if
+    any; their `window.track` is the result's person. Raises InputError if the person, the joint or
+    the frame is not in the result, or if the result has no observations.
     """
     table = people.observations
     if table is None:
@@ -143,7 +143,9 @@ def explain(
 
 
 def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: float | None) -> int:
-    """Index of the row of a person in a frame, or nearest to a time."""
+    """Index of the row of a person in a frame, or nearest to a time; raises InputError if there is
+    none.
+    """
     mine = np.flatnonzero(people.person == person)
     if len(mine) == 0:
         there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
@@ -164,7 +166,9 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
 
 @dataclass(frozen=True)
 class _Detections:
-    """The detections of all people in the frames around, N rows, compared with the reported joints."""
+    """Detections of all people in the surrounding frames, N rows, compared with the reported
+    joints.
+    """
 
     people: Reconstruction
     table: ObservationTable
@@ -192,9 +196,9 @@ class _Detections:
 def _with_strays(
     rows: Observations, table: ObservationTable, views: Views, pixels: Array, detections: DetectionSequence
 ) -> Observations:
-    """The rows with unassigned detections added where a camera has none of a joint: of the same name, nearest
-    to where it would be if the camera was rotated as most of them suggest. A camera that is off has few others,
-    or none.
+    """The rows with unassigned detections added for cameras without one: of the same joint, nearest
+    to its position after the most frequent shift in this camera. A misaligned camera has few or no
+    assigned detections.
     """
     parts, focal = list[tuple[Array | Index, ...]](), np.broadcast_to(views.focal, (len(table), len(views)))
     for frame in np.unique(table.frame[(table.frame >= 0) & (table.frame < len(detections))]).tolist():
@@ -228,15 +232,15 @@ def _commonest(ways: Array) -> Array:
 
 
 def _owner(seen: Detections, table: ObservationTable, rows: Index) -> Index:
-    """(D,) to which of some `rows` of one frame each detection is assigned, counted among these rows; -1 for
-    none.
+    """(D,) index, among some `rows` of one frame, of the row that each detection is assigned to; -1
+    for none.
     """
     given = table.candidate[rows]
     n, joint, view = np.nonzero(given >= 0)
     most = max(seen.place.max(initial=0), given.max(initial=0))
     at = np.full((len(table.view_names), most + 1), len(seen))
     at[seen.view, seen.place] = np.arange(len(seen))
-    owner = np.full(len(seen) + 1, -1)  # the last for those that are not in the recording
+    owner = np.full(len(seen) + 1, -1)  # the last is for detections not in the recording
     owner[at[view, given[n, joint, view]]] = n
     return owner[:-1]
 
@@ -248,12 +252,13 @@ def _view_reasons(
     joint: int,
     config: PipelineConfig,
 ) -> tuple[tuple[ViewReason, ...], tuple[FactorReason, ...], tuple[float, float]]:
-    """The contributions of each camera and each of the user's factors to a joint, and the shares of the body and
-    of motion.
+    """Contributions of each camera and each of the user's factors to a joint, and the shares of the
+    body and of motion.
 
-    The solver's information about the joint is divided: into that of each detection, of the body, and the rest,
-    which comes from other frames. The share of a part is trace(part inverse(whole)) / 3. A detection is compared
-    with the joint as it would be without it: one Gauss-Newton step from where it is.
+    The solver's information about the joint is divided into that of each detection, that of the
+    body, and the rest, which comes from other frames. The share of a part is trace(part
+    inverse(whole)) / 3. A detection is compared with the joint predicted without it, by one
+    Gauss-Newton step.
     """
     people, table = all_of_it.people, all_of_it.table
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
@@ -275,7 +280,7 @@ def _view_reasons(
         weight = kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v]) / sigma[v] ** 2
         information[v], gradient[v] = weight * slope[v].T @ slope[v], weight * slope[v].T @ residual[v]
     if whole is not None and graph is not None and graph.window.temporal and not graph.window.touched[joint]:
-        # Of what is seen the solver's graph holds the share of the variance that is new in every frame.
+        # In the solver's graph, detections have only the white share of their variance.
         seen_well = weakest_sigma(information.sum(axis=0)) <= LOST_M
         whole *= graph.lasting.white_share if seen_well else 1.0
     if whole is None:
@@ -291,7 +296,7 @@ def _view_reasons(
         off_px = off_sigma = None
         like = ""
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
-            least = np.eye(3)  # a metre
+            least = np.eye(3)  # weak prior of 1 m
             without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
             away = residual[v] + slope[v] @ without @ gradient[v]
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
@@ -326,9 +331,9 @@ def _view_reasons(
 def _looks_like(
     all_of_it: _Detections, row: int, joint: int, view: int, at: Array, sigma: float, off: float
 ) -> str:
-    """The joint that a detection more likely belongs to, in words: another person's of the same name, or the
-    person's own of the other side. The detection is at `at`, with standard deviation `sigma` and `off` from its
-    joint, pixels.
+    """The joint that a detection more likely belongs to, in words: another person's of the same
+    name, or the person's own on the other side. The detection is at `at`, with standard deviation
+    `sigma` and distance `off` from its joint, pixels.
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
     here = np.flatnonzero(people.frame == people.frame[row])
@@ -346,8 +351,8 @@ def _looks_like(
 
 
 def _refused(all_of_it: _Detections, row: int, joint: int, detections: DetectionSequence | None) -> list[Finding]:
-    """Detections of a joint in cameras that have none of it, which the detector joins with the person's own or
-    which lie near it, and that are not the person's: assigned to another person, or unassigned.
+    """Detections of a joint in cameras where the person has none, near the joint or with affinities
+    to the person's: assigned to another person, or unassigned.
     """
     people, table = all_of_it.people, all_of_it.table
     frame = int(people.frame[row])
@@ -393,7 +398,7 @@ def _findings(
     wrong: WrongView | None,
     refused: Sequence[Finding],
 ) -> tuple[Finding, ...]:
-    """Problems of a joint, the gravest first."""
+    """Problems of a joint, most serious first."""
     found, used = list[Finding](), [view for view in views if view.gate == GATES[Gate.USED]]
     problem = _problem(people, run, row, joint)
     if problem:
@@ -424,7 +429,7 @@ def _findings(
     against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
-    if len(against) + len(doubted) == 1 and len(agree) > 0:  # one against all others: its detection is wrong
+    if len(against) + len(doubted) == 1 and len(agree) > 0:  # a single one against all others is wrong
         alone = [*against, *doubted]
     else:
         alone = []
@@ -444,8 +449,8 @@ def _findings(
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body contributes {shares[0]:.0%},"
-            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and motion from other frames"
-            " the rest."
+            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and and motion from other"
+            " frames the rest."
         )
         found.append(Finding(Cause.PRIOR_ONLY, (), words))
     if len(used) == 1:
@@ -462,7 +467,9 @@ def _problem(people: Reconstruction, told: _Run, row: int, joint: int) -> str:
 
 
 def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
-    """Cameras that the set-up check left out of a row's frame, or doubted in it, according to run.json."""
+    """Cameras that the set-up check excluded from, or doubted in, a row's frame, according to
+    run.json.
+    """
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (
         (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
@@ -483,7 +490,7 @@ def _taken(view: ViewReason) -> str:
 
 
 def _off(view: ViewReason) -> str:
-    """The distance of a detection from where everything else puts the joint, in words."""
+    """Distance of a detection from the prediction by all else, in words."""
     if view.off_px is None or view.off_sigma is None:
         return "behind the camera"
     return f"{view.off_px:.0f} px or {view.off_sigma:.1f} sigmas off"

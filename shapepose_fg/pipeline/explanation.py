@@ -1,4 +1,4 @@
-"""An explanation of why a joint is where it is: as data, and in words."""
+"""Explanation of a joint's estimate, as data and in words."""
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -11,12 +11,12 @@ GATES = {gate: gate.name.lower().replace("_", " ") for gate in Gate}
 
 
 class Cause(StrEnum):
-    """Kinds of problems of a joint, the gravest first."""
+    """Kinds of problems of a joint, most serious first."""
 
     NOT_SOLVED = "not solved"
-    """The solver found no place for the joint."""
+    """The solver found no position for the joint."""
     WRONG_CAMERA = "wrong camera"
-    """A camera that saw the joint is off for all that it sees: its pose, its lens or its clock is wrong."""
+    """All detections of a camera are displaced: its pose, lens or clock is wrong."""
     FOREIGN = "foreign detection"
     """A detection belongs to another person, or to the other side of the body."""
     CONTRADICTION = "contradiction"
@@ -36,7 +36,7 @@ class Finding:
     cause: Cause
     """The kind of problem."""
     cameras: tuple[str, ...]
-    """The cameras that have the problem; none where no camera has."""
+    """Cameras with the problem; empty if it concerns none."""
     words: str
     """A description in a sentence or two."""
 
@@ -52,7 +52,7 @@ class ViewReason:
     detection_px: tuple[float, float] | None
     """The detection, undistorted pixels; None where there is none."""
     score: float
-    """The detector's score, 0 to 1."""
+    """Confidence of the detector, 0 to 1."""
     probability: float
     """Probability that the detection is this person's, from the assignment."""
     sigma_px: float | None
@@ -60,15 +60,15 @@ class ViewReason:
     residual_px: tuple[float, float] | None
     """The projection of the joint as reported minus the detection, pixels."""
     off_px: float | None
-    """Distance from the detection to where everything *else* puts the joint, this detection not counted,
+    """Distance of the detection from the prediction by all *else*, excluding this detection,
     pixels."""
     off_sigma: float | None
-    """The distance `off_px` in standard deviations of the detection and of where everything else puts the
-    joint."""
+    """The distance `off_px` in standard deviations of the detection and the prediction together."""
     share: float
     """Share of the information about the joint that this view gives, 0 to 1."""
     looks_like: str = ""
-    """The joint that the detection more likely belongs to, as `person 3's RWrist`; empty where there is none."""
+    """The joint that the detection more likely belongs to, as `person 3's RWrist`;
+    empty if none."""
 
 
 @dataclass(frozen=True)
@@ -78,15 +78,15 @@ class FactorReason:
     name: str
     """Name of the function that made the factors."""
     others: tuple[str, ...]
-    """The joints that the factors connect it to, as `person 3's RWrist`; none where they are on this joint
-    alone."""
+    """Joints that the factors connect it to, as `person 3's RWrist`; empty for factors on this
+    joint only."""
     share: float
     """Share of the information about the joint that these factors give, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why a joint is where it is."""
+    """Explanation of a joint's estimate."""
 
     person: int
     joint: str
@@ -103,25 +103,26 @@ class Explanation:
     views: tuple[ViewReason, ...]
     """Contributions of the cameras."""
     body_share: float
-    """Share of the information about the joint that the body gives, the joint's own views not counted, 0 to 1."""
+    """Share of the information about the joint from the body, excluding the joint's own views, 0 to
+    1."""
     motion_share: float
     """Share of the information about the joint that comes from other frames, 0 to 1."""
     findings: tuple[Finding, ...]
-    """Problems, the gravest first; empty where there are none."""
+    """Problems, most serious first; empty if there are none."""
     factors: tuple[FactorReason, ...] = ()
     """Contributions of your own factors to the joint in this frame, one entry for those of one function that
     connect it to the same joints. Their contributions in other frames are in `motion_share`."""
     missing_factors: tuple[str, ...] = ()
-    """The user's functions that the result was solved with and that were not given here: shares do not include
+    """Functions with which the result was solved, and that were not given here: the shares exclude
     them."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as `shapepose-fg explain --json` prints them."""
+        """Plain values, as printed by `shapepose-fg explain --json`."""
         return asdict(self)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The explanation in sentences: where the joint is, what is wrong, and what it is estimated from."""
+        """The explanation in sentences: position, problems, and contributions."""
         when = f"frame {self.frame}" + (f" ({self.time_s:.3f} s)" if self.time_s is not None else "")
         who = f"{self.joint} of person {self.person} in {when}"
         if self.position_m is None or self.sigma_m is None:

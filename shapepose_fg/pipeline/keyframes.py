@@ -1,8 +1,9 @@
-"""Keyframes, in which people are tracked and solved, and the rows in the frames between.
+"""Keyframes, in which people are tracked and solved, and the rows of frames between them.
 
-Between two keyframes a joint moves as the motion model predicts without measurements: given positions and
-velocities at both ends, the mean under white noise on acceleration is a cubic. Errors of detectors last longer
-than the time between keyframes, so that the covariance is that of the ends, and of the unobserved motion.
+Between two keyframes a joint follows the mean of the motion model without measurements: given
+positions and velocities at both ends, under white noise on acceleration, this is a cubic. Errors of
+detectors are correlated over longer times than between keyframes, so that the covariance is that of
+the ends, plus that of the unobserved motion.
 """
 
 from collections.abc import Sequence
@@ -18,12 +19,14 @@ from shapepose_fg.estimation.motion_model import MotionModel
 
 _ROUNDING_S = 1e-6
 STRAY_M = 0.03
-"""Deviation of a joint from the cubic between two keyframes, m, above which a frame between becomes one: more than
-the errors of detectors."""
+"""Deviation of a joint from the cubic between keyframes, m, above which a frame between becomes a
+keyframe."""
 
 
 def spaced(time_s: Array, apart_s: float) -> Mask:
-    """(T,) mask of rising times: the first, the last, and as few between as leave no gap longer than `apart_s`."""
+    """(T,) mask for ascending times: first, last, and as few between as leave no gap longer than
+    `apart_s`.
+    """
     chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
     reached = np.searchsorted(time_s, time_s + apart_s + _ROUNDING_S, side="right") - 1
     while at < last:
@@ -34,8 +37,8 @@ def spaced(time_s: Array, apart_s: float) -> Mask:
 
 
 def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float) -> Mask:
-    """(T,) which frames of a recording at times (T,) are keyframes: of the wanted `frames` as few as leave no
-    gap longer than `apart_s` between cuts; all where that is 0.
+    """(T,) mask of keyframes of a recording with times (T,): among the wanted `frames`, as few as
+    leave no gap longer than `apart_s` between cuts; all if that is 0.
     """
     chosen = np.ones(len(time_s), dtype=bool)
     for segment in segments(frames, cuts) if apart_s > 0 else ():
@@ -47,10 +50,11 @@ def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float)
 def with_rows_between(
     rows: Reconstruction, frame: Index, time_s: Array, key: Mask, motion: MotionModel
 ) -> Reconstruction:
-    """Add rows in the frames between keyframes, for everybody who is in both of two consecutive ones.
+    """Add rows in the frames between keyframes, for people present in both adjacent keyframes.
 
-    `frame` (F,) are consecutive frames, at `time_s` (F,) seconds, of which `key` (F,) are keyframes. New rows have
-    no detections and no body; their joints come from `motion`. Sorted by frame and person.
+    `frame` (F,) are consecutive frames, at `time_s` (F,) seconds, with the mask `key` (F,) of
+    keyframes. New rows have no detections and no body; their joints come from `motion`. Sorted by
+    frame and person.
     """
     keys = np.flatnonzero(key)
     order = np.lexsort((rows.frame, rows.person))
@@ -67,11 +71,11 @@ def with_rows_between(
 
 
 def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
-    """(T - 1,) standard deviation of joints from the cubic, half way between two keyframes of a person, m; the
-    largest.
+    """(T - 1,) largest standard deviation of a person's joints from the cubic, half way between two
+    keyframes, m.
 
-    `joints` and `velocity` (T, J, 3), at `times_s` (T,). It is the deviation under white noise on the
-    acceleration, whose density is the most probable one for the change from one state to the next.
+    `joints` and `velocity` (T, J, 3), at `times_s` (T,). The deviation is under white noise on the
+    acceleration, with the maximum-likelihood density for the change between the two states.
     """
     lasts_s = np.diff(times_s)[:, None, None]
     moved, turned = np.diff(joints, axis=0) - lasts_s * velocity[:-1], np.diff(velocity, axis=0)
@@ -111,14 +115,16 @@ def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionM
 def _carried(
     before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
 ) -> Reconstruction:
-    """N rows at `time_s` (N,) of the people whose rows in the keyframes around are `before` and `after`."""
+    """N rows at `time_s` (N,), interpolated between the rows `before` and `after` in adjacent
+    keyframes.
+    """
     lasts_s = (after.time_s - before.time_s)[:, None, None]
     share = (time_s - before.time_s)[:, None, None] / lasts_s
     chord = (after.joints - before.joints) / lasts_s
     speeds = [np.where(np.isfinite(each.velocity), each.velocity, chord) for each in (before, after)]
     joints, velocity = cubic(share, lasts_s, (before.joints, after.joints), (speeds[0], speeds[1]))
 
-    # Of white noise on acceleration with both ends known.
+    # White noise on acceleration with both ends given.
     density = motion.psd_still + motion.psd_speed * np.nan_to_num(np.square(chord).sum(axis=-1))
     inside, length = (share * (1 - share))[..., 0], lasts_s[..., 0]
     of_place, of_speed = density * (length * inside) ** 3 / 3, density * length * inside * (1 - 3 * inside)
@@ -127,7 +133,8 @@ def _carried(
         ends = getattr(before, name), getattr(after, name)
         return (1 - share[..., None]) * ends[0] + share[..., None] * ends[1] + unseen[..., None, None] * np.eye(3)
 
-    # Where the first end is as it should be the second one says what is wrong; bodies come later.
+    # The status is that of the first end unless it is good, else of the second; bodies are fitted
+    # later.
     fine = np.isin(before.status, (Status.OK, Status.BODY_UNDETERMINED))
     status = np.where(fine, after.status, before.status)
     placed = np.isfinite(joints).all(axis=-1)
@@ -149,8 +156,8 @@ def _carried(
 def cubic(
     share: Array, lasts_s: Array, places: tuple[Array, Array], speeds: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Position and velocity (...) at a `share` (...) of the `lasts_s` (...) seconds between two `places` (...),
-    where the velocities are `speeds` (...).
+    """Position and velocity (...) at `share` (...) of `lasts_s` (...) seconds between two `places`
+    (...), on the cubic with end velocities `speeds` (...).
     """
     way, s = places[1] - places[0], share
     first, second = (lasts_s * each - way for each in speeds)
@@ -161,12 +168,12 @@ def cubic(
 def bodies_between(
     ok: Mask, bodies: Sequence[Array], key_s: Array, time_s: Array
 ) -> tuple[Mask, tuple[Array, Array, Array, Array]]:
-    """Interpolate bodies at times `time_s` (N,) between given ones at rising times `key_s` (B,); returns a mask
-    (N,), too.
+    """Interpolate bodies at times `time_s` (N,) between given ones at ascending times `key_s` (B,);
+    also returns a mask (N,).
 
-    `bodies` are shapes (B, 10), rotations of the root (B, 3) and of the other joints (B, 23, 3), translations (B,
-    3); those that are not `ok` (B,) are ignored. Translations, and rotations as quaternions, are cubics with the
-    slopes of their neighbours.
+    `bodies` are shapes (B, 10), rotations of the root (B, 3) and of the other joints (B, 23, 3),
+    translations (B, 3); those that are not `ok` (B,) are ignored. Translations, and rotations as
+    quaternions, are cubics with the slopes of their neighbours.
     """
     after = np.searchsorted(key_s, time_s)
     before = np.where(key_s[after] == time_s, after, after - 1)
@@ -194,8 +201,8 @@ def bodies_between(
 
 
 def _quaternions(vectors: Array) -> Array:
-    """(B, K, 4) unit quaternions of rotation vectors (B, K, 3), radians; signs are those nearer to the row
-    before.
+    """(B, K, 4) unit quaternions of rotation vectors (B, K, 3), radians; signs are continuous over
+    rows.
     """
     half = np.linalg.norm(vectors, axis=-1, keepdims=True) / 2
     found = np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * vectors], axis=-1)
@@ -205,7 +212,7 @@ def _quaternions(vectors: Array) -> Array:
 
 
 def _rotation_vectors(quaternions: Array) -> Array:
-    """(..., 3) radians, at most pi, of quaternions (..., 4) of any length."""
+    """(..., 3) rotation vectors, norm at most pi, of quaternions (..., 4) of any length."""
     w, xyz = quaternions[..., :1], quaternions[..., 1:]
     xyz = np.where(w < 0, -xyz, xyz)
     sine = np.linalg.norm(xyz, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What is learnt of a detector from frames spread over a recording: offsets of its joints, and its noise law."""
+"""Learns a detector's joint offsets and noise law from frames spread over a recording."""
 
 from dataclasses import fields, replace
 
@@ -26,11 +26,11 @@ from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.proposal.thinning import ThinnedFrames
 
 _OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
-"""The names under which a run stores them."""
+"""Names under which a run stores the offsets and the noise law."""
 NOISE_FRAMES = 60
-"""Maximum number of frames from which the noise law is learnt; shorter recordings keep what ships."""
+"""Maximum number of frames for learning the noise law. Shorter recordings use the shipped law."""
 _ENOUGH = 10_000
-"""Number of detections of 2D people that are enough for it: crowds have them in a dozen frames."""
+"""Number of detections that are enough for the noise law; a crowd has them in about 12 frames."""
 _GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -62,7 +62,7 @@ def estimate_offsets(
 def kept_offsets(
     kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """The offsets that a run stored when it began; `offsets_of` where it has none yet."""
+    """The offsets stored when the run began; `offsets_of` if there are none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         with naming(kept.place(_OFFSETS), ANEW):
@@ -76,7 +76,7 @@ def kept_offsets(
 def kept_noise(
     kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> NoiseLaw:
-    """The noise law that a run stored when it began; `noise_of` where it has none."""
+    """The noise law stored when the run began; `noise_of` if there is none yet."""
     if len(kept.names(_NOISE)) > 0:
         with naming(kept.place(_NOISE), ANEW):
             return NoiseLaw.from_dict({name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS})
@@ -87,7 +87,10 @@ def kept_noise(
 
 
 def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook) -> NoiseLaw:
-    """The noise law of the detector, from where the offsets come; what ships in recordings of few frames."""
+    """The detector's noise law, from the same source as the offsets.
+
+    A recording of fewer than `NOISE_FRAMES` frames uses the shipped law.
+    """
     source = setup.config.offsets.source
     if source not in ("none", "recording"):
         return NoiseLaw.load(source)
@@ -101,7 +104,7 @@ def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: N
             times.of_views(len(setup.rig)),
         )
         frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
-        # Wherever this ends, its frames are spread over the whole recording.
+        # In golden-ratio order, frames are spread over the whole recording even if it ends early.
         for frame in frames[np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")].tolist():
             found = detections[frame]
             people = stage(found, setup.rig.at(time_s[frame]))
@@ -120,8 +123,8 @@ def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: N
 def offsets_of(
     setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
 ) -> KeypointOffsets | None:
-    """The offsets of the detector's joints; None where there is no source. ValueError where a file does not
-    fit.
+    """Offsets of the detector's joints; None without a source. Raises ValueError for an unsuitable
+    file.
     """
     config, rig, fitter = setup.config, setup.rig, setup.fitter
     source = config.offsets.source

@@ -55,22 +55,26 @@ def reconstruct(
     extra_factors: ExtraFactors | None = None,
     execution: Execution | None = None,
 ) -> Reconstruction:
-    """Reconstruct the people of a recording over time; with `config.temporal` false, each frame separately.
+    """Reconstruct the people of a recording over time, or each frame separately.
 
-    `frames` picks frames of the recording (all of them by default). `times` are the times of the frames; without
-    it 30 frames a second are assumed, and `run` says so. `cuts` are first frames after cuts: nothing carries over
-    to them, and identities do not either. `shapes` are people known from other recordings. `fitter` replaces the
-    body fitter. `extra_factors`, one function or several, adds factors of your own to every person's window; they
-    may connect people (docs/extending.md), and `run` has their number. Where cameras move, their trajectories are
-    refined first, unless `refine_trajectories` has done so. `Trusted(detections, check_setup(detections,
-    rig).trust)` leaves out cameras that contradict the others. `execution` sets how the work is executed:
+    Frames are separate if `config.temporal` is false.
+
+    `frames` selects frames of the recording (default: all). `times` are the times of the frames.
+    Without it, 30 frames per second are assumed, and `run` says so. `cuts` are the first frames
+    after cuts. No states or identities are carried over a cut. `shapes` are people known from other
+    recordings. `fitter` replaces the body fitter. `extra_factors`, one function or several, adds
+    your own factors to every person's window; they may connect people (docs/extending.md), and
+    `run` has their number. Trajectories of moving cameras are refined first, unless
+    `refine_trajectories` has done so. `Trusted(detections, check_setup(detections, rig).trust)`
+    leaves out cameras that contradict the others. `execution` sets how the work is executed:
     processes, a cluster, chunks, and a callback for progress.
 
-    In the result `person` is an identity over time (in separate frames, the number of a person within the frame).
-    Its `run` has the configuration, versions, seconds per stage (over all processes), numbers of people that were
-    found and dropped, with reasons, and offsets of the detector's joints from the body's. These are estimated from
-    frames spread over the whole recording, whatever `frames` picks; a fitter of your own takes part if it has a
-    `model`. ValueError where an argument does not fit the recording.
+    In the result, `person` is an identity over time. If each frame is reconstructed separately, it
+    is the number of a person within the frame. `run` has the configuration, versions, seconds per
+    stage (over all processes), numbers of people found and dropped, with reasons, and offsets of
+    the detector's joints from the body's. The offsets are estimated from frames spread over the
+    whole recording, whatever `frames` selects; with your own fitter only if it has a `model`.
+    Raises ValueError for an argument that does not fit the recording.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
@@ -109,7 +113,7 @@ def refine_trajectories(
 
 @dataclass(frozen=True)
 class Task:
-    """The arguments of `reconstruct`, which describes them."""
+    """Arguments of `reconstruct`, described there."""
 
     detections: DetectionSequence
     rig: Rig
@@ -123,7 +127,9 @@ class Task:
     camera_factors: CameraFactors | None = None
 
     def whole(self) -> tuple[range, FrameTimes, list[int]]:
-        """Frames, times and cuts, with defaults for missing ones; ValueError where they do not fit."""
+        """Frames, times and cuts, with defaults for missing ones; raises ValueError if they are
+        inconsistent.
+        """
         if len(self.rig) < 2:
             raise ValueError(f"at least 2 cameras are needed, got {len(self.rig)}")
         count = len(self.detections)
@@ -143,11 +149,10 @@ class Task:
 
 
 def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None = None) -> Assembly:
-    """`reconstruct` with windows that are stored in `kept` as they are solved, and a result that is assembled from
-    them.
+    """`reconstruct` with solved windows stored in `kept`, and a result assembled from them.
 
-    Windows that an interrupted call for the same task left in `kept` are not solved again, and the result is the
-    same to the byte.
+    Windows that an interrupted call for the same task left in `kept` are not solved again; the
+    result is identical in every byte.
     """
     execution = Execution() if execution is None else execution
     config, rig, skeleton, chunk = task.config, task.rig, task.detections.skeleton, execution.chunk_frames
@@ -184,7 +189,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         result = Assembly(parts, skeleton.joints, rig.names)
         if config.temporal and len(parts) > 0:
             with book.stage("follow"):
-                # Between two frames, where no rounding matters.
+                # half way between frames, to avoid rounding
                 cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
                 result = replace(result, names=_names(result, setup, cuts_s.tolist()))
         floor: Floor | str = "frame by frame" if not config.temporal else "not sought"
@@ -223,7 +228,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
 
 
 def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) -> Setup:
-    """The set-up with refined trajectories, where cameras move; a run stores them."""
+    """The set-up with refined trajectories for moving cameras; a run stores them."""
     rig, config = setup.rig, setup.config
     if not unrefined(rig) or not config.temporal:
         return setup
@@ -231,7 +236,7 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
         frames, times, cuts = task.whole()
         pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
         thinned = ThinnedFrames(pictures, rig, config.candidates)
-        # What it has to say of people is said when they are followed again.
+        # Notes on people are made when they are tracked again.
         every = np.arange(frames.start, frames.stop)
         windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, every, Notebook())
         with book.stage("trajectories"):
@@ -241,12 +246,12 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
 
 
 def _fit_person(setup: Setup, person: Person) -> dict[str, Any]:
-    """One person's bodies, fitted in any process."""
+    """Fit one person's bodies, in any process."""
     return person.fitted(setup.fitter)
 
 
 def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int, int]:
-    """New numbers of tracks that are joined over longer times out of sight."""
+    """New numbers of tracks that are joined over longer gaps."""
 
     def trace(track: int) -> Trace:
         pieces = tracks.own_pieces(track, ("time_s", "joints"))
@@ -256,7 +261,7 @@ def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int,
 
 
 def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:
-    """The entries of run.json about a run, without its inputs."""
+    """Entries of run.json about a run, without its inputs."""
     problems = [
         {
             "person": result.names.get(each.track, each.track),

@@ -1,4 +1,4 @@
-"""All steps from frames to rows, built from the settings: the data that every process needs."""
+"""All steps from frames to rows, built from the settings: the data of every process."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -30,18 +30,19 @@ from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.tracking.tracker import BodyScale, Tracker
 
 FAST_M_S = 3.0
-"""Speed of the fastest joints that the tracker's predictions cover, m/s: a hand that is thrown up or strikes."""
+"""Speed of the fastest joints covered by the tracker's predictions, m/s: a hand that is thrown up
+or strikes."""
 UNSEEN_S = 0.3
-"""Longest gap without detections over which the tracker's predictions cover such joints, s."""
+"""Longest gap without detections over which predictions cover such joints, s."""
 _ON_TRIAL = 0.5
-"""Share of the required probability that is enough in single frames before a body is fitted."""
+"""Factor on the required probability in single frames before a body is fitted."""
 _FALSE_POSITIVE = "hardly any detections of their own, or at the position of another person"
 """Reason for dropping people when detections are reassociated."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """The data that all processes share: plain data, except for the user's own factors."""
+    """Data shared by all processes: plain data, except for the user's own factors."""
 
     rig: Rig
     """The cameras."""
@@ -54,16 +55,19 @@ class Setup:
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """How far the detector's joints lie from the true ones."""
+    """The detector's noise law."""
     estimator: EstimatorConfig = field(init=False)
-    """The settings of stage II, with the motion model: other processes need not know its name."""
+    """Settings of stage II, with the motion model itself, which other processes need not know by
+    name."""
 
     def __post_init__(self) -> None:
         estimator = replace(self.config.estimator, joints=self.skeleton.joints, noise=self.noise)
         object.__setattr__(self, "estimator", estimator)
 
     def solve(self, span: Span) -> Part:
-        """Solve one window, in any process: the rows of its own frames, by frame and person, and notes on them."""
+        """Solve one window, in any process; returns rows of its own frames, by frame and person,
+        and notes.
+        """
         every = [frame for frame, _ in span.decided]
         given = [frame for frame in every if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
@@ -87,7 +91,7 @@ class Setup:
         whole = solution
         solution = solution.rows(by_person[np.isin(found.frame[by_person], list(own))])
         rows = solution.observations
-        if not self.config.temporal:  # a person is a number within the frame
+        if not self.config.temporal:  # numbers within the frame
             number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
             problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
             solution = replace(solution, observations=replace(rows, track=number), problems=problems)
@@ -127,13 +131,13 @@ class Setup:
         return solution.result(place, rig, self.skeleton.joints)
 
     def engine(self, book: Notebook) -> Engine:
-        """The tracker and its windows; notes are written to `book`."""
+        """The tracker with its windows; notes are written to `book`."""
         config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
         sure = StageOne(skeleton, config.candidates, config.proposals, book)
-        # What evidence leaves over may be people whose hips two views saw: whether they are, time tells.
+        # Unexplained detections may be people with hips seen by two views; later frames decide.
         hips = sure.of_the_rest()
         if sure.proposals.evidence and not config.temporal:
-            # In frames that stand alone evidence decides, when the detections are reassociated.
+            # In single frames evidence decides during reassociation.
             likely = replace(sure.proposals, min_probability=_ON_TRIAL * sure.proposals.min_probability)
             sure, tracking = replace(sure, proposals=likely), replace(tracking, min_new_joints=3)
         law = self.estimator.law
@@ -145,8 +149,8 @@ class Setup:
 
 
 def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:
-    """Statuses (N,) where cameras are doubted in some frames: of rows without two other views for
-    `LEAST_JOINTS`.
+    """Statuses (N,) with cameras doubted in some frames: changed for rows without `LEAST_JOINTS` in
+    two other views.
     """
     used = solution.inlier.copy()
     for row, frame in enumerate(solution.observations.frame.tolist()):
@@ -158,5 +162,5 @@ def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -
 
 
 def find_people(detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig) -> Observations:
-    """Stage I, one frame: the people's 2D observations and their initial joints."""
+    """Stage I for one frame: people's 2D observations and initial joints."""
     return StageOne(skeleton, config.candidates, config.proposals, Notebook())(detections, rig)

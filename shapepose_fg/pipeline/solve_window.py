@@ -1,4 +1,6 @@
-"""Stage II on one page: from a window of frames with assigned detections to joints, bodies and graphs."""
+"""Stage II on one page: joints, bodies and graphs from a window of frames with assigned
+detections.
+"""
 
 import time
 from collections.abc import Sequence
@@ -27,13 +29,13 @@ from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
 _SETTLED = 0.002
-"""Share of changed detections below which reassociation ends: in crowds before six cameras after three or four
-rounds, before three after eight or more."""
+"""Share of changed detections below which reassociation ends: in crowds after three or four rounds
+with six cameras, after eight or more with three."""
 
 
 @dataclass(frozen=True)
 class Assigning:
-    """The data for reassociation around initial estimates."""
+    """Data for reassociation around initial estimates."""
 
     frames: Sequence[Input]
     """All detections of the window's frames."""
@@ -55,16 +57,17 @@ def solve_window(
     assigning: Assigning | None = None,
     extra_factors: ExtraFactors | None = None,
 ) -> WindowSolution:
-    """Joints, covariances, bodies and graphs of N rows, sorted in any way; (track, frame) must differ.
+    """Joints, covariances, bodies and graphs of N rows in any order; (track, frame) must be unique.
 
-    Rows of one track at several frames are a window, one factor graph; a row whose track has no other is the
-    frame-by-frame method, and with `EstimatorConfig` of the paper its Algorithm 1. `views` are the cameras, row by
-    row if they move. `extra_factors`, one function or several, add factors of your own to every window. Without
-    `assigning` detections keep their people.
+    Rows of one track at several frames are a window, one factor graph; a single row of a track is
+    solved by the frame-by-frame method, which with the paper's `EstimatorConfig` is its Algorithm
+    1. `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
+    factors of your own to every window. Without `assigning` detections keep their people.
 
-    In each round the body is fitted to the estimates of all joints from the views alone, and then constrains the
-    joints. Its constraint on a joint leaves that joint's own views out (`BodyFit.prior_xyz`), so that nothing is
-    counted twice. Motion constrains the joints, never the targets of the body.
+    In each round the body is fitted to estimates of all joints from the views only, and then
+    constrains the joints. Its constraint on a joint excludes that joint's own views
+    (`BodyFit.prior_xyz`), so that no measurement counts twice. Motion constrains the joints, never
+    the targets of the body.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
         raise ValueError(
@@ -73,7 +76,7 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    # Assign: detections go to the person whose initial joints and body are near them, round by round.
+    # Assignment: detections near people's initial joints and bodies, iterated.
     drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None
@@ -91,7 +94,7 @@ def solve_window(
             break
     assigned = time.perf_counter()
 
-    # Draft: X_0, the observations' sigmas there, and everybody's graph.
+    # Initial estimate: X_0, standard deviations of the observations there, and all graphs.
     state = State.start(observations, views, fitter, config, motion, functions_of(extra_factors))
     moving, velocity = state.people, velocities_of(observations, state.joints)
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
@@ -99,7 +102,7 @@ def solve_window(
         cameras, sigma, X = views.rows(rows), state.sigmas[rows], state.joints[rows]
         observed = carried_to_frames(observations.rows(rows), X, velocity[rows], cameras)
 
-        # Gate: what the views say around X, delta of Eq. 2.
+        # Gating: measurements of the views around X, delta of Eq. 2.
         evidence = linearise(observed, sigma, X, cameras, config.observations)
         if n == 0:
             placed = evidence.sigma_m <= config.refine.max_sigma_m
@@ -112,19 +115,21 @@ def solve_window(
         fitted = evidence.target
         wrong = disagreement(evidence, body) > config.refine.contradiction
         if wrong.any():
-            # Gated anew around the body's place; and the body is fitted again, without what was thrown away.
+            # Gate again around the body's joints, and fit the body again without rejected
+            # detections.
             there = np.where(wrong[..., None], body.prior_xyz, X)
             evidence = linearise(observed, sigma, there, cameras, config.observations)
             again = np.flatnonzero(wrong.any(axis=-1))
             targets = step.targets(evidence, state.enough[rows])
             body, anew = body.with_rows(again, step.fit(targets, body, again)), np.union1d(anew, again)
         state.told.put(rows[anew], targets.rows(anew))
-        # delta of Eq. 4; and what its views do not determine needs the body however sure its one view is.
+        # delta of Eq. 4; joints that their views do not determine need the body despite a confident
+        # single view.
         pulled = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d
         pulled |= evidence.sigma_m > config.refine.max_sigma_m
         of_body = step.message(body, targets, pulled)
 
-        # Joints: the X step. GTSAM has the last word on frames by themselves when they are done.
+        # Joints: the X step. Single-frame graphs are solved by GTSAM only after convergence.
         parts = parts_of(moving)
         near = X
         if any(map(_waits, moving)):
@@ -135,7 +140,8 @@ def solve_window(
         for person, part in now:
             X_new[part] = person.positions
 
-        # Settled: the body was fitted to where the joints are now, and pulled joints stay where they were.
+        # Convergence: the body was fitted to the current joints, and joints constrained by it did
+        # not move.
         before = np.where((of_body.known | wrong)[..., None], X, fitted)
         still = np.linalg.norm(X_new - before, axis=-1) < config.refine.settled_m
         settled = (still | np.isnan(X_new).any(axis=-1)).all(axis=1)
@@ -162,5 +168,5 @@ def solve_window(
 
 
 def _waits(person: WindowGraph) -> bool:
-    """Whether a person's graph is solved in the last round only."""
+    """Whether a person's graph is solved only in the last round."""
     return not person.temporal and len(person.ties.factors) == 0

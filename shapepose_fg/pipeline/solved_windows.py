@@ -1,4 +1,6 @@
-"""The solved windows of a recording, in order: people are tracked in this process, or chunk by chunk in others."""
+"""Solved windows of a recording, in order: people are tracked in this process, or by chunk in
+others.
+"""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -23,34 +25,34 @@ from shapepose_fg.proposal.thinning import ThinnedFrames
 
 @dataclass(frozen=True)
 class SolvedWindows:
-    """The windows of a recording: their source, and their solution."""
+    """Windows of a recording: source and solution."""
 
     setup: Setup
-    """The data that all processes share."""
+    """Data shared by all processes."""
     detections: ThinnedFrames
     """Detections of the recording."""
     pictures: WithoutRepeats
-    """The recording before it was thinned, without repeated pictures."""
+    """The recording before thinning, without repeated pictures."""
     times: FrameTimes
     """Times of the frames."""
     frames: range
-    """The frames that are wanted."""
+    """The wanted frames."""
     cuts: Sequence[int]
     """First frames after cuts."""
     keyframes: Index
-    """(K,) the keyframes, in which people are searched for, rising."""
+    """(K,) keyframes, in which people are searched for, ascending."""
     book: Notebook
     """Collects the notes of this process."""
     _rigs: dict[tuple[tuple[int, ...], ...], Rig] = field(default_factory=dict, init=False)
-    """The cameras, by the views without a picture and the doubted views."""
+    """Rigs, by views without a picture and doubted views."""
 
     @cached_property
     def _time_s(self) -> Array:
-        """(T, V) times at which the views took the frames, seconds."""
+        """(T, V) exposure times of the frames by view, seconds."""
         return self.times.of_views(len(self.setup.rig))
 
     def read(self, frame: int) -> Input:
-        """The input of a frame; between keyframes it is not thinned."""
+        """Input of a frame; it is not thinned between keyframes."""
         key = _among(frame, self.keyframes)
         with self.book.stage("read"):
             thinned = self.detections.is_thinned(frame)
@@ -59,7 +61,7 @@ class SolvedWindows:
                 self.book.thin("detections", thinned, frame)
                 self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
             found = self.detections[frame] if key else self.pictures[frame]
-            # Who is who among more detections than people make is chance.
+            # With more detections than people could explain, associations are chance.
             doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
             said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
             if self.setup.rig.moves:
@@ -70,7 +72,7 @@ class SolvedWindows:
             return Input(frame, self._time_s[frame], found, self._rigs[said], key)
 
     def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
-        """The windows from `begin` on, in order; in chunks of about `chunk_frames`, where that is given."""
+        """The windows from `begin` on, in order; in chunks of about `chunk_frames` if given."""
         begin = Checkpoint(self.frames.start) if begin is None else begin
         if chunk_frames is not None:
             yield from self._by_chunks(begin, pool, chunk_frames)
@@ -88,7 +90,7 @@ class SolvedWindows:
             yield replace(part, checkpoint=behind)
 
     def _followed(self, begin: Checkpoint) -> Iterator[tuple[Span, Checkpoint | None]]:
-        """The windows as far as their people are tracked, some with the state with which tracking continues."""
+        """Windows with tracked people, some with the state for continuing tracking."""
         config, engine = self.setup.config, self.setup.engine(self.book)
         next_id = begin.next_id
         for segment in segments(self.frames, self.cuts):
@@ -139,14 +141,14 @@ class SolvedWindows:
 
 
 def _among(frame: int, frames: Index) -> bool:
-    """Whether `frame` is one of the rising `frames`."""
+    """Whether `frame` is in the ascending `frames`."""
     at = int(np.searchsorted(frames, frame))
     return at < len(frames) and frames[at] == frame
 
 
 @dataclass(frozen=True)
 class SolvedChunk:
-    """A solved chunk; its tracks count from 0."""
+    """A solved chunk; its tracks are numbered from 0."""
 
     parts: tuple[Part, ...]
     """Windows of the chunk."""
@@ -161,8 +163,8 @@ class SolvedChunk:
 def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk:
     """Track people through a chunk and solve its windows, in any process.
 
-    The job has the input of all frames from `chunk.first` on. RuntimeError where these are not the frames of the
-    chunk, each once.
+    The job has the input of all frames from `chunk.first` on. Raises RuntimeError if the solved
+    frames are not those of the chunk, each once.
     """
     chunk, given = job
     book = Notebook()

@@ -1,4 +1,6 @@
-"""Solves rows of a result again from their own observations: after corrections by hand, and for their graphs."""
+"""Solves rows of a result again from their own observations: after manual corrections, and for
+their graphs.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,13 +42,15 @@ class Solver:
     config: PipelineConfig
     """The settings."""
     fitter: BodyFitter
-    """Fits bodies; it knows where the detector puts its joints (`run["keypoint_offsets"]`)."""
+    """Fits bodies, with the detector's offsets (`run["keypoint_offsets"]`)."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """How far the detector's joints lie from the true ones (`run["noise_law"]`)."""
+    """The detector's noise law (`run["noise_law"]`)."""
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, run_file: Path = Path("run.json")) -> "Solver":
-        """The data for a result of these cameras; InputError where its `run_file` does not have them."""
+        """Build it for a result of these cameras; raises InputError if `run_file` lacks its
+        settings.
+        """
         configuration = people.run.get("configuration")
         if not isinstance(configuration, dict):
             raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
@@ -60,8 +64,8 @@ class Solver:
 
     @classmethod
     def read(cls, folder: Path, people: Reconstruction) -> "Solver":
-        """Solver of a result that was loaded from `folder`; InputError as in `of`, and where the cameras are
-        others.
+        """Build it for a result loaded from `folder`; raises InputError as `of` does, and for other
+        cameras.
         """
         rig, table = cameras_of(folder), people.observations
         if table is not None and tuple(table.view_names.tolist()) != rig.names:
@@ -71,10 +75,11 @@ class Solver:
 
 
 def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None = None) -> Reconstruction:
-    """Solve some people of a result again, each over all of their rows, in the windows of the whole recording.
+    """Solve some people of a result again, each over all of their rows, in the windows of the whole
+    recording.
 
-    Detections keep their people; gates are decided again. `extra_factors` are factors of your own, for which
-    `window.track` is the result's person. ValueError where `rows` have no observations.
+    Detections keep their people; they are gated again. `extra_factors` are factors of your own;
+    their `window.track` is the result's person. Raises ValueError if `rows` have no observations.
     """
     parts, keyframe_s = [], solver.config.windows.keyframe_s
     motion = MotionModel.load(tuple(rows.joint_names.tolist()), solver.config.motion)
@@ -94,12 +99,14 @@ def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors
 def window_solutions(
     people: Reconstruction, rig: Rig, *, extra_factors: ExtraFactors | None = None
 ) -> Iterator[PersonGraph]:
-    """Every person of every window of a result as one graph, with the values and marginals of the result.
+    """Yield all people of all windows of a result as graphs, with the values and marginals of the
+    result.
 
-    Joints and covariances are those of `people`; the graphs are solved again from their observations, with the
-    cameras `rig`, in the order of the views. With `extra_factors`, whose `window.track` is the result's person,
-    joints and covariances are those of the graph. Windows overlap: frames near a border are in two. InputError
-    where `people.run` has no settings, ValueError where there are no observations.
+    Joints and covariances are those of `people`; the graphs are solved again from their
+    observations, with the cameras `rig`, in the order of the views. With `extra_factors`, with the
+    result's person as `window.track`, joints and covariances are those of the graph. Windows
+    overlap: frames near a border are in two. Raises InputError if `people.run` has no settings,
+    ValueError if there are no observations.
     """
     solver = Solver.of(people, rig)
     for _, part, solution in _solved(people, solver, extra_factors):
@@ -111,8 +118,9 @@ def window_solutions(
 def solved_around(
     people: Reconstruction, solver: Solver, person: int, frame: int, extra_factors: ExtraFactors | None = None
 ) -> PersonGraph | None:
-    """The graph of a person's window that has this frame, solved again from the person's own observations; None
-    where it is empty. With `extra_factors` all people in the window are solved. The observations must be there.
+    """Graph of a person's window that contains this frame, solved again from the person's own
+    observations; None if it is empty. With `extra_factors` all people in the window are solved. The
+    observations must be present.
     """
     if extra_factors is None:
         people = people.rows(people.person == person if solver.config.temporal else people.frame == frame)
@@ -126,8 +134,8 @@ def _solved(
     extra_factors: ExtraFactors | None,
     frame: int | None = None,
 ) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
-    """Solve each window of the recording, or that of one `frame`; yields its own frames, its rows with those
-    around it, and their solution.
+    """Solve all windows, or that of one `frame`; yields its own frames, the rows including the
+    overlap, and the solution.
     """
     if rows.observations is None:
         raise ValueError("rows without observations cannot be solved again; reconstruct the recording again")
@@ -141,7 +149,7 @@ def _solved(
         if config.windows.keyframe_s > 0:
             part = part.rows(looked_at(part))
         assert part.observations is not None
-        # From the views: the joints as they are may belong to another person.
+        # Initialised from the views: the current joints may be another person's.
         observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
         views = Views.of(rig, observations.time_s)
         found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
@@ -149,7 +157,7 @@ def _solved(
 
 
 def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
-    """InputError where rows are not those of people over time: files may have been edited by hand."""
+    """Raise InputError unless rows are consistent over time: files may be edited by hand."""
     order = np.lexsort((rows.frame, rows.person))
     person, frame, time_s = (each[order] for each in (rows.person, rows.frame, rows.time_s))
     same = np.diff(person) == 0
@@ -170,10 +178,12 @@ def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
 
 
 def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> Index:
-    """Rows in a window's `own` frames, and in those within `overlap_s` of its borders, none beyond a cut."""
+    """Rows in a window's `own` frames, and in those within `overlap_s` of its borders, not beyond
+    cuts.
+    """
     frame, time_s = rows.frame, rows.time_s
     known, first = np.unique(frame, return_index=True)
-    # Where no row is in the frame at a border, its time is between those of the frames around it.
+    # The time of a border frame without rows is interpolated.
     begin_s, end_s = np.interp([own.start, own.stop], known, time_s[first])
     before = near_border(time_s, begin_s, overlap_s) & (frame < own.start)
     after = near_border(time_s, end_s, overlap_s) & (frame >= own.stop)
@@ -181,9 +191,10 @@ def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float)
 
 
 def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, range]]:
-    """The windows that have any of `rows`: their own frames, and those from one cut to the next around them.
+    """Windows with any of `rows`: their own frames, and the segment between cuts that contains
+    them.
 
-    Windows are those in which the recording was solved; frame by frame, each frame is one.
+    Windows are those in which the recording was solved; single frames are windows of their own.
     """
     if not config.temporal:
         return [(frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())]
@@ -201,5 +212,5 @@ def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, 
 
 
 def _inside(frame: Whole, span: range) -> Mask:
-    """(N,) which frames are in `span`."""
+    """(N,) mask of frames in `span`."""
     return (frame >= span.start) & (frame < span.stop)

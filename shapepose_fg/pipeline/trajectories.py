@@ -1,8 +1,8 @@
-"""Trajectories of moving cameras: their odometry, corrected by the people that they see.
+"""Trajectories of moving cameras: odometry, corrected by the people they see.
 
-People are tracked with the poses as corrected so far; each window's people and poses are solved together
-(`estimation/trajectory_graph.py`), and at the end the poses of the whole recording in one graph, in which each
-window's people are replaced by their marginal on the poses.
+People are tracked with the poses corrected so far; each window's people and poses are solved
+jointly (`estimation/trajectory_graph.py`), and last the poses of the whole recording in one graph,
+in which each window's people are replaced by their marginal on the poses.
 """
 
 from collections.abc import Iterator
@@ -25,18 +25,18 @@ from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import Span
 
 _SAME_S = 1e-4
-"""Time within which a pose of the odometry coincides with a frame, s; it is then left out."""
+"""Time within which a pose of the odometry coincides with a frame, s, and is dropped."""
 _KEPT = "trajectories"
 """Prefix of the names under which a run stores trajectories, followed by their number."""
 
 
 def unrefined(rig: Rig) -> bool:
-    """Whether there are moving cameras whose trajectories have not been refined yet."""
+    """Whether there are moving cameras with unrefined trajectories."""
     return rig.moves and not all(each.refined for each in rig.trajectories)
 
 
 def kept_rig(kept: KeptArrays, rig: Rig) -> Rig | None:
-    """The rig with the trajectories that a run has stored; None where it has none yet, or needs none."""
+    """The rig with the trajectories that a run has stored; None if there are none."""
     if not rig.moves:
         return None
     found = []
@@ -114,11 +114,12 @@ class _Pass:
     windows: SolvedWindows
     """The recording."""
     time_s: Array
-    """(T, V) times at which the views took the frames, seconds."""
+    """(T, V) exposure times of the frames by view, seconds."""
     camera_factors: CameraFactors | None
     """The user's own factors on camera poses."""
     correction: Array = field(init=False)
-    """(B, 4, 4) current correction of each carrier: from its odometry pose to its pose in the world."""
+    """(B, 4, 4) current correction of each carrier: from its odometry pose to its pose in the
+    world."""
     _before: gtsam.NonlinearFactorGraph | None = None
     """Marginal on the last poses of the last window; None before the first."""
 
@@ -126,11 +127,11 @@ class _Pass:
         self.correction = np.tile(np.eye(4), (len(self.windows.setup.rig.trajectories), 1, 1))
 
     def corrected(self, odometry: Array) -> Array:
-        """(T, B, 4, 4) poses of the odometry with the current correction."""
+        """(T, B, 4, 4) odometry poses with the current correction."""
         return self.correction @ odometry
 
     def graphs(self) -> Iterator[TrajectoryGraph]:
-        """People and poses of each window, solved."""
+        """Yield the solved graph of people and poses for each window."""
         windows, setup = self.windows, self.windows.setup
         engine, last = setup.engine(windows.book), None
         for segment in segments(windows.frames, windows.cuts):
@@ -156,7 +157,7 @@ class _Pass:
         return replace(rig, trajectories=tuple(moved))
 
     def _solved(self, span: Span, last: int | None) -> TrajectoryGraph:
-        """Solve a window's own frames, and the `last` one before them, whose poses are known."""
+        """Solve a window's own frames, and the `last` one before them, with known poses."""
         setup = self.windows.setup
         own = span.decided[span.start : span.stop]
         frames = np.array([*([] if last is None else [last]), *(frame.frame for frame, _ in own)])
@@ -180,7 +181,7 @@ class _Pass:
 
 
 def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """Marginal of a solved window on its last poses, each carrier separately."""
+    """Marginal of a solved window on its last poses, independently for each carrier."""
     both, values = gtsam.NonlinearFactorGraph(anchors), gtsam.Values()
     for factor in graph.of_poses():
         both.push_back(factor)
@@ -194,7 +195,7 @@ def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam
 
 
 def _smoothed(whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFactor]) -> tuple[Array, Array]:
-    """(T, B, 4, 4) the poses of all frames in one graph, starting at `poses`, and their covariances (T, B, 6,
+    """(T, B, 4, 4) poses of all frames in one graph, starting at `poses`, and covariances (T, B, 6,
     6).
     """
     graph, values, keys = gtsam.NonlinearFactorGraph(), gtsam.Values(), whole.keys()
@@ -214,11 +215,13 @@ def _smoothed(whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFacto
 
 
 def _refined(given: Trajectory, time_s: Array, poses: Array, odometry: Array, covariance: Array) -> Trajectory:
-    """The trajectory through `poses` (T, 4, 4) at the frames' times, and between them along the odometry."""
+    """The trajectory through `poses` (T, 4, 4) at the frames' times, and along the odometry between
+    them.
+    """
     middle = time_s.mean(axis=1)
     first, last = np.searchsorted(given.time_s, [time_s.min(), time_s.max()])
     own = given.time_s[max(first - 1, 0) : last + 1]
-    # What is as good as at a frame is the frame's.
+    # Odometry poses that coincide with a frame are replaced by the frame's.
     place = np.clip(np.searchsorted(middle, own), 1, len(middle) - 1)
     near = np.minimum(np.abs(middle[place] - own), np.abs(middle[place - 1] - own)) < _SAME_S
     times = np.sort(np.concatenate([own[~near], middle]))

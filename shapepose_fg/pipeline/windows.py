@@ -1,7 +1,8 @@
-"""From frames to windows: people are tracked, and wait to be solved in windows of frames that overlap.
+"""From frames to windows: people are tracked, then solved in overlapping windows of frames.
 
-`Engine.follow` maps (frames, state) to (windows, state): it is quick, and memory does not grow with the recording.
-Windows are independent of each other, and are solved here or in other processes (`Setup.solve`).
+`Engine.follow` maps (frames, state) to (windows, state): it is fast, and memory does not grow with
+the recording. Windows are independent of each other, and are solved here or in other processes
+(`Setup.solve`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -25,48 +26,50 @@ from shapepose_fg.tracking.tracker import Tracker
 
 
 def window_stop(start: int, end: int, frames: int) -> int:
-    """The end of the window that begins at `start`, of `frames` frames, in a segment that ends before `end`.
+    """End of the window that begins at `start`, of `frames` frames, in a segment that ends before
+    `end`.
 
-    The last one is longer by up to half a window: a window of a few frames would determine its people less well.
+    The last one is longer by up to half a window, because a window of a few frames would constrain
+    its people less.
     """
     stop = start + frames
     return stop if stop + frames // 2 < end else end
 
 
 def near_border(times_s: Array, border_s: float, overlap_s: float) -> Mask:
-    """(T,) which frames, at `times_s` (T,), are so near to the border between two windows that both include
-    them.
+    """(T,) mask of frames, at `times_s` (T,), near enough to the border of two windows to be in
+    both.
     """
     return np.abs(times_s - border_s) <= overlap_s
 
 
 @dataclass(frozen=True)
 class Span:
-    """Frames with assigned detections that wait to be solved."""
+    """Frames with assigned detections, to be solved."""
 
     decided: tuple[Decided, ...]
-    """The frames with their rows, with those before and after that the window includes."""
+    """The frames with their rows, including the overlap before and after."""
     start: int
-    """Index of the first of `decided` whose rows are returned."""
+    """Index of the first of `decided` with rows to return."""
     stop: int
-    """Index after the last."""
+    """Index after the last of `decided` with rows to return."""
     alone: bool = False
     """Whether every frame is solved separately."""
     rig: Rig | None = None
-    """The cameras, where they move and their poses arrive with the frames; None where they are known
+    """The cameras, if they move and their poses arrive with the frames; None if they are known
     beforehand."""
 
 
 @dataclass(frozen=True)
 class StreamState:
-    """State that is carried from call to call."""
+    """State carried between calls."""
 
     follow: FollowState
-    """The tracks, and the frames whose detections are not assigned yet."""
+    """The tracks, and the frames without assigned detections."""
     decided: tuple[Decided, ...] = ()
-    """Frames that wait to be solved, and before them those that the next window includes."""
+    """Frames to be solved, and before them those that the next window includes."""
     before: int = 0
-    """Number of frames of `decided` that have been returned already."""
+    """Number of frames of `decided` that have been returned."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,8 @@ class Engine:
     def follow(
         self, state: StreamState, frames: Iterable[Input], *, last: bool = False
     ) -> tuple[list[Span], StreamState]:
-        """Track people through `frames`; returns the windows that can be solved now, each separately, in any
-        process.
+        """Track people through `frames`; returns the windows that can be solved now, independently
+        in any process.
 
         With `last` the recording ends, or is cut, after them.
         """
@@ -106,7 +109,7 @@ class Engine:
         return spans, StreamState(following, tuple(decided), before)
 
     def alone(self, frames: Iterable[Input]) -> Span:
-        """Independent frames in one window, because bodies are fitted fastest together."""
+        """Independent frames in one window, because bodies are fitted fastest in batches."""
         decided, people = list[Decided](), 0
         for frame in frames:
             decided.append(alone(self.tracker, frame, people))
@@ -114,7 +117,7 @@ class Engine:
         return Span(tuple(decided), 0, len(decided), alone=True)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
-        """The end of the next window's own frames, and of the window; None where there are too few frames."""
+        """End of the next window's own frames, and of the window; None with too few frames."""
         stop = window_stop(before, len(decided), self.config.batch_frames)
         if stop < len(decided):
             end = self._overlap(decided, stop, 1)
@@ -130,10 +133,10 @@ class Engine:
 
 
 def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: PipelineConfig) -> list[Span]:
-    """The parts of a span that must be solved again, with a further keyframe where a joint deviates from its
-    curve.
+    """Parts of a span to be solved again, with a further keyframe where a joint deviates from its
+    interpolation.
 
-    `solved` are the rows of the span's keyframes, `between` has those that were interpolated.
+    `solved` are the rows of the span's keyframes, `between` includes the interpolated ones.
     """
     given, rows = [each for each, _ in span.decided], solved.observations
     number, time_s = np.array([each.frame for each in given]), np.array([each.time_s.mean() for each in given])
@@ -157,7 +160,7 @@ def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: 
             ))  # fmt: skip
         else:
             decided.append((each, rows.rows(rows.frame == each.frame)))
-    # From the keyframe before the first to that behind the last of those that are new and near each other.
+    # From the keyframe before to the one after each group of nearby new keyframes.
     keys, near_s, spans = np.flatnonzero(key), config.windows.shared_s, list[Span]()
     every = np.flatnonzero(new)
     apart = np.flatnonzero(np.diff(time_s[every]) > near_s) + 1

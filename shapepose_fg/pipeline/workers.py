@@ -1,7 +1,9 @@
-"""Worker processes: run one function on many items, here or in parallel, in order, with the same result.
+"""Worker processes: run one function on many items, here or in parallel, in order, with the same
+result.
 
-Everything is a `concurrent.futures.Executor`: this process (`Here`), processes of this machine (`Processes`, by
-loky, which need no importable `__main__`), or those of a Dask cluster (`pipeline/cluster.py`).
+All use `concurrent.futures.Executor`: this process (`Here`), processes of this machine
+(`Processes`, by loky, which needs no importable `__main__`), or those of a Dask cluster
+(`pipeline/cluster.py`).
 """
 
 import os
@@ -44,19 +46,19 @@ class Pool(Generic[Shared]):
     executor: Executor
     """The executor."""
     call: tuple[Any, ...]
-    """A function and its first arguments; the last two are the work and the item."""
+    """A function and its first arguments; the last two arguments are the work and the item."""
     under_way: Callable[[], float]
     """Maximum number of submitted items: enough to keep all processes busy, few enough to bound memory."""
 
     def submit(self, work: Callable[[Shared, Item], Result], item: Item) -> Future[Result]:
-        """Submit `work(shared, item)`; it is done on return where there are no further processes."""
+        """Submit `work(shared, item)`; without further processes it is done on return."""
         with naming_lost_work():
             return self.executor.submit(*self.call, work, item)
 
     def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """`work(shared, item)` for each item, in order; `items` are taken as they are needed.
+        """Yield `work(shared, item)` for each item, in order; `items` are consumed on demand.
 
-        `WorkLost` where a process dies.
+        Raises `WorkLost` if a process dies.
         """
         waiting: deque[Future[Result]] = deque()
         with naming_lost_work():
@@ -70,10 +72,11 @@ class Pool(Generic[Shared]):
 
 @contextmanager
 def workers(count: int, shared: Shared, ahead: int = 2) -> Iterator[Pool[Shared]]:
-    """Start `count` processes, each of which has `shared`; for a count of 1 the work is done in this process.
+    """Start `count` processes, each with `shared`; for a count of 1 the work is done in this
+    process.
 
-    They start when the block is entered and end when it is left, whatever happens in between. `ahead` items a
-    worker are under way. ValueError for a count under 1, and for something shared that cannot be sent to another
+    They start when the block is entered and always end when it is left. `ahead` items per worker
+    are submitted. Raises ValueError for a count below 1, and if `shared` cannot be sent to another
     process; functions and classes of a script or notebook can.
     """
     if count < 1:
@@ -89,7 +92,7 @@ class Here(Executor):
     """An executor that does the work when it is submitted, in this process."""
 
     def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
-        """`fn(*args, **kwargs)`, done on return; what it raises is raised here."""
+        """`fn(*args, **kwargs)`, done on return; its exceptions are raised here."""
         done: Future[Result] = Future()
         done.set_result(fn(*args, **kwargs))
         return done
@@ -106,17 +109,17 @@ class Processes(Executor):
             self._pool.submit(_nothing)  # the first job starts all processes
 
     def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
-        """`fn(*args, **kwargs)` in one of the processes."""
+        """Submit `fn(*args, **kwargs)` to one of the processes."""
         return self._pool.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
-        """End the processes, also those that are busy."""
+        """End the processes, including busy ones."""
         self._pool.shutdown(wait=wait, kill_workers=True)
 
 
 @contextmanager
 def naming_lost_work() -> Iterator[None]:
-    """Raise `WorkLost` where a process ends in the block."""
+    """Raise `WorkLost` if a process ends in the block."""
     try:
         yield
     except BrokenProcessPool as error:
@@ -126,10 +129,10 @@ def naming_lost_work() -> Iterator[None]:
 
 
 def packed(shared: object) -> bytes:
-    """Something as bytes for other processes; ValueError where that cannot be done."""
+    """An object as bytes for other processes; raises ValueError if that is impossible."""
     try:
         return cloudpickle.dumps(shared)
-    except Exception as error:  # whatever the user's own objects raise
+    except Exception as error:  # of the user's own objects
         reason = " ".join(str(error).split())[:300]
         raise ValueError(
             f"this cannot be sent to worker processes ({type(error).__name__}: {reason}); leave out objects of"
@@ -138,7 +141,7 @@ def packed(shared: object) -> bytes:
 
 
 def suitable_workers(items: int, worth: int) -> int:
-    """Number of workers for this many items, at most one per core that this process may use and one per `worth`
+    """Number of workers for this many items: at most one per usable core, and one per `worth`
     items.
     """
     return max(1, min(cores(), items // worth))
@@ -146,8 +149,10 @@ def suitable_workers(items: int, worth: int) -> int:
 
 @contextmanager
 def _ctrl_c_blocked() -> Iterator[None]:
-    """Processes that start in the block ignore Ctrl-C, which a terminal sends to all: this process ends them."""
-    # Python's own helper of such processes lets the signal through again when it starts: it has to run by then.
+    """Processes started in the block ignore Ctrl-C, which a terminal sends to all: this process
+    ends them.
+    """
+    # Python's helper process unblocks the signal when it starts, so it must be running already.
     resource_tracker.ensure_running()
     can_block = hasattr(signal, "pthread_sigmask")
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if can_block else set()
@@ -170,7 +175,7 @@ def _begin(parent: int, initializer: Callable[..., object], *arguments: Any) -> 
 
 
 def _end_with(parent: int) -> None:
-    """End this process, also if it is busy, when the one that started it has ended, even if killed."""
+    """End this process, even if busy, when its parent has ended or was killed."""
     while os.getppid() == parent:
         time.sleep(_LOOK_S)
     os._exit(1)
@@ -188,14 +193,14 @@ def _keep(content: bytes) -> None:
 
 
 def _with_shared(work: Callable[[Any, Item], Result], item: Item) -> Result:
-    """One item, in a worker."""
+    """Process one item, in a worker."""
     if isinstance(_shared, Exception):
         raise _shared
     return work(_shared, item)
 
 
 def _call(shared: Any, work: Callable[[Any, Item], Result], item: Item) -> Result:
-    """One item, in this process."""
+    """Process one item, in this process."""
     return work(shared, item)
 
 

@@ -7,9 +7,9 @@ from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
 
 LEAST_JOINTS = 4
-"""Minimum number of joints by which a 2D person is known to be that of a person in 3D."""
+"""Minimum number of joints that a 2D person must share with a 3D person to match it."""
 _MOST_OF = 0.6
-"""Minimum share of the person's detections in the view that are of this 2D person."""
+"""Minimum share of the 3D person's detections in the view that belong to this 2D person."""
 
 
 def without_repeats(found: Detections) -> tuple[Detections, Index]:
@@ -52,10 +52,11 @@ def group_people(found: Detections) -> list[Index]:
 
 
 def whole_people(chosen: Index, found: Detections) -> Index:
-    """All detections (N, J, V) of the 2D people whose detections N people have, `chosen` (N, J, V); -1 for none.
+    """All detections (N, J, V) of the 2D people that match N 3D people; -1 for none.
 
-    A joint of which a person has another detection, or another person this one, is left out: there the groups, not
-    the detector, are wrong.
+    `chosen` (N, J, V) are the detections of the 3D people. A joint is left out if its 3D person has
+    a detection of another 2D person, or if another 3D person has its detection. There the grouping
+    into 2D people is wrong, not the detector.
     """
     group, groups = np.empty(len(found), dtype=np.intp), group_people(found)
     for number, rows in enumerate(groups):

@@ -28,7 +28,8 @@ _PRIOR = -1.75
 PRIOR_WITH_BODY = -0.3
 """Log-odds of a hypothesis without evidence, after a body fit and reassociation of detections."""
 _GAP_M = 0.03
-"""Standard deviation, m, of the weight of a detection by the distance of its ray from the joint."""
+"""A detection is weighted by a Gaussian of the distance from its ray to the joint. This is the
+standard deviation of the Gaussian, m."""
 _SINGLE = 0.1
 """Weight of a detection of a joint that no other view sees, since its depth is unknown."""
 _BESIDE = 0.5

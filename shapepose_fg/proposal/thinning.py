@@ -30,7 +30,7 @@ class ThinnedFrames(DerivedFrames):
     """
 
     rig: Rig
-    """Its V cameras."""
+    """The V cameras of the recording."""
     config: CandidateConfig
     """Settings with the limits."""
 

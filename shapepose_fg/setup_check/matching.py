@@ -141,7 +141,7 @@ class Pairs:
     members: Index
     """(M, 2) the two sightings."""
     views: Index
-    """(M, 2) their cameras."""
+    """(M, 2) cameras of the two sightings."""
     error: Array
     """(M,) median distance of their rays, as a share of the person's size in the picture."""
     frame: Index
@@ -149,7 +149,7 @@ class Pairs:
     third: Index
     """(M, V) sighting of every other camera nearest to the person's projection; -1 for none."""
     third_error: Array
-    """(M, V) its median distance, as a share of its size; inf for none."""
+    """(M, V) median distance of the sighting in `third`, as a share of its size; inf for none."""
 
     @classmethod
     def of(cls, sightings: Sightings, views: Views) -> "Pairs":

@@ -78,11 +78,11 @@ class DetectorStatistics:
     double_m: float
     """Standard deviation of each coordinate of the distance between the two, m."""
     double_confidence: Array
-    """(K,) quantiles of the confidence of the wrongly named one."""
+    """(K,) quantiles of the confidence of the wrongly named detection."""
     capture_gap_m: Array
     """(B,) distances from an occluded joint to the same joint of the occluding person, m."""
     capture: Array
-    """(B,) share of the missed joints that are captured there."""
+    """(B,) share of the missed joints that are captured, at the distances `capture_gap_m`."""
     merge_px: float
     """Distance, px at `merge_height_px`, at which the same joint of two people is merged in half
     the cases."""

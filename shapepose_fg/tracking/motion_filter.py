@@ -33,7 +33,7 @@ class JointStates(Rows):
     mean: Array
     """(A, J, 3 n) position, metres in the world, velocity, metres per second, and so on."""
     covariance: Array
-    """(A, J, 3 n, 3 n) its covariance."""
+    """(A, J, 3 n, 3 n) covariance of the states."""
 
     @property
     def position(self) -> Array:

@@ -98,11 +98,11 @@ class Seed:
     """Start of a world: its first people and their frame."""
 
     frame: int
-    """Index of that frame; -1 for the one before the first."""
+    """Index of the frame; -1 for the one before the first."""
     tracks: Tracks
     """States of the people."""
     candidate: NDArray[np.intp]
-    """(A, J, V) their detections in that frame."""
+    """(A, J, V) detections of the people in this frame."""
     forwards: bool = True
     """Whether to track forwards."""
     backwards: bool = True

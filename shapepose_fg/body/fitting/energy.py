@@ -78,7 +78,7 @@ class Evaluated(FitRows):
     free: Array
     """(B, P) free parameters."""
     energy: Array
-    """(B,) in squared standard deviations."""
+    """(B,) energy, in squared standard deviations."""
     xyz: Array
     """(B, K, 3) keypoints, metres."""
     squared: Array

@@ -18,7 +18,7 @@ LEAST_JOINTS = 4
 """Minimum number of joints with full information: three determine a pose, one more
 allows a check."""
 _SEEN_SIGMA_M = 0.3
-"""Standard deviation, m, below which, along every axis, a joint's information is full."""
+"""A joint has full information if its standard deviation along every axis is below this, m."""
 MIN_SPREAD_M = 0.03
 """Minimum root mean square distance of the joints with full information from a common line, m; else
 the rotation about it is undetermined."""

@@ -192,7 +192,7 @@ class Shapes:
     """Gaussian posteriors of the shapes (betas) of G people."""
 
     mean: Array
-    """(G, 10) in standard deviations over adults."""
+    """(G, 10) mean betas, in standard deviations over adults."""
     information: Array
     """(G, 10, 10) inverse covariances; the prior of an unknown person is the identity, around 0."""
 

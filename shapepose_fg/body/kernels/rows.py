@@ -86,7 +86,7 @@ class Linear(NamedTuple):
 
     kinds = "f1 f3 f2 f2 f3"
     energy: Array
-    """(B,) in squared standard deviations."""
+    """(B,) energy, in squared standard deviations."""
     xyz: Array
     """(B, K, 3) keypoints, metres."""
     squared: Array
@@ -135,7 +135,7 @@ class Work(NamedTuple):
     xyz: Array
     """(3 K,) points, metres."""
     push: Array
-    """(3 K,) forces on them."""
+    """(3 K,) forces on the points."""
     J: Array
     """(K, 3, 85) Jacobian of each point, its first `count` columns."""
     column: Index

@@ -73,8 +73,8 @@ class Pieces:
 
 
 def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> None:
-    """Write `arrays` as a compressed `.npz` that NumPy alone can read; equal values give equal
-    bytes.
+    """Write `arrays` as a compressed `.npz`, readable with NumPy without this package; equal values
+    give equal bytes.
 
     Arrays are requested in order, one after the other is written, and need not be in memory.
     """

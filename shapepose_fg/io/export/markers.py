@@ -114,7 +114,7 @@ def _c3d_take(written: Written, take: Take) -> tuple[Take, Array]:
 def _each(
     job: Job, take: Take, kind: str, written: Written, write: Callable[[int, Markers, Take, Written], None]
 ) -> Written:
-    """Write a file for each person with a marker; people without markers are noted."""
+    """Call `write` for each person with a marker; people without markers are noted."""
     for person, who in enumerate(take.persons.tolist()):
         markers = markers_of(take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None)
         if len(markers.frames) > 0:

@@ -1,4 +1,4 @@
-"""The result of a run, assembled from its parts column by column: in memory, or straight into the files."""
+"""Assembles the result of a run from its parts, by column: in memory, or directly into files."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,15 +25,15 @@ from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
 _FLOOR_ROWS = 4000
-"""Approximate number of rows, spread over all frames, from which a floor is found."""
+"""Approximate number of rows, spread over all frames, for finding the floor."""
 _STANDS_M_S = 0.1
-"""Maximum speed of a standing foot, m/s: that of a visible heel or toe, whose speed is known this well per
-axis."""
+"""Maximum speed of a standing foot, m/s, and of its standard deviation per axis, for a visible heel
+or toe."""
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """The parts of a run, and all that is needed to assemble a result from them."""
+    """Parts of a run, with all data for assembling a result."""
 
     parts: Parts
     """The solved windows."""
@@ -42,7 +42,7 @@ class Assembly:
     view_names: Sequence[str]
     """(V,) names of the cameras."""
     names: Mapping[int, int] = field(default_factory=dict)
-    """Names of tracks in the result; a track that is not in it keeps its number."""
+    """Identities of tracks in the result; tracks not listed keep their number."""
     bodies: BodiesOverTime | None = None
     """Bodies that replace those of the windows."""
     run: dict[str, Any] = field(default_factory=dict)
@@ -58,18 +58,18 @@ class Assembly:
 
     @cached_property
     def persons(self) -> list[NDArray[np.int64]]:
-        """For each part the identities (R,) of its rows."""
+        """Identities (R,) of the rows of each part."""
         tracks = (self.parts.column(n, "person").tolist() for n in range(len(self.parts)))
         return [np.array([self.names.get(each, each) for each in track], dtype=np.int64) for track in tracks]
 
     @cached_property
     def rows_of(self) -> dict[int, int]:
-        """The number of rows of each person."""
+        """Number of rows of each person."""
         return {number: sum(places.values()) for number, places in sorted(self._places.items())}
 
     @cached_property
     def _places(self) -> dict[int, dict[int, int]]:
-        """For each person the parts with its rows, and their number in each."""
+        """For each person the parts with rows of that person, and their number in each."""
         places: dict[int, dict[int, int]] = {}
         for n, person in enumerate(self.persons):
             for number, count in Counter(person.tolist()).items():
@@ -79,7 +79,9 @@ class Assembly:
     def own_pieces(
         self, number: int, columns: Sequence[str], rows: range | None = None
     ) -> Iterator[tuple[NDArray[Any], ...]]:
-        """`columns` of one person's rows, part by part; `rows` counts among the person's own, None for all."""
+        """`columns` of one person's rows, by part; `rows` is a range among the person's own, None
+        for all.
+        """
         wanted = range(self.rows_of[number]) if rows is None else rows
         before = 0
         for n, count in self._places[number].items():
@@ -90,15 +92,13 @@ class Assembly:
                 yield tuple(self.parts.column(n, name)[mine] for name in columns)
 
     def person(self, number: int, rows: Sequence[range]) -> Person:
-        """The data that a person's bodies are fitted to, in some of the person's own rows, one range after the
-        other.
-        """
+        """Data for fitting a person's bodies, in ranges of the person's own rows, in order."""
         columns = ("joints", "covariance", "time_s")
         pieces = [piece for part in rows for piece in self.own_pieces(number, columns, part)]
         return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
     def pieces(self, name: str) -> Iterator[NDArray[Any]]:
-        """A column of people.npz, or of observations.npz (`OBSERVED`), part by part."""
+        """A column of people.npz, or of observations.npz (`OBSERVED`), by part."""
         before: Counter[int] = Counter()
         for n, person in enumerate(self.persons):
             yield self._piece(n, name, before)
@@ -113,15 +113,15 @@ class Assembly:
         return self._columns(Reconstruction.empty(self.joint_names), "")
 
     def observation_columns(self) -> dict[str, Pieces] | None:
-        """The columns of observations.npz; None where there are no rows."""
+        """The columns of observations.npz; None without rows."""
         empty = ObservationTable.empty(self.joint_names, self.view_names)
         return self._columns(empty, OBSERVED) if len(self) > 0 else None
 
     def reconstruction(self, every: int = 1, *, consume: bool = False) -> Reconstruction:
         """The result in memory, all of it or every n-th frame.
 
-        With `consume` the parts are released as they are read, so that rows are not in memory twice; nothing else
-        can be assembled afterwards.
+        With `consume` the parts are released after reading, so that rows are not in memory twice;
+        nothing else can be assembled afterwards.
         """
         chosen = [np.flatnonzero(frame % every == 0) for frame in self.pieces("frame")]
         empty = Reconstruction.empty(self.joint_names)
@@ -146,7 +146,7 @@ class Assembly:
         return replace(empty, **rows, run=self.run, observations=table, shapes=self.shapes)
 
     def save(self, folder: Path) -> None:
-        """Write what `Reconstruction.save` writes; it is never all in memory."""
+        """Write the files of `Reconstruction.save`, without all of it in memory at once."""
         write_result(folder, self.columns(), self.observation_columns(), self.run, check_files)
 
     def with_run(self, **entries: Any) -> "Assembly":
@@ -154,7 +154,7 @@ class Assembly:
         return replace(self, run=self.run | entries)
 
     def _piece(self, n: int, name: str, before: Mapping[int, int]) -> NDArray[Any]:
-        """A column of a part; `before` is the number of rows of each person in the parts before it."""
+        """A column of a part; `before` is the number of rows of each person in earlier parts."""
         if name.removeprefix(OBSERVED) == "person":
             return self.persons[n]
         values = self.parts.column(n, name)
@@ -170,9 +170,11 @@ class Assembly:
         }
 
     def floor(self, model: BodyModel, up: Array) -> Floor | str:
-        """The floor under the soles of all bodies, or in words why none was found; `up` (3,) points up."""
+        """The floor under the soles of all bodies, or the reason why none was found; `up` (3,)
+        points up.
+        """
         joints, parts = tuple(self.joint_names), self.parts
-        # Ankles alone do not say where the sole is: unseen feet hang as the body's prior has them.
+        # Ankles do not determine the soles: unseen feet follow the body's prior.
         soles = [n for n in feet_of(joints).tolist() if not joints[n].endswith("Ankle")]
         sides = [[n for n in soles if joints[n].startswith(side)] for side in "RL"]
         if len(soles) == 0:

@@ -1,4 +1,4 @@
-"""Divides a recording into chunks whose people are tracked in parallel, and joins identities across their
+"""Divides a recording into chunks with people tracked in parallel, and joins identities across
 borders.
 """
 
@@ -19,12 +19,14 @@ from shapepose_fg.pipeline.windows import Engine, Span
 from shapepose_fg.tracking.following import BLOCK_S
 
 WARM_S = 6.0
-"""Time over which people are tracked before a chunk, s: who is present is known after a second or two, and people
-who are hidden for longer are rare. Tracking takes a tenth of the time."""
+"""Tracking time before a chunk, s: tracks are established after a second or two, and longer
+occlusions are rare. Tracking takes a tenth of the total time."""
 _SAME = 0.5
-"""Minimum share of the smaller track's detections that both tracks use, from which on they are one person."""
+"""Minimum share of the smaller track's detections that both tracks use for them to be
+one person."""
 _NEAR_M = 0.3
-"""Mean distance between the joints of two tracks without detections, m, below which they are one person."""
+"""Mean distance between joints of two tracks without detections, m, below which they are one
+person."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,11 @@ class Chunk:
     """Frames that are reconstructed independently of all others."""
 
     own: range
-    """The frames whose rows belong to the chunk."""
+    """Frames of the chunk's rows."""
     first: int
-    """The first frame in which people are tracked."""
+    """First frame of tracking."""
     until: int
-    """The frame before which tracking ends; the last of the chunk's own windows is decided by then."""
+    """Frame before which tracking ends; the chunk's last own window is decided by then."""
     ended: bool
     """Whether the recording ends, or is cut, at `until`."""
 
@@ -44,16 +46,17 @@ class Chunk:
 def cut_in_chunks(
     frames: range, cuts: Sequence[int], time_s: Array, config: PipelineConfig, chunk_frames: int
 ) -> list[Chunk]:
-    """Chunks of about `chunk_frames` whose borders are those of windows, so that windows are as without chunks.
+    """Chunks of about `chunk_frames`, with borders at those of windows, so that windows are the
+    same as without chunks.
 
-    `time_s` (T,) are the times of all frames of the recording. Tracking begins whole windows before a chunk, at
-    least `WARM_S`. Each segment between cuts is divided separately.
+    `time_s` (T,) are the times of all frames of the recording. Tracking begins whole windows before
+    a chunk, at least `WARM_S`. Each segment between cuts is divided separately.
     """
     batch = config.batch_frames
     step = max(1, round(chunk_frames / batch)) * batch
     found = []
     for segment in segments(frames, cuts):
-        # The last window takes up to half a window more than its own frames (`Engine.follow`).
+        # The last window is up to half a window longer (`Engine.follow`).
         borders = [at for at in segment[step::step] if at + batch // 2 < segment.stop]
         for start, stop in zip((segment.start, *borders), (*borders, segment.stop), strict=True):
             first = start
@@ -65,11 +68,11 @@ def cut_in_chunks(
 
 
 def _until(stop: int, segment: range, first: int, time_s: Array, config: PipelineConfig) -> int:
-    """The frame to which people must be tracked for the window that ends at `stop`.
+    """Frame up to which people must be tracked for the window that ends at `stop`.
 
-    It is half a window and the overlap beyond it, the block in which that is decided, the tracker's look-ahead,
-    and two frames to spare, in whole batches. `Engine` compares means over the cameras' times, which round
-    differently: a frame more or less, twice.
+    It adds half a window and the overlap, the block in which that is decided, the tracker's
+    look-ahead, and two spare frames, in whole batches. `Engine` compares means over the cameras'
+    times, with other rounding: one frame more or less, twice.
     """
     beyond = stop + config.batch_frames // 2 + 1
     while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.shared_s:
@@ -86,7 +89,7 @@ def _until(stop: int, segment: range, first: int, time_s: Array, config: Pipelin
 
 
 def windows_of(engine: Engine, chunk: Chunk, read: Callable[[int], Input]) -> Iterator[Span]:
-    """The windows of a chunk, whose people are tracked from `chunk.first` on."""
+    """The windows of a chunk, with people tracked from `chunk.first` on."""
     state, done, step = engine.start(), chunk.first, engine.config.batch_frames
     for start in range(chunk.first, chunk.until, step):
         batch = range(start, min(start + step, chunk.until))
@@ -105,7 +108,7 @@ class Border(Table):
     frame: Annotated[Index, Column("N", np.intp)]
     """(N,) frame of each row."""
     track: Annotated[Index, Column("N", np.intp)]
-    """(N,) track of each row, as numbered in one of the chunks."""
+    """(N,) track of each row, by its number in one of the chunks."""
     candidate: Annotated[Index, Column("N J V", np.intp)]
     """(N, J, V) detections of the row; -1 for none."""
     place: Annotated[Array, Column("N J 3", unit="m")]
@@ -113,16 +116,16 @@ class Border(Table):
 
     @classmethod
     def of(cls, span: Span) -> "Border":
-        """The rows of a window, and of the frames that it overlaps."""
+        """The rows of a window, including the frames of its overlap."""
         rows = Observations.concatenate([rows for _, rows in span.decided])
         return cls(rows.frame, rows.track, rows.candidate, rows.initial)
 
 
 def same_people(before: Border, after: Border) -> dict[int, int]:
-    """Match tracks of `after` with those of `before`, one to one, as far as they are the same person.
+    """Match tracks of `after` one-to-one with the same people in `before`.
 
-    Tracks match by the detections that both chunks assigned to them in the frames that both have; tracks without
-    detections by their predicted joints.
+    Tracks match by common detections in common frames; tracks without detections by their predicted
+    joints.
     """
     shared = np.intersect1d(before.frame, after.frame)
     before, after = (each.rows(np.isin(each.frame, shared)) for each in (before, after))
@@ -136,8 +139,8 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
 
 
 def _alike(a: Border, b: Border) -> float:
-    """Similarity of two tracks: 0 for two people; up to 1 without detections, and up to 2 by the share of
-    common ones.
+    """Similarity of two tracks: 0 for two people; up to 1 without detections, and up to 2 by common
+    ones.
     """
     _, first, second = np.intersect1d(a.frame, b.frame, return_indices=True)
     if len(first) == 0:
@@ -153,7 +156,7 @@ def _alike(a: Border, b: Border) -> float:
 
 
 class Identities:
-    """Assigns identities to the tracks of consecutive chunks, so that a person keeps the identity."""
+    """Assigns identities to the tracks of consecutive chunks, consistently over chunks."""
 
     def __init__(self, next_id: int, border: Border | None) -> None:
         """`next_id` is the next free identity, `border` the tracks at the end of the chunk before."""
@@ -161,8 +164,8 @@ class Identities:
         self.border = border
 
     def names(self, begins: Border, *, alone: bool) -> dict[int, int]:
-        """Identities of those tracks of a chunk that continue one of the chunk before; empty where frames are
-        `alone`.
+        """Identities of tracks that continue one of the chunk before; empty if frames
+        are `alone`.
         """
         return {} if alone or self.border is None else same_people(self.border, begins)
 

@@ -1,4 +1,4 @@
-"""The folder of an unfinished run: free space, what the run was begun from, and what it has done so far."""
+"""Folder of an unfinished run: its inputs, its progress, and disk space."""
 
 import hashlib
 import json
@@ -24,29 +24,31 @@ from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder, KeptArrays
 from shapepose_fg.pipeline.runs.parts import Parts
 
 PARTS = "parts"
-"""The folder of an unfinished run, beside its results."""
+"""Folder of an unfinished run, next to its results."""
 _GONE = ".parts-gone"
-"""Name of that folder while it is removed: if interrupted, it is not mistaken for an unfinished run."""
+"""Name of this folder while it is removed, so that an interrupted removal is not mistaken for an
+unfinished run."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
 _LOOKED_AT = 200
-"""Number of frames, spread over the run, from which the number of people is estimated."""
+"""Number of frames, spread over the run, for estimating the number of people."""
 _WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
-"""Names of differences that need other words than their keys."""
+"""Words for differences, for keys that are not words themselves."""
 
 
 def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False) -> InFolder:
-    """The folder of a run into `output` that is begun from `begun`, plain values; or resumed, with `resume`.
+    """The folder of a run into `output` with inputs `begun`, plain values; or of the resumed one,
+    with `resume`.
 
-    With `restart` the remains of an interrupted run are removed. InputError where there are some and neither is
-    given, and where it was begun from something else: the first difference is named. The caller is the only run in
-    `output`.
+    With `restart` the files of an interrupted run are removed. Raises InputError if there are some
+    and neither is given, and if its inputs were others: the first difference is named. The caller
+    must be the only run in `output`.
     """
     folder = inside(output, PARTS)
     manifest = inside(folder, _MANIFEST)
-    shutil.rmtree(inside(output, _GONE), ignore_errors=True)  # what a kill left of a run that was being removed
+    shutil.rmtree(inside(output, _GONE), ignore_errors=True)  # left by an interrupted removal
     begun = json.loads(json.dumps({"format": _FORMAT, **begun}))
-    # A run that was killed at its very beginning leaves the manifest's temporary file alone.
+    # A run killed at its start leaves only the manifest's temporary file.
     left = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     if not manifest.is_file() and any(not file.name.startswith(f".{_MANIFEST}.") for file in left):
         raise InputError(f"{folder}: this is not a run of this program; move it, or give another --output")
@@ -73,12 +75,12 @@ def frames_done(output: Path) -> int:
 
 
 def _digest(begun: Any) -> str:
-    """Digest of what a run was begun from."""
+    """Digest of a run's inputs."""
     return hashlib.sha256(json.dumps(begun, sort_keys=True).encode()).hexdigest()
 
 
 def end_run(output: Path) -> None:
-    """Remove the files of a run whose results are written."""
+    """Remove the files of a finished run."""
     gone = inside(output, _GONE)
     shutil.rmtree(gone, ignore_errors=True)
     if (output / PARTS).exists():
@@ -87,7 +89,7 @@ def end_run(output: Path) -> None:
 
 
 def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
-    """InputError where a run was begun from something else."""
+    """Raise InputError if a run had other inputs."""
     found = difference(before, now)
     if found is None:
         return
@@ -100,10 +102,10 @@ def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
 
 
 def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> int:
-    """Upper bound of the space that a run needs on the disk: its rows twice, as parts and as results.
+    """Upper bound of the disk space for a run, bytes: its rows twice, as parts and as results.
 
-    The number of people is estimated by the detections of each joint per view, in the mean over views, joints and
-    frames.
+    The number of people is estimated by the detections of each joint per view, averaged over views,
+    joints and frames.
     """
     joints = detections.skeleton.joints
     if len(frames) == 0:
@@ -117,7 +119,7 @@ def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> in
 
 
 def check_room(folder: Path, needed: int) -> None:
-    """InputError where the disk of `folder` has less free space."""
+    """Raise InputError if the disk of `folder` has less free space than `needed` bytes."""
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise InputError(
@@ -131,9 +133,10 @@ _KNOWN, _WRITTEN, _ARRAYS = "known-people", "known-people-written", ("betas", "i
 
 
 def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShapes]) -> SubjectShapes:
-    """People known when the run began; `load` reads them from `file`, a file of shapes, when it begins.
+    """People known when the run began; `load` reads them from `file`, a file of shapes, at the
+    beginning.
 
-    InputError where the file has changed since, unless this run itself wrote it.
+    Raises InputError if the file has changed since, except by this run itself.
     """
     now = hashlib.sha256(read_bytes(file)).hexdigest() if file.exists() else None
     if _KNOWN not in kept.names(_KNOWN):
@@ -161,7 +164,7 @@ def checksum_at_start(kept: KeptArrays) -> str:
 
 
 def write_people(kept: KeptArrays, file: Path, people: SubjectShapes) -> None:
-    """Bring `file` up to date; a run that is interrupted right afterwards recognises its own change."""
+    """Update `file`; a run interrupted right afterwards recognises its own change."""
     content = BytesIO()
     people.write(content)
     kept.keep(_WRITTEN, {}, hashlib.sha256(content.getvalue()).hexdigest())

@@ -1,4 +1,4 @@
-"""Solved windows, stored one after the other: what a run has done so far, and where it can be resumed."""
+"""Solved windows, stored in order: the progress of a run, from which it can be resumed."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ _STATUS = np.array([*map(str, Status)])
 """Statuses, stored as their index in this list."""
 _CODE = Column("N", np.uint8, codes=Status)
 OBSERVED = "observations."
-"""Prefix of the names of observations' columns among those of a part."""
+"""Prefix of observations' columns among those of a part."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Checkpoint:
     """State of tracking after a batch of frames."""
 
     frame: int
-    """The first frame that was not tracked."""
+    """First frame that is not tracked yet."""
     next_id: int = 0
-    """The next free identity."""
+    """Next free identity."""
     state: StreamState | None = None
-    """State of the tracker; None before a cut, at the end of a chunk, and frame by frame."""
+    """State of the tracker; None before a cut, at the end of a chunk, and for separate frames."""
     border: Border | None = None
     """Tracks at the end of the last chunk, between chunks."""
 
@@ -48,18 +48,20 @@ class Part:
     """One window, solved."""
 
     rows: Reconstruction
-    """Rows of the window; a person is a track there, or frame by frame a number within the frame."""
+    """Rows of the window; a person is a track, or in separate frames a number within the frame."""
     notes: Notes
-    """Notes about it."""
+    """Notes about the window."""
     checkpoint: Checkpoint | None = None
-    """State with which tracking continues after it, where that is known."""
+    """State for continuing tracking after the window, if known."""
 
 
 class Parts:
     """The windows of a run, in order."""
 
     def __init__(self, kept: KeptArrays) -> None:
-        """The stored windows of `kept`, up to the last one from which the run can be resumed."""
+        """Open the stored windows of `kept`, up to the last one from which the run can
+        be resumed.
+        """
         self.kept = kept
         followed = kept.names("followed-")
         self._followed = followed[-1] if followed else None
@@ -77,11 +79,13 @@ class Parts:
         return sum(self._counts)
 
     def append(self, part: Part) -> None:
-        """Store the next window. When this returns, and it has a checkpoint, the run can be resumed behind it."""
+        """Store the next window. After that the run can be resumed behind it, if it has a
+        checkpoint.
+        """
         n, rows, table = len(self), part.rows, part.rows.observations
         if table is None:
             raise ValueError("the rows of a part need their observations")
-        # Frame and person are those of the rows.
+        # Frame and person are columns of the rows.
         arrays = {OBSERVED + name: getattr(table, name) for name in table.ROWS[2:]}
         arrays |= {name: getattr(rows, name) for name in rows.ROWS}
         arrays["status"] = np.argmax(rows.status[:, None] == _STATUS, axis=1).astype(np.uint8)
@@ -94,14 +98,16 @@ class Parts:
                 self.kept.drop(before)
 
     def column(self, n: int, name: str) -> NDArray[Any]:
-        """A column of a part, by its name in people.npz, or in observations.npz with `OBSERVED` before it."""
+        """A column of a part, by its name in people.npz, or with the prefix `OBSERVED` in
+        observations.npz.
+        """
         shared = name.removeprefix(OBSERVED)
         values = self.kept.array(_name(n), shared if shared in ObservationTable.ROWS[:2] else name)
         return _STATUS[_CODE.checked(name, values, {})] if name == "status" else values
 
     def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range, frame_s: Array) -> None:
-        """InputError for a part that is none of a run of these joints, views and frames; `frame_s` (T,) are the
-        times of all frames of the recording.
+        """Raise InputError if a part is not of a run with these joints, views and frames; `frame_s`
+        (T,) are the times of all frames of the recording.
         """
         done = frames.start
         for n in range(len(self)):
@@ -124,7 +130,7 @@ class Parts:
         self.kept.drop(_name(n))
 
     def notes(self) -> Notes:
-        """Notes about all of them."""
+        """Notes about all windows."""
         notes = Notes()
         for n in range(len(self)):
             with naming(self.kept.place(_name(n)), ANEW):
@@ -132,9 +138,11 @@ class Parts:
         return notes
 
     def checkpoint(self, read: Callable[[int], Input], frames: range, nobody: Tracks) -> Checkpoint | None:
-        """State with which tracking continues; None at the beginning. `read` returns the input of a frame.
+        """State for continuing tracking; None at the beginning. `read` returns the input of a
+        frame.
 
-        InputError where it is none of a run of these `frames`, whose tracks are as those of `nobody`.
+        Raises InputError if it is not of a run with these `frames`, and tracks in the form of
+        `nobody`.
         """
         name = self._followed
         if name is None:
@@ -148,7 +156,7 @@ class Parts:
 
 
 def _are_of(rows: Reconstruction, frames: range, frame_s: Array) -> bool:
-    """Whether rows are of these frames, at their times, and each person at most once per frame."""
+    """Whether rows are in these frames, at their times, with each person at most once per frame."""
     if np.any((rows.frame < frames.start) | (rows.frame >= frames.stop)):
         return False
     each = np.unique(np.stack([rows.frame, rows.person], axis=1), axis=0)
@@ -160,7 +168,7 @@ def _name(n: int) -> str:
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
-    """A checkpoint as arrays. The cameras' input is not among them: it is read again."""
+    """A checkpoint as arrays, without the cameras' input, which is read again."""
     arrays: dict[str, NDArray[Any]] = {"at": np.array([checkpoint.frame, checkpoint.next_id])}
     if checkpoint.border is not None:
         arrays |= {f"border.{name}": getattr(checkpoint.border, name) for name in Border.ROWS}
@@ -183,7 +191,7 @@ _ROWS = {
     "initial": Column("N J 3", most=1e6),
     "evidence": Column("N", most=1e6),
 }
-"""Columns of a row that waits to be solved; the rest comes from the cameras."""
+"""Columns of a row that is not solved yet; the rest comes from the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
 _FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6)}
 _FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12)}
@@ -195,10 +203,10 @@ _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).it
 def checkpoint_of(
     arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range, nobody: Tracks
 ) -> Checkpoint:
-    """The checkpoint from the `arrays` that `checkpoint_arrays` returned.
+    """Inverse of `checkpoint_arrays`.
 
-    `read` returns the input of a frame; frames before `solved` are in parts, and `frames` are all of the run.
-    ValueError where the arrays are not of such a run.
+    `read` returns the input of a frame; frames before `solved` are in parts, and `frames` are all
+    of the run. Raises ValueError if the arrays do not fit such a run.
     """
     following, next_id = arrays["at"].tolist()
     next_track, before = arrays["state.numbers"].tolist() if "state.numbers" in arrays else (0, 0)
@@ -233,13 +241,15 @@ def checkpoint_of(
 
 
 def _check_tracks(track: Index, next_id: int) -> None:
-    """ValueError for duplicate tracks, and for tracks with numbers that were not given yet."""
+    """Raise ValueError for duplicate tracks, and for numbers not assigned yet."""
     if len(np.unique(track)) < len(track) or np.any(track >= next_id):
         raise ValueError(f"its tracks must be different numbers below {next_id}")
 
 
 def _check_candidates(candidate: Index, given: Input) -> None:
-    """ValueError where `candidate` (N, J, V) are not detections of these joints in these views, or -1."""
+    """Raise ValueError unless `candidate` (N, J, V) are detections of these joints in these views,
+    or -1.
+    """
     seen, joint, view = given.detections, *np.nonzero(candidate != -1)[1:]
     chosen = candidate[candidate != -1]
     wrong = candidate.shape[2:] != (len(given.rig),) or np.any((chosen < 0) | (chosen >= len(seen)))

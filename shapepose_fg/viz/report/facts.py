@@ -73,8 +73,10 @@ def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
 
 
 def _noise(told: Run) -> list[tuple[float, float, float, float, int]]:
-    """Errors of the detector, a row per range of scores from which it was learnt: middle of the range, standard
-    deviation, that of what ships, mm, share of gross errors, and number of detections.
+    """Table of the detector's noise law, with a row for each range of scores that had detections.
+
+    Columns are the middle of the range, the standard deviation, mm, that of the shipped law, mm, the
+    share of gross errors, and the number of detections.
     """
     try:
         law, usual = NoiseLaw.from_dict(told).as_dict(), NoiseLaw.shipped().as_dict()
