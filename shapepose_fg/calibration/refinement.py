@@ -70,8 +70,8 @@ class Refinement:
     stature_m: float = float("nan")
     """Median of the people's statures from their bones, in the adjusted cameras' metres."""
     probability: float = 1.0
-    """Probability that the given cameras are wrong, rather than the detector biased, with biases
-    common to frames of a person."""
+    """Probability that the given cameras are wrong. The alternative is that the detector is biased,
+    with biases common to frames of a person."""
 
     @property
     def better(self) -> bool:
@@ -180,7 +180,7 @@ def refine(
 
 
 def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
-    """The rig with misaligned cameras, by degrees, rotated to fit the people of the others."""
+    """The rig; cameras misaligned by degrees are rotated to fit the people seen by the others."""
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
     turned = {view for each in findings if each.kind in kinds for view in each.cameras}
     cameras = list(rig.cameras)

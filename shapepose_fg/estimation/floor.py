@@ -49,7 +49,7 @@ class Floor:
     looks: int
     """Number of looks at standing feet used."""
     share: float
-    """Share of these that agree."""
+    """Share of these looks that agree with the floor."""
 
     def above(self, points: Array) -> Array:
         """(...,) height of points (..., 3) above the floor, metres."""

@@ -71,8 +71,8 @@ class MotionModel:
     """(J,) increase of this density per (m/s)² of the joint's speed: fast joints also accelerate
     more."""
     psd_lost: Array
-    """(J,) minimum of this density while a joint is lost, with unknown speed: the mean over all
-    speeds."""
+    """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum is
+    the mean over all speeds."""
     views: Lasting
     """Error of estimates of a joint from all views of one frame."""
     body: Lasting

@@ -68,7 +68,7 @@ class Marginal:
     """(3 K, 3 K) covariance, m², ordered by joint."""
 
     def block(self, one: int, other: int) -> Array:
-        """(3, 3) covariance of two of them, m²."""
+        """(3, 3) covariance of the errors of two joints, by index, m²."""
         return self.covariance[3 * one : 3 * one + 3, 3 * other : 3 * other + 3]
 
 
@@ -82,7 +82,7 @@ class Distance:
     """
 
     apart: Array
-    """(..., 3) displacement from one point to the other, metres."""
+    """(..., 3) mean displacement from the first to the second point, metres."""
     covariance: Array
     """(..., 3, 3) covariance of `apart`, m²."""
 

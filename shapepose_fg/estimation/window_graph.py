@@ -181,7 +181,7 @@ class WindowGraph:
         """(T, J, 3) positions and velocities of the last solution, metres and m/s; NaN if not in
         it."""
         self.chains: list[Chains] = []
-        """The last problem of several frames by joint, without user factors."""
+        """The last multi-frame problem, as chains of joints without user factors."""
 
     @property
     def keys(self) -> NDArray[np.int64]:

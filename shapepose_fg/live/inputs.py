@@ -124,7 +124,7 @@ class _Sender:
             self.good += 1
 
     def end(self) -> None:
-        """Raise InputError if lines came and none was accepted."""
+        """Raise InputError if there were lines, but none was accepted."""
         if self.good == 0 and self.refused is not None:
             raise self.refused
 

@@ -82,7 +82,7 @@ class Scheduler:
     address: str
     """`tcp://host:8786`."""
     processes: int
-    """Current number of its processes."""
+    """Current number of worker processes."""
     dashboard: str | None
     """Address of its dashboard; None if there is none."""
 

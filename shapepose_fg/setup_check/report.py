@@ -33,7 +33,7 @@ class CameraFigures:
     people: int
     """Number of people seen in the frames used."""
     matched: float
-    """Share of them that another camera sees too."""
+    """Share of these people that another camera sees too."""
     median_px: float | None
     """Median reprojection error of all matched joints, pixels."""
     high_px: float | None
@@ -45,7 +45,7 @@ class CameraFigures:
     left_out_px: float | None
     """Median distance from joints triangulated by the other cameras only, pixels."""
     left_out_mm: float | None
-    """Median of this distance as a length, millimetres."""
+    """Median distance from these joints as a length, millimetres."""
     left_out_matched: float
     """Share of the possible matches with people of the others that the camera has."""
     late_frames: int

@@ -29,7 +29,7 @@ _HALF_ROOM_M = 1.75
 _LIMBS_M = 0.12
 """Minimum distance of a standing person's joints from those of others, if space permits, m."""
 _TORSO_M = 0.2
-"""Minimum distance of another person's joints from these, m."""
+"""Minimum distance of another person's joints from pelvis, spine and neck, m."""
 _MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
 """Pelvis and chest; elbows, wrists, hands, knees."""
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
@@ -88,7 +88,7 @@ class Room:
         self.performed: list[Performance] = []
         """Motions of the people, in order of arrival."""
         self.names: list[str] = []
-        """Names of their recordings."""
+        """Names of the recordings of these motions."""
 
     def add_pair(self, betas: Array, pair: tuple[Clip, Clip]) -> None:
         """Add two people who dance together, with a common scale, so that held hands
