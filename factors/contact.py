@@ -35,7 +35,7 @@ def standing_factors(
             f" {before.shape}, {after.shape}, {dt.shape}, {q.shape}"
         )
     if not (_positive(dt) and _positive(q)):
-        raise ValueError("dt_s and density must be positive and finite: leave out steps that are none")
+        raise ValueError("dt_s and density must be positive and finite: leave out empty steps")
     models = isotropic_models(3, np.sqrt(q * dt))
     return list(map(gtsam.BetweenFactorPoint3, before.tolist(), after.tolist(), repeat(np.zeros(3)), models))
 

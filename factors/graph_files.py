@@ -54,9 +54,9 @@ def load_graph(file: str | Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Valu
     try:
         content = json.loads(Path(file).read_text(encoding="utf-8"), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: is no JSON text ({str(error)[:80]}); {_CURE}") from None
+        raise ValueError(f"{file}: cannot be read as JSON ({str(error)[:80]}); {_CURE}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f'{file}: is not of the format "{FORMAT}"; {_CURE}')
+        raise ValueError(f'{file}: this is not a file of the format "{FORMAT}"; {_CURE}')
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     place = "values"
     try:
@@ -178,7 +178,7 @@ class _Writer:
             if not all(map(self._values.exists, factor.keys())):
                 raise ValueError("has a variable that is not among the values")
             if name is None:
-                raise ValueError("is of a class that has no record; linearise it (gtsam.LinearContainerFactor)")
+                raise ValueError("is of a class that cannot be saved; linearise it (gtsam.LinearContainerFactor)")
             found: dict[str, Any] = {"kind": name, "keys": list(factor.keys())}
             if name == _LINEAR:
                 return found | _linear_data(factor)
@@ -189,7 +189,7 @@ class _Writer:
                 *(each.linearize(self._values).jacobian() for each in (factor, _factor(found))), strict=True
             ):
                 if not np.abs(here - there).max() <= 1e-9 * max(np.abs(here).max(), 1.0):
-                    raise ValueError("would not be read back the same")
+                    raise ValueError("would differ when it is read")
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"factor {number}, {type(factor).__name__}: {error}") from None
         return found
@@ -261,7 +261,7 @@ def _noise_data(model: Any) -> dict[str, Any]:
     if isinstance(model, noiseModel.Robust):
         kernel, base = _kernel_data(model.robust()), cast(Any, model.noise())
     if base is None or base.isConstrained():
-        raise ValueError("a constraint has no noise: give it a small one")
+        raise ValueError("a constraint has no noise: give it a small sigma")
     return {"noise": base.R().tolist()} | ({"kernel": kernel} if kernel is not None else {})
 
 
@@ -289,10 +289,12 @@ def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
     linear = factor.linearize(origin) if factor.isJacobian() else None
     A, b = linear.jacobian() if isinstance(linear, gtsam.JacobianFactor) else (np.zeros((0, 0)), np.zeros(0))
     if A.shape[1] != 3 * len(keys):
-        raise ValueError("a linear factor must be a Jacobian on points: rotations turn what it was linearised at")
+        raise ValueError(
+            "a linear factor must be a Jacobian on points, because rotations change its point of linearisation"
+        )
     off = factor.error(origin) - (b @ b) / 2
     if abs(off) > 1e-9 * max(b @ b, 1.0):
-        raise ValueError("has no point of linearisation, and so no error: make it with factors.linear_factor")
+        raise ValueError("has no point of linearisation, and so no error: create it with factors.linear_factor")
     return {"data": [A.tolist(), b.tolist()]}
 
 

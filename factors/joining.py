@@ -102,7 +102,7 @@ def reported_factor(
     and does not constrain the poses alone. ValueError for more than two poses.
     """
     if len(poses) > 2:
-        raise ValueError(f"a joint goes with two poses at the most, got {len(poses)}")
+        raise ValueError(f"a joint may be attached to at most two poses, got {len(poses)}")
     if not poses:
         return gtsam.PriorFactorPoint3(key, place, gaussian(covariance))
     root = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -151,7 +151,7 @@ class PeopleInGraph:
         seen = np.isfinite(one.xy).all(axis=-1) & placed[:, None]
         last_s, last_frame = self._last.setdefault(one.person, (np.full(J, -np.inf), np.zeros(J, dtype=np.int64)))
         if not one.time_s > last_s.max(initial=-np.inf):
-            raise ValueError(f"person {one.person}: frames must rise in time, {one.time_s} s comes too late")
+            raise ValueError(f"person {one.person}: frames must be in order of time, but {one.time_s} s is not")
         linked = one.time_s - last_s <= self._link_s
         there = np.flatnonzero(seen.any(axis=1))
         x, v = (

@@ -60,7 +60,7 @@ def analytic_jacobian(factor: Factor, values: gtsam.Values) -> NDArray[np.float6
     whitened = np.linalg.norm(_whitened(factor, values))
     scale = np.linalg.norm(right_hand_side) / whitened if whitened > 0 else 1.0
     if scale == 0.0:
-        raise AssertionError("the robust kernel gives this factor no weight at all: test nearer to the truth")
+        raise AssertionError("the robust kernel gives this factor no weight: test closer to the truth")
     return np.asarray(jacobian) / scale
 
 

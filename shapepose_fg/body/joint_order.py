@@ -37,9 +37,9 @@ class _Distances:
     """Log-distances between `BODY_POINTS`, relative to the mean over all pairs of a body."""
 
     mean: Array
-    """(P, P) mean over poses, builds and views."""
+    """(P, P) mean log-distance over poses, builds and views."""
     sigma: Array
-    """(P, P) standard deviation over poses, builds and views."""
+    """(P, P) standard deviation of the log-distance over poses, builds and views."""
 
 
 @cache

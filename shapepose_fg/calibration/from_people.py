@@ -50,9 +50,7 @@ _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 _UNUSUAL = 3.0
 """Maximum deviation of stature, in standard deviations, for people assumed to be adults."""
 _FREE = Freedom(turn_deg=20.0, move_m=1.0)
-_FILM = (
-    "film a minute of two or more people who walk through all that the cameras see, near and far, not on one line"
-)
+_FILM = "film two or more people for a minute who walk through all views, near and far, not on one line"
 
 
 class Undetermined(ValueError):
@@ -180,8 +178,8 @@ def calibrate(
     usual = _UNUSUAL * sigma_of_scale(world.persons, False)
     if not measured.distances or abs(np.log(world.stature_m / ADULT_M)) < usual:
         return found
-    tall = f"people come out {world.stature_m:.2f} m tall in the median"
-    return replace(found, notes=(f"{tall}; if they are adults, measure the cameras' distance again",))
+    tall = f"the median stature of people is {world.stature_m:.2f} m"
+    return replace(found, notes=(f"{tall}; if they are adults, measure the distance of the cameras again",))
 
 
 def _pairs(
@@ -210,7 +208,7 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
     seen_s = np.bincount(sightings.view, minlength=len(rig)) / fps
     if len(few := np.flatnonzero(seen_s < _LEAST_S)) > 0:
         figures = ", ".join(f"{each:.1f}" for each in seen_s[few])
-        least = f"{_LEAST_S:g} s of a person are the least, {figures} s are seen"
+        least = f"at least {_LEAST_S:g} s of a person are needed, but only {figures} s are seen"
         raise Undetermined((f"{_named(rig, few)}: {least}; {_FILM}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
     return [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
@@ -220,8 +218,8 @@ def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
     """Cameras that share too little with the others, in words."""
     most = " ".join(rig.names[view] for view in connected[0])
     return [
-        f"{_named(rig, part)}: too few people are seen at the same moments there and by {most}, or cameras are not"
-        f" synchronised; {_FILM}, where views overlap"
+        f"{_named(rig, part)}: too few people are seen there and by {most} at the same times, or cameras are"
+        f" not synchronised; {_FILM}, where views overlap"
         for part in connected[1:]
     ]
 
@@ -257,15 +255,19 @@ class _How:
         for step in range(rounds):
             people = footage.people(now)
             if len(people) < LEAST_PEOPLE or not people.seen.any():
-                few = f"only {len(people)} people are seen by two cameras at once, {LEAST_PEOPLE} are the least"
-                raise Undetermined((f"{few}; {_FILM}",))
+                raise Undetermined(
+                    (
+                        f"only {len(people)} people are seen by two cameras at once, but at least 10 are needed;"
+                        f" {_FILM}",
+                    )
+                )
             given = self.given.at_poses(now.wTc)
             spread = dilution(self.times.frame_s[np.unique(people.frame)])
             adjusted = adjust(given, now, people, self.freedom, spread, misfit(people, now), scaled=True)
             factor = scale_of(adjusted.people, self.skeleton, self.stature_m)
             if not np.isfinite(factor):
                 raise Undetermined(
-                    (f"nobody's arms and legs are seen by two cameras: there is no scale; {_FILM}",)
+                    (f"no arms and legs are seen by two cameras, so the scale is unknown; {_FILM}",)
                 )
             adjusted = _grown(adjusted, factor)
             before, now = now, adjusted.rig
@@ -302,8 +304,12 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
     few, vague = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
     torn = apart_deg > _MOST_APART_DEG
     kinds = (
-        (few, counts, f"{{}} people whom another camera sees, {LEAST_PEOPLE} are the least"),
-        (~few & vague, sigma.round(1), "the people's motion determines the direction to {} degrees only"),
+        (
+            few,
+            counts,
+            f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} are needed",
+        ),
+        (~few & vague, sigma.round(1), "the motion of the people determines the rotation to {} degrees only"),
         (~few & ~vague & torn, apart_deg.round(1), "the two halves of the recording are {} degrees apart"),
     )
     problems = [

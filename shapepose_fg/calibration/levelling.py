@@ -62,8 +62,8 @@ class Measured:
         if abs(said[worst] - log) > _CONTRADICTS * sigma[worst]:
             a, b, given = self.distances[worst]
             raise InputError(
-                f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances put them"
-                f" {np.exp(log) * length[worst]:.2f} m apart, not {given:g} m; measure again"
+                f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances give"
+                f" {np.exp(log) * length[worst]:.2f} m instead of {given:g} m; measure again"
             )
         return float(np.exp(log)), float(1 / np.sqrt(weight.sum()))
 

@@ -68,8 +68,8 @@ class Refinement:
     stature_m: float = float("nan")
     """Median of the people's statures from their bones, in the adjusted cameras' metres."""
     probability: float = 1.0
-    """Probability that the given cameras are wrong, rather than the detector biased, with biases
-    common to frames of a person."""
+    """Probability that the given cameras are wrong. The alternative is that the detector is biased,
+    with biases common to frames of a person."""
 
     @property
     def better(self) -> bool:
@@ -163,7 +163,8 @@ def refine(
     missed = (np.concatenate(before), np.concatenate(after))
     if not np.isfinite(missed[0]).any():
         raise InputError(
-            "no joint is seen by three cameras, on frames that were not used; refining cannot be tried"
+            "no joint is seen by three cameras in the frames for validation, so a refinement cannot be"
+            " validated; give more frames"
         )
     was, now = (float(np.nanmedian(each)) for each in missed)
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
@@ -177,7 +178,7 @@ def refine(
 
 
 def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
-    """The rig with misaligned cameras, by degrees, rotated to fit the people of the others."""
+    """The rig; cameras misaligned by degrees are rotated to fit the people seen by the others."""
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
     turned = {view for each in findings if each.kind in kinds for view in each.cameras}
     cameras = list(rig.cameras)
@@ -206,9 +207,8 @@ def _fitted(
         people = footage.people(rig_now)
         if len(people) < LEAST_PEOPLE or not people.seen.any():
             raise InputError(
-                f"only {len(people)} people are seen by two cameras at once, at the frames that were looked at;"
-                f" cameras are refined by at least {LEAST_PEOPLE}: film people where views overlap, or see"
-                " shapepose-fg check-calibration"
+                f"only {len(people)} people are seen by two cameras at once in the checked frames, but at least"
+                " 10 are needed; film people where views overlap, or run shapepose-fg check-calibration"
             )
         spread = dilution(times.frame_s[np.unique(people.frame)])
         adjusted = adjust(rig, rig_now, people, freedom, spread, misfit(people, rig_now), reference)
@@ -231,8 +231,8 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     """Parameters that the people do not determine, in words."""
     prior = {name: float(np.sqrt((freedom.sigmas[part] ** 2).sum())) for name, part in PARTS.items()}
     words = {
-        "turn": "which way it looks",
-        "move": "where it stands",
+        "turn": "its rotation",
+        "move": "its position",
         "focal": "its focal length",
         "centre": "its principal point",
         "lens": "its distortion",
@@ -240,13 +240,13 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     notes = []
     for view, camera in enumerate(adjusted.rig.cameras):
         if counts[view] < LEAST_PEOPLE:
-            few = f"sees {counts[view]} people whom another camera sees, too few"
-            notes.append(f"camera {camera.name}: {few}; it stays")
+            few = f"shares only {counts[view]} people with other cameras, too few"
+            notes.append(f"camera {camera.name}: {few}; it is not changed")
             continue
         sigmas = {name: adjusted.sigma(part)[view] for name, part in PARTS.items()}
         unknown = [words[name] for name in PARTS if prior[name] > 0 and sigmas[name] > _UNKNOWN * prior[name]]
         if unknown:
-            what = f"the people's motion does not determine {' or '.join(unknown)} better than was known before"
-            cure = "film people who walk through all of the picture, near and far"
+            what = f"the motion of the people determines {' or '.join(unknown)} no better than the prior"
+            cure = "film people who walk through the whole picture, near and far"
             notes.append(f"camera {camera.name}: {what}; {cure}")
     return notes

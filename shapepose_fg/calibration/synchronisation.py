@@ -88,7 +88,8 @@ class Synchronised:
         """Cameras whose offset the people's motion does not determine, in words."""
         cure = "film people who walk about and wave, in view of all cameras"
         return [
-            f"camera {name}: the people's motion does not determine its offset, others fit about as well; {cure}"
+            f"camera {name}: the motion of the people does not determine its offset, because other offsets fit"
+            f" about as well; {cure}"
             for name, sure, sigma in zip(rig.names, self.sure, self.sigma_s, strict=True)
             if sure < _SURE or not sigma < _WORST_S
         ]
@@ -138,7 +139,7 @@ def offsets(
     views = Views.of(rig)
     for view, name in enumerate(rig.names):
         if (sightings.view == view).sum() < _LEAST_SEEN:
-            raise InputError(f"camera {name}: hardly anybody is seen: nothing says when it exposed its frames")
+            raise InputError(f"camera {name}: too few people are seen to estimate the times of its frames")
     start = -np.rint(around_s * fps).astype(np.intp)
     # Frames are counted on the clock of the first camera: with `shift` zero all clocks agree.
     sightings = replace(sightings, frame=sightings.frame - start[sightings.view])

@@ -28,7 +28,7 @@ def setup_report(report: SetupReport) -> RenderableType:
 def use_table(uses: Sequence[CameraUse]) -> RenderableType:
     """A row for each camera of a reconstruction."""
     return table(
-        ("camera", "offered", "used", "error px", "mm", "used px", "left out px", "mm"),
+        ("camera", "detected", "used", "error px", "mm", "used px", "left out px", "mm"),
         (
             (
                 _short(each.camera),
@@ -43,8 +43,8 @@ def use_table(uses: Sequence[CameraUse]) -> RenderableType:
             for each in uses
         ),
         caption=(
-            "error: median / 90 % of all detections given to people, before gates; used: after; left out: median,"
-            " from where the other cameras alone put the joint"
+            "error: median / 90 % of all detections assigned to people; used: the same after gating; left out:"
+            " median distance from where the other cameras alone place the joint"
         ),
     )
 
@@ -52,7 +52,7 @@ def use_table(uses: Sequence[CameraUse]) -> RenderableType:
 def _sentences(report: SetupReport) -> RenderableType:
     """The findings, one paragraph each."""
     if len(report.warnings) == 0:
-        return Text(f"Nothing looks wrong in the {report.frames} frames that were looked at.", style="green")
+        return Text(f"No problems were found in the {report.frames} checked frames.", style="green")
     listed = Table.grid(padding=(0, 1))
     listed.add_column(style="bold yellow")
     listed.add_column()
@@ -80,9 +80,10 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
             for each in cameras
         ),
         caption=(
-            "people: seen in the frames that were looked at; shared: with another camera; error: median / 90 % of"
-            " joints, from where all cameras together put them; left out: median, from where the others alone put"
-            " them; fits: people of the others who are matched so; late: frames."
+            "people: seen in the checked frames; shared: seen by another camera, too; error: median / 90 % of"
+            " the distance from where all cameras place the joints; left out: median distance from where"
+            " the other cameras alone place them; fits: people of the others who match; late: offset in"
+            " frames."
         ),
     )
 
@@ -102,7 +103,7 @@ def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> Re
             )
             for row, first in enumerate(cameras[:-1])
         ),
-        caption="people seen by both at once who are one; how far rays miss, px",
+        caption="share of the people seen by both cameras that match; distance by which their rays miss, px",
     )
 
 

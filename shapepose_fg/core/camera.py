@@ -81,7 +81,7 @@ class Camera:
             raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")
         way = PurePath(self.name)
         if way.is_absolute() or len(way.parts) == 0 or ".." in way.parts:
-            raise refuse("the name must not lead out of a folder: files are called so")
+            raise refuse("the name must not contain a path, because files are named after it")
         object.__setattr__(self, "image_size", (int(width), int(height)))
 
     @classmethod
@@ -318,7 +318,7 @@ def choose(known: Sequence[str], only: Sequence[str] | None = None, without: Seq
             raise ValueError(f"there is no camera {name[:80]!r}; there are {listed}")
     chosen = [name for name in known if (only is None or name in only) and name not in without]
     if len(chosen) == 0 and len(known) > 0:
-        raise ValueError(f"no camera is chosen; give some of {' '.join(known[:12])}")
+        raise ValueError(f"no camera is selected; give some of {' '.join(known[:12])}")
     return chosen
 
 
@@ -343,7 +343,7 @@ class Views:
         if K.shape[-2:] != (3, 3) or cTw.shape[-2:] != (3, 4) or K.ndim not in (3, 4) or cTw.ndim not in (3, 4):
             raise ValueError(f"K must be ([N,] V, 3, 3) and cTw ([N,] V, 3, 4), got {K.shape} and {cTw.shape}")
         if K.shape[-3] != cTw.shape[-3] or (K.ndim == cTw.ndim == 4 and len(K) != len(cTw)):
-            raise ValueError(f"K and cTw must be of the same rows and views, got {K.shape} and {cTw.shape}")
+            raise ValueError(f"K and cTw must have the same rows and views, got {K.shape} and {cTw.shape}")
         if not (np.isfinite(K).all() and np.isfinite(cTw).all()):
             raise ValueError("K or cTw holds a value that is not finite")
 
@@ -357,7 +357,7 @@ class Views:
         if not rig.moves:
             return cls(rig.K, rig.cTw, rig.image_sizes, readout_s)
         if time_s is None:
-            raise ValueError("cameras that move have poses at times only: give time_s, or `Rig.at` a moment")
+            raise ValueError("poses of moving cameras depend on time: give time_s, or use `Rig.at`")
         cTw = np.ascontiguousarray(np.linalg.inv(rig.poses(time_s))[..., :3, :], dtype=np.float64)
         carried = Carried.of(rig.trajectories, rig.carrier, time_s.mean(axis=1))
         return cls(rig.K, cTw, rig.image_sizes, readout_s, carried)

@@ -41,10 +41,13 @@ def compile_beside(kernels: Sequence[Any]) -> None:
         missing = [each for each in kernels if not each.is_kept]
         lasts_s = _work(missing) / _BYTES_S
         count = min(cores(), _MOST, len(missing)) if lasts_s > _WORTH_S and place is not None else 1
-        what = f"compiling {len(missing)} functions for this machine, about {max(lasts_s / count, 1):.0f} s"
+        what = (
+            f"compiling {len(missing)} functions for this machine, which takes about"
+            f" {max(lasts_s / count, 1):.0f} s"
+        )
         if place != wanted_folder():
-            cure = "set NUMBA_CACHE_DIR to a folder that can be written"
-            what += f", at each start: {wanted_folder()} cannot be written; {cure}"
+            cure = "set NUMBA_CACHE_DIR to a writable folder"
+            what += f" at each start, because {wanted_folder()} cannot be written; {cure}"
         with saying(what):
             if count > 1:
                 _share_out(missing, count)
@@ -121,7 +124,7 @@ def _alone() -> Iterator[None]:
 
     place = kept_folder()
     lock = None if place is None else FileLock(place / "compiling.lock")
-    waiting = saying("waiting for another process that compiles functions for this machine")
+    waiting = saying("waiting for another process that compiles the functions for this machine")
     with waiting, suppress(OSError, NotImplementedError):  # some file systems have no locks, or are full
         if lock is not None:
             lock.acquire()

@@ -42,7 +42,7 @@ def failure(error: BaseException) -> str | None:
     if isinstance(error, OSError):
         return f"{f'{error.filename}: ' if error.filename is not None else ''}{error.strerror or error}"
     if isinstance(error, MemoryError) or "allocate memory" in str(error):  # some libraries raise a RuntimeError
-        return "there is too little memory: close other programs, or give fewer --workers"
+        return "there is too little memory; close other programs, or give fewer --workers"
     return str(error) if isinstance(error, WorkLost) else None
 
 

@@ -76,12 +76,12 @@ class FrameTimes:
         columns = time_s if time_s.ndim == 2 else time_s[:, None]
         finite = np.isfinite(columns).all(axis=1)
         if not finite.all():
-            raise ValueError(f"time_s must be finite, at frame {np.argmin(finite)} it is not")
+            raise ValueError(f"time_s must be finite, but is not at frame {np.argmin(finite)}")
         rising = np.append(True, (np.diff(columns, axis=0) > LEAST_STEP_S).all(axis=1))
         if not rising.all():
             raise ValueError(
-                f"time_s must rise from frame to frame, at frame {np.argmin(rising)} it does not"
-                f" (by more than {LEAST_STEP_S:g} s)"
+                f"time_s must increase by more than {LEAST_STEP_S:g} s from frame to frame, but does not at"
+                f" frame {np.argmin(rising)}"
             )
 
     def __len__(self) -> int:
@@ -92,7 +92,7 @@ class FrameTimes:
         """`frames` frames at `fps` frames a second, frame 0 at 0 s (`typed_rate`)."""
         if not LEAST_FPS <= fps <= MOST_FPS:
             bounds = f"{LEAST_FPS:g} to {MOST_FPS:g}"
-            raise ValueError(f"fps must be a positive number of frames a second, {bounds}, got {fps}")
+            raise ValueError(f"fps must be {bounds} Hz, got {fps}")
         return cls(np.arange(frames) / typed_rate(fps), source="fps")
 
     @classmethod
@@ -131,8 +131,8 @@ def rate_words(run: Mapping[str, Any]) -> str:
     told = run.get("time") or {}
     if told.get("fps") is None:
         return ""
-    assumed = " (assumed: give --fps)" if told.get("source") == "assumed" else ""
-    return f", {told['fps']:.6g} a second{assumed}"
+    assumed = " (assumed; give --fps)" if told.get("source") == "assumed" else ""
+    return f", {told['fps']:.6g} Hz{assumed}"
 
 
 def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
@@ -143,7 +143,7 @@ def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
     numbers = np.asarray(cuts)
     whole = numbers.ndim == 1 and (numbers.size == 0 or numbers.dtype.kind in "iu")
     if not whole or (np.diff(numbers) <= 0).any() or ((numbers < 1) | (numbers >= frames)).any():
-        raise ValueError(f"cuts must be rising frame numbers between 1 and {frames - 1}, got {list(cuts)}")
+        raise ValueError(f"cuts must be increasing frame numbers between 1 and {frames - 1}, got {list(cuts)}")
     return tuple(int(cut) for cut in numbers)
 
 

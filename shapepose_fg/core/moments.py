@@ -70,7 +70,7 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
         early, unit = min(clocks, key=lambda each: each.time[-1]), " s" if has_clock else ""
         raise InputError(
             f"camera {early.name} ends at {early.time[-1]:.6g}{unit} and camera {late.name} starts at"
-            f" {late.time[0]:.6g}{unit}: they have no moment in common; {cure}"
+            f" {late.time[0]:.6g}{unit}: they have no time in common; {cure}"
         )
     nearest = [_nearest(each, moment) for each in clocks]
     picture = np.column_stack([place for place, _ in nearest])
@@ -78,17 +78,18 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
     for each, (place, off) in zip(clocks, nearest, strict=True):
         missing, misfit = np.flatnonzero(place < 0), 1e3 * off[place >= 0]
         if left_out := _left_out(each, place, slowest):
-            what = "frames that another camera has no picture for were left out"
+            what = "frames without a picture of every camera are left out"
             notes.append(f"camera {each.name}: {what}, {left_out}")
         if len(missing) > 0:
             notes.append(
-                f"camera {each.name}: no picture within half a frame of {len(missing)} of {len(moment)} moments"
-                f" (the first is frame {missing[0]}); it sees no people there"
+                f"camera {each.name}: {len(missing)} of {len(moment)} synchronised frames have no picture"
+                f" within half a frame (the first is frame {missing[0]}); they are read as frames without"
+                " people"
             )
         if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
             notes.append(
-                f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the moment they stand"
-                f" for ({misfit.mean():.1f} ms in the mean)"
+                f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the time of their"
+                f" synchronised frame ({misfit.mean():.1f} ms on average)"
             )
     time_s = None
     if has_clock:
@@ -120,8 +121,9 @@ def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
         time_s = np.column_stack(taken)
     least = min(map(len, places))
     notes = (
-        f"cameras have {least} to {count} frames; all are detected, under each camera's own numbers. When cameras"
-        " began is said by --start, or found by `calibrate --times`, or of known poses by `synchronise`",
+        f"cameras have {least} to {count} frames; all frames are processed, with each camera's own numbers."
+        " Give start times with --start, or estimate them with `calibrate --times`, or with `synchronise`"
+        " if the poses are known",
     )
     return Moments(picture, time_s, notes if least < count else ())
 

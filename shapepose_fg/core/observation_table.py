@@ -83,14 +83,14 @@ class ObservationTable(Table):
         if not ((self.probability >= 0) & (self.probability <= 1)).all():
             raise ValueError("probability must be 0 to 1")
         if np.isinf(self.residual_px).any():
-            raise ValueError("residual_px must be finite, or NaN where there is none")
+            raise ValueError("residual_px must be finite, or NaN if there is none")
         if not np.isfinite(self.lead_s).all():
             raise ValueError("lead_s must be finite")
         for name in self.shared():
             if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
                 raise ValueError(f"{name} must differ from each other")
         if not all(map(str.isprintable, self.view_names.tolist())):
-            raise ValueError("view_names must be names in one line")
+            raise ValueError("view_names must be one-line names")
         # A score may underflow in float32, and the index of the detection may be unknown.
         wrong = {
             "candidate": (self.candidate >= 0) & ~seen,
@@ -101,8 +101,8 @@ class ObservationTable(Table):
             if where.any():
                 row, joint, view = np.argwhere(where)[0].tolist()
                 raise ValueError(
-                    f"{name} and gate must agree on what was seen, at row {row}, {self.joint_names[joint]},"
-                    f" view {self.view_names[view]} they do not"
+                    f"{name} and gate must agree on what was seen, but do not at row {row},"
+                    f" {self.joint_names[joint]}, view {self.view_names[view]}"
                 )
 
     @classmethod

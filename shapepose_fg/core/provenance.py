@@ -66,7 +66,7 @@ class ReadInputs:
         found = checksums(inputs)
         for file, state in _states(inputs):
             if self._before.get(file) != state:
-                raise InputError(f"{file}: this changed while it was read; start again when it is written")
+                raise InputError(f"{file}: this file changed while it was read; start again when it is complete")
         return found
 
 

@@ -176,7 +176,9 @@ class Reconstruction(Table):
             *((name, ok & ~with_body(getattr(self, name))) for name in BODY),
         ):
             if wrong.any():
-                raise ValueError(f"{name} must be numbers where they are known, not as in row {wrong.argmax()}")
+                raise ValueError(
+                    f"{name} must be numbers where joints are known, but are not in row {wrong.argmax()}"
+                )
 
     def at(self, frame: int) -> "Reconstruction":
         """The people of one frame."""
@@ -216,7 +218,9 @@ class Reconstruction(Table):
         observations = None if self.observations is None else self.observations.columns()
         cameras = Path(folder) / CAMERAS
         if rig is not None and not is_replaceable(cameras):
-            raise InputError(f"{cameras}: this is no rig file of a result and would be lost; give another folder")
+            raise InputError(
+                f"{cameras}: this is not the rig file of a result and would be overwritten; give another folder"
+            )
         write_result(Path(folder), self.columns(), observations, self.run, check_files)
         if rig is not None:
             write_rig(rig, cameras)
@@ -328,7 +332,7 @@ def check_files(people: Path, observations: Path | None) -> None:
             rows.read(index, observations=None if table is None else table.read(index))
 
 
-_UNREADABLE = "the result was not written, and what was there before is as it was"
+_UNREADABLE = "the result was not written, and the previous files are unchanged"
 _CHECKED_ROWS = 4096
 """Number of rows that are read at a time to check that a file is readable."""
 

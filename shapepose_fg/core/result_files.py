@@ -51,7 +51,7 @@ def set_aside(folder: Path) -> list[str]:
         if made.is_dir():
             names = (made.with_name(f"{made.name}-older{number}") for number in chain([""], count(2)))
             made.rename(free := next(path for path in names if not path.exists()))
-            told.append(f"{made} is of the result before; it is called {free.name} now")
+            told.append(f"{made} belongs to the previous result; it was renamed to {free.name}")
     return told
 
 
@@ -116,8 +116,9 @@ def check_id(people_id: object, other_id: object, file: Path) -> None:
     if people_id is None or other_id is None or str(people_id) == str(other_id):
         return
     raise InputError(
-        f"{file}: this is of another run than the {PEOPLE} beside it, as after a run that was killed while it"
-        " wrote its results; start that run again with --resume, or put together the files of one run"
+        f"{file}: this file is of another run than the {PEOPLE} beside it, perhaps because a run was killed"
+        " while it wrote its results; start that run again with --resume, or put the files of one run"
+        " together"
     )
 
 

@@ -33,13 +33,13 @@ def merged_run(runs: Sequence[Run]) -> Run:
         found = difference(settings[0], other)
         if found is not None:
             raise ValueError(
-                f"parts must have the same configuration, {found[0]} differs; reconstruct them with one and the"
-                " same"
+                f"parts must have the same configuration, but {found[0]} differs; reconstruct them with the"
+                " same configuration"
             )
     inputs: Run = {}
     for file, digest in (pair for run in runs for pair in run.get("inputs", {}).items()):
         if inputs.setdefault(file, digest) != digest:
-            raise ValueError(f"parts must be made from the same inputs, {file} changed between two of them")
+            raise ValueError(f"parts must be made from the same inputs, but {file} changed between two of them")
     together: Run = {"inputs": inputs} if inputs else {}
     if settings:
         together["configuration"] = settings[0]
@@ -60,7 +60,7 @@ def _joined(spans: Sequence[range]) -> list[Any]:
     found: list[list[int]] = []
     for span in sorted((span for span in spans if len(span) > 0), key=lambda span: span.start):
         if found and span.start < found[-1][1]:
-            raise ValueError(f"parts must not cover the same frame, two of them cover frame {span.start}")
+            raise ValueError(f"parts must not overlap, but two of them cover frame {span.start}")
         if found and span.start == found[-1][1]:
             found[-1][1] = span.stop
         else:

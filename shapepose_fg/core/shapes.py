@@ -41,11 +41,11 @@ class SubjectShapes(Table):
         names = self.names.tolist()
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"names must differ, {name!r} occurs twice")
+                raise ValueError(f"names must differ, but {name!r} occurs twice")
         finite = np.isfinite(self.betas).all(axis=1) & np.isfinite(self.information).all(axis=(1, 2))
         if not finite.all():
             whose = names[np.argmin(finite)]
-            raise ValueError(f"betas and information must be finite, those of {whose!r} are not")
+            raise ValueError(f"betas and information must be finite, but those of {whose!r} are not")
         largest = float(np.abs(self.information).max(initial=0.0))
         symmetric = np.allclose(self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest)
         if not symmetric or (len(self) > 0 and (np.linalg.eigvalsh(self.information) < _LEAST).any()):
@@ -98,8 +98,8 @@ class SubjectShapes(Table):
         whose = columns["body"]
         if whose.shape != () or whose.dtype.kind != "U" or str(whose) != body:
             raise InputError(
-                f"{file}: these are shapes of another body model, their betas mean something else on this one;"
-                " give --body the model that they were made with, or another file"
+                f"{file}: these are shapes of another body model, and betas of one model do not fit another;"
+                " give their model with --body, or another file"
             )
         with naming(file, _CURE):
             return cls(columns["names"], columns["betas"], columns["information"], body)

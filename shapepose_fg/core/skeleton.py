@@ -91,11 +91,11 @@ class Skeleton:
         for joint, ends in middles.items():
             for late in set(ends) - made:
                 raise ValueError(
-                    f"{name}: the middle {joint} is made of {late}, which must be a keypoint or a middle before it"
+                    f"{name}: the midpoint {joint} uses {late}, which must be a keypoint or an earlier midpoint"
                 )
             made.add(joint)
         if len(core) == 0:
-            raise ValueError(f"{name}: core must have a joint at least, by which a person is recognised; name one")
+            raise ValueError(f"{name}: core must have at least one joint, by which a person is found; name one")
         other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
         edges = tuple((place[a], place[b]) for a, b in limbs)
         grown = _grown(place[anchor], edges, len(joints))
@@ -103,7 +103,7 @@ class Skeleton:
             grown = [place.get(parents.get(joint, ""), -1) for joint in joints]
         lost = [joints[j] for j, parent in enumerate(grown) if parent < 0 and joints[j] != anchor]
         if lost:
-            raise ValueError(f"{name}: no limbs lead from the anchor {anchor} to {' '.join(lost)}; add limbs")
+            raise ValueError(f"{name}: no limbs connect the anchor {anchor} with {' '.join(lost)}; add limbs")
         skeleton = cls(
             name=name,
             joints=joints,
@@ -117,7 +117,8 @@ class Skeleton:
         beside = [j for j in range(len(joints)) if grown[j] == place[anchor] and skeleton.mirror[j] != j]
         if len(beside) < 2:
             raise ValueError(
-                f"{name}: two joints beside the anchor {anchor} must mirror each other, as hips do; anchor it so"
+                f"{name}: two joints next to the anchor {anchor} must be left and right, such as hips; choose"
+                " another anchor"
             )
         return skeleton
 
@@ -239,7 +240,7 @@ def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> 
     given = [point for point in keypoints if point]
     lacking = [each for ends in _MIDDLES.values() for each in ends if each not in given]
     if lacking:
-        problem = f"there is no {' and no '.join(lacking)}, and a person needs both shoulders and both hips"
+        problem = f"there is no {' and no '.join(lacking)}, but both shoulders and both hips are needed"
         raise ValueError(f"{name}: {problem}")
     middles = {joint: ends for joint, ends in _MIDDLES.items() if joint not in given}
     joints, names = (*given, *middles), BODY_25.joints

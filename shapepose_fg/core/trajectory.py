@@ -67,7 +67,7 @@ class Trajectory:
         if (most := float(np.abs(wTb[:, :3, 3]).max())) > MOST_METRES:
             raise refuse(f"poses must be at most {MOST_METRES:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
-            raise refuse(f"times must rise, at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1} they do not")
+            raise refuse(f"times must increase, but do not at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1}")
         R = wTb[:, :3, :3]
         if not is_rotation(R):
             raise refuse("rotations must be orthonormal with determinant 1")

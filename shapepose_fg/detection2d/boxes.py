@@ -86,9 +86,9 @@ class BoxNetwork:
         shape = outputs[0].shape
         if shape[:1] != (1,) or len(shape) != 3 or shape[2] < 5 or (shape[2] > 5 and shape[1] != len(cells)):
             raise InputError(
-                f"{self.network.file}: of a picture of {words(self.form.size)} YOLOX gives 1 x {len(cells)} x 6"
-                f" numbers or more, with suppression inside 1 x N x 5, this network {words(shape)}; give another"
-                " --boxes"
+                f"{self.network.file}: for pictures of {words(self.form.size)}, YOLOX has an output of 1 x"
+                f" {len(cells)} x 6 or more, or of 1 x N x 5 with suppression inside, but this network has"
+                f" {words(shape)}; give another --boxes"
             )
         found = outputs[0][0]
         if shape[2] == 5:

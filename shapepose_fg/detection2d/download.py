@@ -68,7 +68,9 @@ def named_file(
     kept, pin = (user_cache("networks") / f"{name}.{ending}" for ending in ("onnx", "sha256"))
     there = kept.is_file()
     if not there and not fetch:
-        raise InputError(f"{name}: it has not been fetched yet; --download {name} does so, or give a file's path")
+        raise InputError(
+            f"{name}: this network has not been downloaded yet; give --download {name}, or the path of a file"
+        )
     content = read_bytes(kept, MOST_BYTES) if there else _fetched(named_networks()[name].file, progress)
     digest = hashlib.sha256(content).hexdigest()
     if not pin.is_file():
@@ -77,8 +79,8 @@ def named_file(
     pinned = read_text(pin, most=SMALL).strip()
     if digest != pinned:
         raise InputError(
-            f"{kept}: the sha256 of {'the file' if there else 'what came'} is {digest}, and {pinned[:64]} was"
-            f" pinned at first use; if that is meant, delete the file and {pin.name} beside it"
+            f"{kept}: the sha256 of {'the file' if there else 'the download'} is {digest}, but {pinned[:64]}"
+            f" was pinned at first use; if the change is intended, delete the file and {pin.name} beside it"
         )
     if not there:
         write_content(kept, content)
@@ -90,7 +92,7 @@ class _OnlyHttps(urllib.request.HTTPRedirectHandler):
 
     def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
         if not newurl.startswith("https://"):
-            raise urllib.error.URLError(f"it leads on to {newurl[:200]}, which is not https")
+            raise urllib.error.URLError(f"it redirects to {newurl[:200]}, which is not https")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
@@ -108,14 +110,18 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
                     done += len(part)
                     progress(done, max(total, done))
                 if done < total or done > MOST_BYTES:
-                    raise ValueError(f"{done} bytes came of {total}" if done < total else "it has no end")
+                    raise ValueError(
+                        f"only {done} of {total} bytes were received"
+                        if done < total
+                        else "the download is too long"
+                    )
                 return _inside(archive)
         except (OSError, ValueError, EOFError, RuntimeError, http.client.HTTPException, *_BROKEN) as error:
             told = error if isinstance(error, urllib.error.HTTPError) else getattr(error, "reason", error)
             problems.append(f"{base}/{file} ({told})")
     raise InputError(
-        f"the network cannot be fetched from {' or '.join(problems)}; fetch it by hand and give the path of the"
-        f" {_INSIDE} in it"
+        f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and give the path"
+        f" of the {_INSIDE} in it"
     )
 
 

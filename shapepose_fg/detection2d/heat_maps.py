@@ -88,7 +88,7 @@ class HeatMapNetwork:
         """
         every = layouts()
         if layout not in (None, *every):
-            raise InputError(f"--layout {layout}: there is no such layout; give one of {' '.join(every)}")
+            raise InputError(f"--layout {layout}: must be one of {' '.join(every)}")
         network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
         width, height = network.size or _TRIAL
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
@@ -97,11 +97,11 @@ class HeatMapNetwork:
         fitting = [each for each in fitting if shape == (1, each.channels, *cells)]
         fitting = [each for each in fitting if each.sha256 == network.sha256] or fitting
         if len(fitting) != 1:
-            which = "no layout known does; give another network, or --boxes with RTMPose and its like"
+            which = "no known layout fits; give another network, or --boxes with networks such as RTMPose"
             if len(fitting) > 1:
-                which = f"several layouts do; give --layout {' or '.join(each.name for each in fitting)}"
+                which = f"several layouts fit; give --layout {' or '.join(each.name for each in fitting)}"
             raise InputError(
-                f"{file}: it makes {words(shape)} numbers of {width} x {height} pixels, which {which}"
+                f"{file}: its output for pictures of {width} x {height} pixels is {words(shape)}: {which}"
             )
         return cls(network, fitting[0], long_side or _LONG_SIDE)
 

@@ -51,11 +51,13 @@ def read_onnx(file: Path) -> bytes:
     try:
         whole = _is_whole(memoryview(content))
     except _Broken as error:
-        raise InputError(f"{file}: not an ONNX network ({error}); give the ONNX file of a network") from None
+        raise InputError(
+            f"{file}: cannot be read as an ONNX network ({error}); give the ONNX file of a network"
+        ) from None
     if not whole:
         raise InputError(
-            f"{file}: its weights lie in another file; give a network that holds them itself, as"
-            " onnx.save_model(onnx.load(FILE), NEW) writes it"
+            f"{file}: its weights are in another file; give a network that contains them, as written by"
+            " onnx.save_model(onnx.load(FILE), NEW)"
         )
     return content
 
@@ -75,14 +77,14 @@ def _is_whole(content: memoryview) -> bool:
             start, (tag, at) = at, _varint(content, at, end)
             field, kind = tag >> 3, tag & 7
             if field == 0 or tag >= 2**32 or at - start > max(1, -(-tag.bit_length() // 7)):
-                raise _Broken(f"byte {start} begins no field")
+                raise _Broken(f"there is no field at byte {start}")
             value = 1
             if kind == 0:
                 value, at = _varint(content, at, end)
             elif kind == 2:
                 length, at = _varint(content, at, end)
                 if length >= _LONGEST:
-                    raise _Broken(f"the field at byte {start} ends behind its message")
+                    raise _Broken(f"the field at byte {start} ends beyond its message")
                 if field in inner:
                     waiting.append((inner[field], at, at + length, depth + 1))
                 at += length
@@ -91,7 +93,7 @@ def _is_whole(content: memoryview) -> bool:
             else:
                 raise _Broken(f"byte {start} begins a group")
             if at > end:
-                raise _Broken(f"the field at byte {start} ends behind its message")
+                raise _Broken(f"the field at byte {start} ends beyond its message")
             if message == "tensor" and (field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value != 0)):
                 return False
     return True

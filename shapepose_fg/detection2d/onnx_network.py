@@ -73,8 +73,9 @@ class OnnxNetwork:
             return self.forward(pictures)
         except Exception as error:
             raise InputError(
-                f"{self.file}: it cannot be run on {words(pictures.shape)} numbers ({_first_line(error)});"
-                " give one that takes pictures, 1 x 3 x height x width; RTMPose and its like need --boxes"
+                f"{self.file}: the network cannot be run on input of {words(pictures.shape)}"
+                f" ({_first_line(error)}); give one with pictures as input, 1 x 3 x height x width;"
+                " networks such as RTMPose need --boxes"
             ) from None
 
 
@@ -85,9 +86,11 @@ def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(content, dtype=np.uint8))
         empty = net.empty()
     except cv2.error as error:
-        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({error.err.strip()[:160]})") from None
+        raise InputError(
+            f"{file}: cannot be read as an ONNX network by OpenCV ({error.err.strip()[:160]})"
+        ) from None
     if empty:
-        raise InputError(f"{file}: not an ONNX network; give the ONNX file of a network")
+        raise InputError(f"{file}: cannot be read as an ONNX network; give the ONNX file of a network")
 
     def forward(pictures: Blob) -> list[Blob]:
         net.setInput(pictures)
@@ -112,11 +115,11 @@ def _try_elsewhere(file: Path, content: bytes) -> None:
             timeout=_LOADS_S,
             check=False,
         )
-        what = "it makes OpenCV crash" if done.returncode < 0 else ""
+        what = "OpenCV crashes" if done.returncode < 0 else ""
     except subprocess.TimeoutExpired:
-        what = f"OpenCV takes over {_LOADS_S} s to read it"
+        what = f"OpenCV needs more than {_LOADS_S} s"
     if what:
-        raise InputError(f"{file}: not an ONNX network that OpenCV can read ({what}); give another copy of it")
+        raise InputError(f"{file}: cannot be read as an ONNX network by OpenCV ({what}); give another copy of it")
 
 
 def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
@@ -126,15 +129,14 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
     try:
         onnxruntime: Any = import_module("onnxruntime")
     except ImportError:
-        raise InputError(
-            f'{file}: the package onnxruntime runs it, which is missing; pip install "shapepose-fg[detect]"'
-        ) from None
+        raise InputError(f'{file}: onnxruntime is not installed; pip install "shapepose-fg[detect]"') from None
     kind, _, number = device.partition(":")
     provider, there = f"{PROVIDERS.get(kind)}ExecutionProvider", onnxruntime.get_available_providers()
     if provider not in there or not (number or "0").isdecimal():
         known = " ".join(name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there)
         raise InputError(
-            f"--device {device}: the onnxruntime that is installed has {known}; install its package for the device"
+            f"--device {device}: the installed onnxruntime supports {known}; install the onnxruntime package"
+            " for this device"
         )
     options: Any = onnxruntime.SessionOptions()
     options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
@@ -146,12 +148,16 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
             content, options, providers=providers, read_config_from_model=0
         )
     except Exception as error:
-        raise InputError(f"{file}: not an ONNX network that onnxruntime can read ({_first_line(error)})") from None
+        raise InputError(
+            f"{file}: cannot be read as an ONNX network by onnxruntime ({_first_line(error)})"
+        ) from None
     if provider not in session.get_providers():  # it fell back to the CPU
-        raise InputError(f"--device {device}: the device cannot be used; check its driver, or leave --device out")
+        raise InputError(f"--device {device}: this device cannot be used; check its driver, or leave out --device")
     takes = session.get_inputs()
     if len(takes) != 1:
-        raise InputError(f"{file}: the network takes {len(takes)} inputs; give one that takes pictures alone")
+        raise InputError(
+            f"{file}: the network has {len(takes)} inputs; give one that has pictures as its only input"
+        )
     shape = [side if type(side) is int else None for side in takes[0].shape]
     batch, _, height, width = shape if len(shape) == 4 else (1, 3, None, None)
 

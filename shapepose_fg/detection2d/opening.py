@@ -41,11 +41,13 @@ def open_network(
     elif named is None:
         form = KeypointForm(network=network)
     elif named.boxes is None:
-        raise InputError(f"--network {network}: it finds people, not their joints; name it with --boxes")
+        raise InputError(
+            f"--network {network}: this network detects people, not their joints; give it with --boxes"
+        )
     else:
         form, boxes = KeypointForm(network=str(named_file(network)), size=named.size), boxes or named.boxes
     for name in (name for name, value in openpose.items() if value is not None):
-        raise InputError(f"--{name.replace('_', '-')} is for networks of OpenPose's kind; leave it out")
+        raise InputError(f"--{name.replace('_', '-')} is for networks such as OpenPose; leave it out")
     people = form.boxes
     if boxes is not None:
         named = _named("--boxes", boxes)
@@ -58,7 +60,7 @@ def open_network(
     keypoints = OnnxNetwork.open(form.network, device=device)
     for name, there in (form.input, keypoints.inputs), *((each, keypoints.outputs) for each in form.outputs or ()):
         if name is not None and name not in there:
-            raise InputError(f"{network}: the network has no {name!r}, but {' '.join(there)}; name that instead")
+            raise InputError(f"{network}: the network has no {name!r}, but {' '.join(there)}; name one of these")
     form = form.model_copy(update={"size": keypoints.size or form.size})
     return TopDownNetwork.of(keypoints, form, find_skeleton(form.skeleton), opened)
 
@@ -70,7 +72,9 @@ def _named(option: str, name: str) -> NamedNetwork | None:
         return None
     if name not in named:
         names = " ".join(named)
-        raise InputError(f"{option} {name}: there is no such file, and no network of this name; names are {names}")
+        raise InputError(
+            f"{option} {name}: there is no such file, and no network of this name; known names are {names}"
+        )
     return named[name]
 
 
@@ -92,6 +96,6 @@ def read_form(path: Path) -> KeypointForm:
 def _beside(path: Path, key: str, name: str) -> str:
     """Path of a file in the folder of the TOML file, or below it."""
     if not (name and is_inside(path.parent, name)):
-        cure = "put it there and name it"
+        cure = "put it there"
         raise InputError(f"{path}: {key} {name[:80]!r} must be a file in the same folder; {cure}")
     return str(path.parent / name)

@@ -108,20 +108,21 @@ class TopDownNetwork:
         skeleton = skeleton or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
         if skeleton is None:
             raise InputError(
-                f"{network.file}: no skeleton known here has {count} joints; name one in a network's TOML file"
+                f"{network.file}: no known skeleton has {count} joints; describe it in a TOML file of the network"
             )
         keypoints = range(len(skeleton)) if skeleton.keypoints is None else skeleton.keypoints
         names = ["" if joint < 0 else skeleton.joints[joint] for joint in keypoints]
         listed = names if form.joints is None else form.joints
         if wrong := [name for name in listed if name and (name not in names or listed.count(name) > 1)]:
             raise InputError(
-                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of {skeleton.name}, once"
+                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of {skeleton.name} without"
+                " repetition"
                 f' ({" ".join(filter(None, names))}), or ""'
             )
         if len(listed) != count:
             raise InputError(
-                f"{network.file}: the network finds {count} joints, {len(listed)} are named ({skeleton.name});"
-                " name its skeleton, or its joints, in a TOML file"
+                f"{network.file}: the network has {count} joints, but {len(listed)} are named"
+                f" ({skeleton.name}); name its skeleton, or its joints, in a TOML file"
             )
         place = np.array([names.index(name) if name else -1 for name in listed], dtype=np.intp)
         return cls(network, form, skeleton, place, boxes)
@@ -229,8 +230,9 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
         or (form.decoding == "coordinates" and shapes[0][2] not in (2, 3))
     ):
         raise InputError(
-            f"{network.file}: the network gives {' and '.join(words(each.shape) for each in outputs)}, which is no"
-            f" {form.decoding}; describe it in a TOML file (docs/detection.md)"
+            f"{network.file}: the output of the network is"
+            f" {' and '.join(words(each.shape) for each in outputs)}, which is not a {form.decoding};"
+            " describe the network in a TOML file (docs/detection.md)"
         )
     size = np.array(blob.shape[:1:-1])
     if form.decoding == "simcc":

@@ -49,7 +49,7 @@ class Floor:
     looks: int
     """Number of looks at standing feet used."""
     share: float
-    """Share of these that agree."""
+    """Share of these looks that agree with the floor."""
 
     def above(self, points: Array) -> Array:
         """(...,) height of points (..., 3) above the floor, metres."""
@@ -79,7 +79,7 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
     if len(numbers) < LEAST_LOOKS:
-        return f"{len(numbers)} looks at standing feet, {LEAST_LOOKS} are the least"
+        return f"{len(numbers)} measurements of standing feet, but at least {LEAST_LOOKS} are needed"
     weight, height = 1.0 / count[whose], points @ up
     order = np.argsort(height, kind="stable")
     total = np.concatenate([[0.0], np.cumsum(weight[order])])
@@ -99,7 +99,7 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
         float(weight[chosen].sum() / len(numbers)) for chosen in (np.abs(left) <= NEAR_M, left < -UNDER_M)
     )
     if share < AGREE:
-        return f"{share:.0%} of standing feet agree on a height, {AGREE:.0%} are the least"
+        return f"{share:.0%} of standing feet agree on a height, but at least {AGREE:.0%} are needed"
     if under > UNDER_SHARE:
         return f"{under:.0%} of standing feet are below where most stand"
     normal = up - found[1:] @ across

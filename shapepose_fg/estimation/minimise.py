@@ -53,7 +53,7 @@ def descend(
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     found = optimizer.optimize()
     if not float(optimizer.error()) < float("inf"):
-        raise NotFinite("the solver left the finite numbers")
+        raise NotFinite("the solver diverged to values that are not finite")
     return found
 
 

@@ -71,8 +71,8 @@ class MotionModel:
     """(J,) increase of this density per (m/s)² of the joint's speed: fast joints also accelerate
     more."""
     psd_lost: Array
-    """(J,) minimum of this density while a joint is lost, with unknown speed: the mean over all
-    speeds."""
+    """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum is
+    the mean over all speeds."""
     views: Lasting
     """Error of estimates of a joint from all views of one frame."""
     body: Lasting
@@ -124,14 +124,14 @@ class MotionModel:
                 raise KeyError("format")
             known = {name: tuple(map(float, numbers)) for name, numbers in data["joints"].items()}
             if any(len(numbers) != 3 for numbers in known.values()):
-                raise ValueError("a joint has other than 3 densities")
+                raise ValueError("a joint must have 3 densities")
             views, body = (
                 Lasting(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
                 for name in ("views", "body")
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
-                f"{path}: is not a motion model ({error}); give the entries of estimation/data/motion.json"
+                f"{path}: this is not a motion model ({error}); give the entries of estimation/data/motion.json"
             ) from None
         table = np.array(list(known.values())).reshape(-1, 3)
         if len(table) == 0 or not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()):
@@ -140,8 +140,8 @@ class MotionModel:
             )
         if not (views.possible and body.possible):
             raise InputError(
-                f"{path}: of views and body, white_share must be between 0 and 1, correlation_s positive and kept"
-                " 0 to 1; give the entries of estimation/data/motion.json"
+                f"{path}: for views and body, white_share must be between 0 and 1, correlation_s positive and"
+                " kept 0 to 1; give the entries of estimation/data/motion.json"
             )
         chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
         still, speed, lost = np.ascontiguousarray(chosen.T)

@@ -229,17 +229,17 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     away[known] = np.linalg.solve(information[known], pulls[known][..., None])[..., 0]
     sigmas = np.sqrt(np.maximum(np.einsum("...i,...i->...", away, pulls), 0.0))
     far = np.linalg.norm(away, axis=2)
-    reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = "ran away from what views and body say of it"
+    reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = "diverged from its views and the body"
     for person in state.people:
         rows = person.rows
         touched = np.ix_(rows, np.flatnonzero(person.touched))
         with np.errstate(invalid="ignore"):
             ran = np.linalg.norm(X[touched] - first[touched], axis=2) > RUNAWAY_M
-        reasons[touched] = np.where(ran, "ran away from its views", reasons[touched])
+        reasons[touched] = np.where(ran, "diverged from its views", reasons[touched])
         if person.failure:
             reasons[rows] = np.where(finite[rows], person.failure, reasons[rows])
     lost = finite & ~np.isfinite(covariance).all(axis=(2, 3)) & (reasons == "")
-    reasons[lost] = "nothing determines it: its system is singular"
+    reasons[lost] = "undetermined: its system is singular"
     return tuple(
         Problem(int(n), int(observations.track[n]), int(observations.frame[n]), int(j), str(reasons[n, j]))
         for n, j in np.argwhere(reasons != "")

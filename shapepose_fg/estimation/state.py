@@ -107,5 +107,5 @@ def window_rows(observations: Observations) -> list[Index]:
     order = np.lexsort((observations.frame, observations.track))
     track, frame = observations.track[order], observations.frame[order]
     if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):
-        raise ValueError("a track may have one row a frame: tell people apart by their track")
+        raise ValueError("a track may have only one row per frame: give each person another track number")
     return np.split(order, np.flatnonzero(np.diff(track)) + 1) if len(order) else []

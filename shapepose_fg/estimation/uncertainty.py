@@ -68,7 +68,7 @@ class Marginal:
     """(3 K, 3 K) covariance, m², ordered by joint."""
 
     def block(self, one: int, other: int) -> Array:
-        """(3, 3) covariance of two of them, m²."""
+        """(3, 3) covariance of the errors of two joints, by index, m²."""
         return self.covariance[3 * one : 3 * one + 3, 3 * other : 3 * other + 3]
 
 
@@ -82,7 +82,7 @@ class Distance:
     """
 
     apart: Array
-    """(..., 3) displacement from one point to the other, metres."""
+    """(..., 3) mean displacement from the first to the second point, metres."""
     covariance: Array
     """(..., 3, 3) covariance of `apart`, m²."""
 
@@ -243,7 +243,7 @@ def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, rep
     """
     own = people.rows(rows)
     if own.observations is None:
-        raise ValueError("what moving cameras saw is not known: keep observations.npz, or give no rig")
+        raise ValueError("the measurements of moving cameras are missing: keep observations.npz, or give no rig")
     seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
     views = Views.of(rig, seen.time_s)
     assert views.carried is not None
@@ -321,7 +321,7 @@ def surface_distance(
     chosen = np.argsort(-weight, kind="stable")[:4]
     chosen = chosen[known[chosen]]
     if len(chosen) == 0:
-        raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a place")
+        raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a position")
     share = weight[chosen] / max(weight[chosen].sum(), 1e-300)
     both = marginal(people, *(JointAt(person, names[j], frame) for j in chosen.tolist()))
     along = (share[:, None] * normal).ravel()
@@ -371,7 +371,7 @@ def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
     """Row and index of a joint with a position."""
     row, names = _row(people, asked.person, asked.frame), people.joint_names.tolist()
     if asked.joint not in names:
-        raise ValueError(f"joint {asked.joint}: there is none of that name, but {' '.join(names)}")
+        raise ValueError(f"joint {asked.joint}: there is no joint of this name; there are {' '.join(names)}")
     joint = names.index(asked.joint)
     if not (np.isfinite(people.joints[row, joint]).all() and np.isfinite(people.covariance[row, joint]).all()):
         raise NotDetermined(
@@ -387,7 +387,7 @@ def _missing(people: Reconstruction, row: int, joint: int) -> str:
         return f"the row's status is {people.status[row]}{body}"
     used = table.view_names[table.used[row, joint]].tolist()
     views = {0: "no camera's detection was used", 1: f"only camera {' '.join(used)} saw it"}
-    return views.get(len(used), f"cameras {', '.join(used)} do not place it") + body
+    return views.get(len(used), f"cameras {', '.join(used)} do not determine it") + body
 
 
 def _reached(probability: float, rising: Array, limits: Array) -> Array:

@@ -88,7 +88,7 @@ class Ties:
             return
         for key in other.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             if self.start.exists(key):
-                raise ValueError(f"the variable {format_key(key)} of your own has two starts")
+                raise ValueError(f"your variable {format_key(key)} has two initial values")
         self.start.insert(other.start)
         self.people += other.people
         self.factors += other.factors
@@ -138,7 +138,7 @@ class WindowGraph:
         """
         T, J, _ = sigmas_px.shape
         if np.any(np.diff(observations.frame) <= 0):
-            raise ValueError(f"a person's frames must rise, got {observations.frame}")
+            raise ValueError(f"frames of a person must increase, got {observations.frame}")
         self.config = config.graph
         self.rows = np.arange(T) if rows is None else rows
         """(T,) row indices in the whole problem."""
@@ -181,7 +181,7 @@ class WindowGraph:
         """(T, J, 3) positions and velocities of the last solution, metres and m/s; NaN if not in
         it."""
         self.chains: list[Chains] = []
-        """The last problem of several frames by joint, without user factors."""
+        """The last multi-frame problem, as chains of joints without user factors."""
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -238,7 +238,7 @@ class WindowGraph:
             self._add_start(item)
             return
         nodes, touched = list[tuple[int, int]](), list[tuple[WindowGraph, int]]()
-        whose = f"a factor of your own{f' ({name})' if name else ''}"
+        whose = f"your factor{f' ({name})' if name else ''}"
         for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             person = next((each for each in (self, *self.people) if key in each._own), None)
             if person is not None:
@@ -249,9 +249,9 @@ class WindowGraph:
             holder = self._holder(key)
             if holder is None:
                 raise ValueError(
-                    f"{whose} is on {format_key(key)}, which is not in this window: use keys of its people (`keys`"
-                    " and `velocity_keys` of `window.people`), who are not in every frame, or yield first"
-                    " gtsam.Values with the start of a variable of your own"
+                    f"{whose} uses {format_key(key)}, which is not in this window: use keys of its people"
+                    " (`keys` and `velocity_keys` of `window.people`; people are not in every frame), or"
+                    " first yield gtsam.Values with the initial value of your variable"
                 )
             nodes.append((-1, key))
             self.ties.take_in(holder)
@@ -268,9 +268,7 @@ class WindowGraph:
         new = gtsam.Values(start)
         for key in start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             if any(key in person._own for person in self.people):
-                raise ValueError(
-                    f"{format_key(key)} is a joint's: variables of your own are symbols (gtsam.symbol)"
-                )
+                raise ValueError(f"{format_key(key)} is the key of a joint: use gtsam.symbol for your variables")
             if self._holder(key) is not None:
                 new.erase(key)
         self.ties.start.insert(new)
@@ -577,7 +575,7 @@ def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
         return ""
     joint = split_key(key)
     whose = f" of person {joint.person}" if len(people) > 1 else ""
-    return f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: nothing determines it there"
+    return f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: no factor determines it there"
 
 
 def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:

@@ -215,7 +215,7 @@ class PersonGraph:
         views = int(self.window.seen[t, joint].sum())
         name, frame = str(joint_names[joint]), int(self.frames[t])
         saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(views, f"{views} cameras saw it")
-        body = "the body says where it may be" if self.body.known[t, joint] else "the body says nothing of it"
+        body = "the body constrains it" if self.body.known[t, joint] else "the body does not constrain it"
         return NotDetermined(self.person, name, frame, float(self.window.times_s[t]), f"{saw}, and {body}")
 
     @property

@@ -45,7 +45,7 @@ class WrongView:
     """Mean squared distance of its detections from the other views' prediction, in variances, up to
     36; 2 is usual."""
     after: float
-    """Mean squared distance after the change of its pose."""
+    """Mean squared distance after the change of the view's pose."""
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def compare_view(
     detections that were assigned to a joint; gated ones only within `NEAR_M` of it.
     """
     if people.observations is None:
-        raise ValueError("people come without observations: give what `reconstruct` returns, or load its folder")
+        raise ValueError("the people have no observations: give the result of `reconstruct`, or load its folder")
     table = people.observations
     xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
     projected, depth = camera.project(people.joints)

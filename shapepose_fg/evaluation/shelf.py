@@ -136,8 +136,8 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
         scored = acted & np.isin(ground_truth.frame, np.fromiter(frames, dtype=np.int64))
     if not scored.any():
         raise InputError(
-            "none of the reconstructed frames is annotated; reconstruct frames that the ground truth covers: "
-            f"{_spans(np.unique(ground_truth.frame[acted]))}"
+            "none of the reconstructed frames is annotated; reconstruct annotated frames:"
+            f" {_spans(np.unique(ground_truth.frame[acted]))}"
         )
     truth, frame = ground_truth.joints[scored], ground_truth.frame[scored]
     distance = _distances(truth, frame, people)

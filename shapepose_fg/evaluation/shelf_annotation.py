@@ -92,7 +92,8 @@ class _Lines:
         entry = next(self._lines, None)
         if entry is None:
             raise InputError(
-                f"{self._path}: the file ends after line {self._place}, before {meaning}; copy it again whole"
+                f"{self._path}: the file ends after line {self._place}, before {meaning}; copy the whole file"
+                " again"
             )
         self._place, line = entry
         words = line.split()

@@ -62,7 +62,7 @@ def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]
     periods = [clock.period for clock in clocks]
     if max(periods) > 1.01 * min(periods):
         slow, fast = (clocks[periods.index(end(periods))].name for end in (max, min))
-        what = f"cameras {slow} and {fast} took {1 / max(periods):.3g} and {1 / min(periods):.3g} frames a second"
+        what = f"cameras {slow} and {fast} have {1 / max(periods):.3g} and {1 / min(periods):.3g} Hz"
         raise InputError(f"{path}: {what}, but synchronisation needs a common rate; give detections of one rate")
     there = np.isfinite(time_s)
     filled = time_s.copy()

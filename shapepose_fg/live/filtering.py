@@ -65,7 +65,7 @@ class Moment:
     running_s: Array
     """(A,) evidence since the birth of each track, as seconds in which a whole person is seen by all views."""
     peak_s: Array
-    """(A,) maximum of this evidence so far."""
+    """(A,) maximum of `running_s` so far."""
     born_s: Array
     """(A,) times of birth, seconds."""
     place: Array

@@ -124,13 +124,13 @@ class _Sender:
             self.good += 1
 
     def end(self) -> None:
-        """Raise InputError if lines came and none was accepted."""
+        """Raise InputError if there were lines, but none was accepted."""
         if self.good == 0 and self.refused is not None:
             raise self.refused
 
     def _read(self, line: bytes | None, place: str) -> tuple[Any, ...] | None:
         if line is None:
-            raise InputError(f"{place}: it is longer than {SMALL} bytes; write a line for each picture")
+            raise InputError(f"{place}: the line is longer than {SMALL} bytes; write a line for each picture")
         try:
             text = line.decode()
         except UnicodeDecodeError as error:
@@ -196,7 +196,7 @@ def _from_socket(where: str, given: _Given) -> None:
 
         def cut_off(client: _Client, why: object = "") -> None:
             if why:
-                given.note(f"{client.sender.name}: {why}; it is cut off")
+                given.note(f"{client.sender.name}: {why}; the connection is closed")
             ready.unregister(client.connection)
             client.connection.close()
             clients.remove(client)
@@ -212,9 +212,14 @@ def _from_socket(where: str, given: _Given) -> None:
                 first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
                 if first.sender.good > 0 and client.heard_s - first.heard_s < _SILENT_S:
                     connection.close()
-                    given.note(f"{where}: {name} is sent away, as {MOST_CLIENTS} clients are served already")
+                    given.note(
+                        f"{where}: {name} is rejected, because {MOST_CLIENTS} clients are connected already"
+                    )
                     return
-                cut_off(first, f"{MOST_CLIENTS} clients are served at most, and it was silent for longest")
+                cut_off(
+                    first,
+                    f"at most {MOST_CLIENTS} clients are served, and this one was silent for the longest time",
+                )
             clients.append(client)
             ready.register(connection, selectors.EVENT_READ, client)
 
@@ -245,7 +250,7 @@ def _from_socket(where: str, given: _Given) -> None:
                 try:
                     come()
                 except OSError as error:
-                    given.note(f"{where}: nobody else can be served ({error.strerror})")
+                    given.note(f"{where}: no further client can be served ({error.strerror})")
                     ready.unregister(listening)
                     full_s = time.monotonic()
             now_s = time.monotonic()

@@ -38,5 +38,5 @@ class SparingNotes(AbstractContextManager["SparingNotes"]):
 
     def _count(self) -> None:
         if self._more > 0:
-            self._note(f"{self._more} more notes were left out here")
+            self._note(f"{self._more} more notes were left out")
         self._more = 0

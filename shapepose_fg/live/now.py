@@ -71,7 +71,7 @@ class Newest:
     moment: Moment
     """The tracks, also those without an identity yet."""
     fitter: BodyFitter
-    """Fits their bodies."""
+    """Fits the bodies of the tracks."""
     doubted: bool = False
     """Whether cameras contradict each other and it is unknown which are wrong."""
     doubt: Array | None = None

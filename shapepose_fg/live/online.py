@@ -123,11 +123,11 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """
         config = PipelineConfig() if config is None else config
         if len(rig) < 2:
-            raise ValueError(f"at least 2 cameras are needed to see depth, got {len(rig)}")
+            raise ValueError(f"at least 2 cameras are needed, got {len(rig)}")
         if not 0.1 <= lag_s <= 2.0:
             raise ValueError(f"lag_s must be 0.1 to 2 seconds, got {lag_s}")
         if not config.temporal:
-            raise ValueError("people are followed over time here: leave config.temporal at true")
+            raise ValueError("live reconstruction tracks people over time; leave config.temporal at true")
         rounds = min(config.windows.again_over_time, _ROUNDS)
         config = replace(config, windows=replace(config.windows, again_over_time=rounds))
         source, noise = config.offsets.source, NoiseLaw.shipped()
@@ -202,7 +202,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
         self._check_time(times)
         if np.ptp(times) > JUMP_S:
-            raise ValueError(f"time_s of one frame must lie within {JUMP_S:g} s, got {np.ptp(times):g} s")
+            raise ValueError(f"the times of one frame must be within {JUMP_S:g} s, got {np.ptp(times):g} s")
         self._check(detections)
         with self._lock:
             slots = self._state.slots
@@ -277,7 +277,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
                 state.rig = replace(state.rig, cameras=cameras, trajectories=others)
             return state.rig
         if alone and not moves and state.without_pose[view] > 0:
-            raise ValueError(f"{name} stands still, as it was seen without a pose before: leave its pose out")
+            raise ValueError(f"camera {name} is fixed, because its earlier views had no pose; leave out its pose")
         since_s = max(state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - _BACK_S
         rig = with_pose(state.rig, view, time_s, pose, covariance, since_s)
         rig.at(np.full(len(rig), time_s))
@@ -340,8 +340,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         ahead_s = 0.0 if time_s is None or not np.isfinite(newest_s) else time_s - newest_s
         if not -1e-9 <= ahead_s <= AHEAD_S + 1e-9:
             raise ValueError(
-                f"people are known from {newest_s:g} s, the newest frame, to {AHEAD_S:g} s later, not at"
-                f" {time_s:g} s; what was before is in settled()"
+                f"people are known from {newest_s:g} s (the newest frame) to {AHEAD_S:g} s later, but not at"
+                f" {time_s:g} s; earlier people are in settled()"
             )
         return people_at(newest, self._setup.skeleton, self._motion, max(ahead_s, 0.0))
 
@@ -412,7 +412,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         rig = self._state.rig if rig is None else rig
         for view in np.flatnonzero(rig.carrier >= 0).tolist():
             if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(times[view]):
-                raise ValueError(f"{rig.names[view]} moves: give a pose with what it sees at {times[view]:g} s")
+                raise ValueError(f"camera {rig.names[view]} moves; give a pose with its view at {times[view]:g} s")
 
     def _take(self, detections: Detections, times: Array) -> None:
         """Insert a frame among the others by its time."""

@@ -157,10 +157,10 @@ class _Listeners:
             except BlockingIOError:
                 pass
             except OSError:
-                self._part(client, "a reader left")
+                self._part(client, "a reader disconnected")
                 continue
             if sum(map(len, waiting)) > _MOST_WAITING:
-                self._part(client, "a reader is too slow, and cut off")
+                self._part(client, "a reader is too slow; its connection is closed")
 
     def _wait_for_readers(self) -> None:
         """Accept clients in a thread, also while there is nothing to send: the system's queue is
@@ -184,9 +184,9 @@ class _Listeners:
                         self._waiting[client] = deque()
                     else:
                         client.close()
-                        self._note(f"{name} is sent away, as {MOST_CLIENTS} read already")
+                        self._note(f"{name} is rejected, because {MOST_CLIENTS} readers are connected already")
         except OSError as error:
-            self._note(f"nobody else can read ({error.strerror})")
+            self._note(f"no further reader can be served ({error.strerror})")
             return False
         return True
 

@@ -31,9 +31,9 @@ class Slot:
     moment: Moment
     """The state after the frame."""
     candidate: Index
-    """(A, J, V) detections of its tracks; -1 for none."""
+    """(A, J, V) detections of the tracks; -1 for none."""
     settled: bool = False
-    """Whether its rows are refined, or being refined."""
+    """Whether the rows of the frame are refined, or being refined."""
     refined: Reconstruction | None = None
     """Rows refined by the newest window that ends here; later frames are tracked from these. Not
     saved."""
@@ -82,7 +82,7 @@ class Refined:
     rows: Reconstruction
     """Rows that the window settles."""
     newest: Reconstruction
-    """Rows of its newest frame, from which tracking restarts."""
+    """Rows of the newest frame of the window, from which tracking restarts."""
 
 
 @dataclass(frozen=True)

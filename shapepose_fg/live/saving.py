@@ -30,7 +30,7 @@ from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
 FORMAT = "shapepose-fg live state 3"
-_CURE = "begin without it"
+_CURE = "start without it"
 _WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place", "mirrored")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """Columns of detections in a saved state."""
@@ -162,11 +162,11 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
     if asymmetric.any() or (np.linalg.eigvalsh(covariance)[..., 0] < -small).any():
         raise ValueError("covariances of its tracks must be symmetric, with no negative eigenvalue")
     if (np.linalg.eigvalsh(covariance[..., :3, :3])[..., 0] < _LEAST_VARIANCE).any():
-        raise ValueError(f"no place of its tracks is known to {_LEAST_VARIANCE:g} m² or less")
+        raise ValueError(f"the variances of its positions must be above {_LEAST_VARIANCE:g} m²")
     if not all((found[name] >= 0).all() for name in ("peak_s", "length_m", "count")):
-        raise ValueError("bones and the most evidence of its tracks must not be negative")
+        raise ValueError("bone lengths and the largest evidence of its tracks must not be negative")
     if not (np.abs(found["times"][:, 0] - found["time_s"].mean(axis=1)) < 1e-3).all():
-        raise ValueError("its tracks must be of the times of its frames")
+        raise ValueError("the times of its tracks must be those of its frames")
     if (np.diff(found["time_s"].mean(axis=1)) <= LEAST_STEP_S).any():
         raise ValueError("its frames must be in order of time")
     slots, starts = [], np.vstack([np.zeros((1, 8), dtype=np.int64), np.cumsum(counts, axis=0)])
@@ -187,7 +187,7 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         joints = JointStates(found["mean"][a], found["covariance"][a])
         ids, who = found["ids"][a], found["identity"][a]
         if len(np.unique(ids)) < len(ids) or not ((ids >= 0) & (ids < track)).all():
-            raise ValueError("its tracks must have numbers of their own")
+            raise ValueError("the numbers of its tracks must differ")
         if not ((who >= ON_TRIAL) & (who < identity)).all():
             raise ValueError("identities of its people must be below the next one")
         tracks = Tracks(time_s, found["ids"][a], found["world"][a], joints, found["evident_s"][a])
@@ -207,7 +207,7 @@ def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
     for each, most in ((seen.confidence, 1), (seen.mirrored, 1), (seen.affinity, _MOST_AFFINITY)):
         if not ((each >= 0) & (each <= most)).all():
             raise ValueError(
-                f"of its detections, confidences and probabilities must be 0 to 1, affinities to {_MOST_AFFINITY}"
+                f"confidences and probabilities of its detections must be 0 to 1, affinities 0 to {_MOST_AFFINITY}"
             )
     within = all(
         len(values) == 0 or (values.min() >= 0 and values.max() < most)
@@ -217,7 +217,7 @@ def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
         raise ValueError("its detections are of other cameras, joints or people")
     first, second = seen.pairs.T
     if (seen.view[first] != seen.view[second]).any() or len(np.unique(seen.pairs, axis=0)) < len(seen.pairs):
-        raise ValueError("its affinities must be of two detections of a camera, of each two once")
+        raise ValueError("its affinities must be of two detections of a camera, each pair once")
     person, joint, view = np.nonzero(candidate >= 0)
     own = candidate[person, joint, view]
     if (seen.joint[own] != joint).any() or (seen.view[own] != view).any():
@@ -263,9 +263,11 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
     optional += [f"pose.{each}" for each in ("carrier", *_POSES)]
     arrays = read_npz(path, ("format", "setup", *_COLUMNS, *names, *optional), _CURE)
     if str(arrays.get("format", "")) != FORMAT:
-        raise InputError(f"{path}: is no state of a live reconstruction; {_CURE}")
+        raise InputError(f"{path}: this is not a saved state of a live reconstruction; {_CURE}")
     if str(arrays.get("setup", "")) != setup:
-        raise InputError(f"{path}: was saved with other cameras, joints, settings or lag; give those, or {_CURE}")
+        raise InputError(
+            f"{path}: the state was saved with other cameras, joints, settings or lag; give those, or {_CURE}"
+        )
     missing = {*names, *(_COLUMNS if len(arrays.get("slots", ())) > 0 else ())} - arrays.keys()
     if missing:
         raise InputError(f"{path}: {min(missing)} is missing; {_CURE}")

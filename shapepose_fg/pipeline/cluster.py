@@ -68,11 +68,11 @@ def _naming_lost_work() -> Iterator[None]:
         yield
     except KilledWorker as error:
         raise WorkLost(
-            f"{error.allowed_failures + 1} processes of the cluster ended one after the other before their"
-            " work: there may be too little memory for one"
+            f"{error.allowed_failures + 1} processes of the cluster ended in turn before they finished; there"
+            " may be too little memory"
         ) from None
     except CancelledError:
-        raise WorkLost("the cluster's scheduler is gone") from None
+        raise WorkLost("the scheduler of the cluster has ended") from None
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Scheduler:
     address: str
     """`tcp://host:8786`."""
     processes: int
-    """Current number of its processes."""
+    """Current number of worker processes."""
     dashboard: str | None
     """Address of its dashboard; None if there is none."""
 
@@ -187,8 +187,8 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
     if other is not None:
         which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
         raise InputError(
-            f"{process} has another version of {other}{which}; install the same there, or results would depend on"
-            " who did what"
+            f"{process} has another version of {other}{which}; install the same version there, because results"
+            " must not depend on the process"
         )
 
 
@@ -203,7 +203,9 @@ def _dask() -> Any:
     try:
         from distributed import Client
     except ImportError:
-        raise InputError('Dask is not installed: pip install "shapepose-fg[cluster]", or leave it out') from None
+        raise InputError(
+            'Dask is not installed; pip install "shapepose-fg[cluster]", or leave out --cluster'
+        ) from None
     return Client
 
 

@@ -95,7 +95,7 @@ class SolvingConfig(Settings):
 
 
 Rules = TypeVar("Rules", CandidateConfig, ProposalConfig, WindowGraphConfig, RefineConfig)
-_CONSTANT = "is no table any more: its settings are constants beside the steps that use them"
+_CONSTANT = "is not a table any more: its settings are constants now"
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class PipelineConfig(Settings):
     need less memory."""
 
     replaced: ClassVar[dict[str, str]] = {
-        "threads": "is gone: bodies are fitted by one thread",
+        "threads": "was removed: bodies are fitted by one thread",
         "candidates": f"{_CONSTANT}; gate_m and most_pairs are in [people]",
         "proposals": f"{_CONSTANT}; min_probability is in [people], and method chooses between evidence and hips",
         "association": _CONSTANT,

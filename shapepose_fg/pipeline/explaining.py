@@ -112,16 +112,14 @@ def explain(
     """
     table = people.observations
     if table is None:
-        raise InputError("the result does not say what it was solved from (observations.npz): reconstruct again")
+        raise InputError("the result has no observations.npz, which contains its detections; reconstruct again")
     if tuple(table.view_names.tolist()) != rig.names:
-        raise InputError(
-            "the cameras are not those of observations.npz; give those that it was reconstructed with"
-        )
+        raise InputError("the cameras are not those of observations.npz; give the cameras of the reconstruction")
     told = validated(_Run, people.run, "run.json", "restore it or reconstruct the recording again")
     row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
-        raise InputError(f"joint {joint}: the result has none of that name; it has {' '.join(names)}")
+        raise InputError(f"joint {joint}: the result has no joint of this name; it has {' '.join(names)}")
     number = names.index(joint)
     solver = Solver.of(people, rig)
     graph = solved_around(people, solver, person, frame, extra_factors)
@@ -151,9 +149,9 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     mine = np.flatnonzero(people.person == person)
     if len(mine) == 0:
         there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
-        raise InputError(f"person {person}: is not in the result; there are {there or 'none'}")
+        raise InputError(f"person {person}: not in the result; there are {there or 'none'}")
     if (frame is None) == (time_s is None):
-        raise InputError("give a frame or a time, one of them")
+        raise InputError("give either a frame or a time")
     if time_s is not None:
         away = np.abs(people.time_s[mine] - time_s)
         if not np.isfinite(away).any():
@@ -162,7 +160,7 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     row = mine[people.frame[mine] == frame]
     if len(row) == 0:
         first, last = people.frame[mine].min(), people.frame[mine].max()
-        raise InputError(f"person {person} is not in frame {frame}, but in some from {first} to {last}")
+        raise InputError(f"person {person} is not in frame {frame}, only in some frames from {first} to {last}")
     return int(row[0])
 
 
@@ -375,13 +373,16 @@ def _refused(all_of_it: _Detections, row: int, joint: int, detections: Detection
         if owner[k] < 0:
             sigmas, others = all_of_it.seen.sigmas_px[:, joint, view], 0.0
             usual = sigmas.sum() / max((sigmas > 0).sum(), 1)
-            whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off) or "nobody's"
-        cause = Cause.GATED if whose == "nobody's" else Cause.FOREIGN
+            whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off)
+        cause = Cause.FOREIGN if whose else Cause.GATED
         if theirs > others:
-            words = f"joins a detection with theirs that is {whose}, {off:.0f} px off. It was not taken."
+            words = (
+                f"connects a detection with this person's that is {whose or 'unassigned'}, {off:.0f} px"
+                " off. It was not used."
+            )
             joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
-        elif whose == "nobody's" and off * depth[view] < _NEAR_M * views.focal[0, view]:
-            words = f"Camera {name} has a detection {off:.0f} px off that nobody was given."
+        elif not whose and off * depth[view] < _NEAR_M * views.focal[0, view]:
+            words = f"Camera {name} has an unassigned detection {off:.0f} px off."
             beside.append((off, Finding(cause, (name,), words)))
     return joined + [each for _, each in sorted(beside, key=lambda one: one[0])]
 
@@ -408,9 +409,9 @@ def _findings(
         name = views[wrong.view].camera
         (turn, turn_sigma), (shift, shift_sigma) = wrong.turn_deg, wrong.shift_m
         words = (
-            f"Camera {name} is off with whatever it sees around this time: turned by {turn:.1f} ± {turn_sigma:.1f}"
-            f" degrees and moved by {100 * shift:.0f} ± {100 * shift_sigma:.0f} cm it would fit the others."
-            " Check its pose, lens and clock."
+            f"Camera {name} disagrees in everything that it sees around this time: rotated by {turn:.1f} ±"
+            f" {turn_sigma:.1f} degrees and moved by {100 * shift:.0f} ± {100 * shift_sigma:.0f} cm it"
+            " would fit the others. Check its pose, lens and clock."
         )
         found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
@@ -418,7 +419,8 @@ def _findings(
     for view in suspects:
         if view.looks_like:
             words = (
-                f"Camera {view.camera}'s detection is rather {view.looks_like}: it is {_off(view)}. {_taken(view)}"
+                f"Camera {view.camera}'s detection probably belongs to {view.looks_like}: it is {_off(view)}."
+                f" {_taken(view)}"
             )
             found.append(Finding(Cause.FOREIGN, (view.camera,), words))
     named = {name for each in found for name in each.cameras}
@@ -434,24 +436,25 @@ def _findings(
         for several, fate in ((against, "left out"), (doubted, "used, with less weight")):
             cameras = tuple(view.camera for view in several)
             words = (
-                f"{_cameras(cameras)} and all else put it at different places ({', '.join(map(_off, several))}):"
-                f" detections were {fate}."
+                f"{_cameras(cameras)} and all other measurements place it differently"
+                f" ({', '.join(map(_off, several))}): detections were {fate}."
             )
             if several:
                 found.append(Finding(Cause.CONTRADICTION, cameras, words))
     alone += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
     for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
-        words = f"Camera {view.camera}'s detection is {_off(view)}, and nobody's that is known. {_taken(view)}"
+        words = f"Camera {view.camera}'s detection is {_off(view)} and matches no known person. {_taken(view)}"
         found.append(Finding(Cause.GATED, (view.camera,), words))
     found += [each for each in refused if each.cameras[0] not in named]
     if len(used) == 0:
         words = (
-            f"No camera's detection was used: the body says {shares[0]:.0%},"
-            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} motion from other frames the rest."
+            f"No camera's detection was used: the body contributes {shares[0]:.0%},"
+            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and and motion from other"
+            " frames the rest."
         )
         found.append(Finding(Cause.PRIOR_ONLY, (), words))
     if len(used) == 1:
-        words = f"Only camera {used[0].camera} tells of it: how deep it is, body and motion say."
+        words = f"Only camera {used[0].camera} measures it: its depth comes from body and motion."
         found.append(Finding(Cause.ONE_VIEW, (used[0].camera,), words))
     return tuple(found)
 
@@ -470,13 +473,13 @@ def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (
         (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
-        (told.setup.doubted, Cause.CONTRADICTION, "not believed"),
+        (told.setup.doubted, Cause.CONTRADICTION, "doubted"),
     ):
         cameras = tuple(each.camera for each in spells if each.frames[0] <= frame < each.frames[1])
         says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*cameras})
         if cameras:
             words = (
-                f"By the set-up check {_cameras(cameras)} {'were' if len(cameras) > 1 else 'was'} {fate}: {says}."
+                f"In the set-up check, {_cameras(cameras)} {'were' if len(cameras) > 1 else 'was'} {fate}: {says}."
             )
             found.append(Finding(cause, cameras, words))
     return found
@@ -489,7 +492,7 @@ def _taken(view: ViewReason) -> str:
 def _off(view: ViewReason) -> str:
     """Distance of a detection from the prediction by all else, in words."""
     if view.off_px is None or view.off_sigma is None:
-        return "behind it"
+        return "behind the camera"
     return f"{view.off_px:.0f} px or {view.off_sigma:.1f} sigmas off"
 
 

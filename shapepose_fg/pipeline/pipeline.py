@@ -82,7 +82,7 @@ def reconstruct(
     people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
     for name, told in people.run.get("extra_factors", {}).items():
         if told["made"] == told["inactive"]:
-            what = "is active, because joints that they need have no place" if told["made"] > 0 else "was made"
+            what = "is active, because joints that they need have no position" if told["made"] > 0 else "was made"
             warnings.warn(f"extra_factors: {name}: none of its factors {what}", stacklevel=2)
     return replace(people, rig=kept_rig(kept, rig) or rig)
 
@@ -131,7 +131,7 @@ class Task:
         inconsistent.
         """
         if len(self.rig) < 2:
-            raise ValueError(f"at least 2 cameras are needed to see depth, got {len(self.rig)}")
+            raise ValueError(f"at least 2 cameras are needed, got {len(self.rig)}")
         count = len(self.detections)
         frames = range(count) if self.frames is None else self.frames
         if frames.step != 1 or not 0 <= frames.start <= frames.stop <= count:
@@ -192,7 +192,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
                 # half way between frames, to avoid rounding
                 cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
                 result = replace(result, names=_names(result, setup, cuts_s.tolist()))
-        floor: Floor | str = "frames stand alone" if not config.temporal else "not sought"
+        floor: Floor | str = "frame by frame" if not config.temporal else "not sought"
         model = setup.fitter.model
         if config.temporal and model is not None and len(result) > 0:
             with book.stage("bodies over time"):

@@ -36,7 +36,7 @@ UNSEEN_S = 0.3
 """Longest gap without detections over which predictions cover such joints, s."""
 _ON_TRIAL = 0.5
 """Factor on the required probability in single frames before a body is fitted."""
-_FALSE_POSITIVE = "next to no detections of their own, or in somebody else's place"
+_FALSE_POSITIVE = "hardly any detections of their own, or at the position of another person"
 """Reason for dropping people when detections are reassociated."""
 
 

@@ -138,7 +138,7 @@ def _solved(
     overlap, and the solution.
     """
     if rows.observations is None:
-        raise ValueError("rows without observations cannot be solved anew; reconstruct the recording again")
+        raise ValueError("rows without observations cannot be solved again; reconstruct the recording again")
     config, rig = solver.config, solver.rig
     _check_rows(rows, over_time=config.temporal)
     settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()), noise=solver.noise)
@@ -162,7 +162,7 @@ def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
     person, frame, time_s = (each[order] for each in (rows.person, rows.frame, rows.time_s))
     same = np.diff(person) == 0
     twice = np.flatnonzero(same & (np.diff(frame) == 0))
-    problem = f"person {person[twice[0]]} is twice in frame {frame[twice[0]]}" if len(twice) > 0 else ""
+    problem = f"person {person[twice[0]]} occurs twice in frame {frame[twice[0]]}" if len(twice) > 0 else ""
     if len(rows) > 0 and (person.max() > MAX_PERSON or frame.max() > MAX_FRAME):
         problem = f"persons must be at most {MAX_PERSON} and frames {MAX_FRAME}"
     if over_time and not problem:
@@ -170,7 +170,9 @@ def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
         wrong[1:] |= same & ~(np.diff(time_s) > LEAST_STEP_S)
         if wrong.any():
             at = int(wrong.argmax())
-            problem = f"time_s must rise with the frames, and does not at person {person[at]}, frame {frame[at]}"
+            problem = (
+                f"time_s must increase with the frames, but does not at person {person[at]}, frame {frame[at]}"
+            )
     if problem:
         raise InputError(f"people.npz: {problem}; restore the file or reconstruct the recording again")
 

@@ -124,7 +124,7 @@ def naming_lost_work() -> Iterator[None]:
         yield
     except BrokenProcessPool as error:
         raise WorkLost(
-            "a worker process was killed, as the system does where there is too little memory for so many"
+            "a worker process was killed, probably because there is too little memory for so many workers"
         ) from error
 
 
@@ -135,8 +135,8 @@ def packed(shared: object) -> bytes:
     except Exception as error:  # of the user's own objects
         reason = " ".join(str(error).split())[:300]
         raise ValueError(
-            f"this cannot be sent to worker processes ({type(error).__name__}: {reason}): leave out what belongs"
-            " to this process alone, such as open files and locks, or use workers=1"
+            f"this cannot be sent to worker processes ({type(error).__name__}: {reason}); leave out objects of"
+            " this process, such as open files and locks, or use workers=1"
         ) from error
 
 

@@ -56,7 +56,7 @@ class Sight(NamedTuple):
     limb: Index
     """(J + 1,) offset of each joint's limbs in `limb_ends`."""
     limb_ends: Index
-    """(2 L,) the joints at their other ends."""
+    """(2 L,) the joint at the other end of each limb."""
     swings: Mask
     """(J,) joints of arms and legs except shoulders and hips."""
 

@@ -275,12 +275,12 @@ class Look:
         return self.pairs.groups(len(self.sightings), views)
 
     def structure(self, without: tuple[int, ...] = (), steps: int = 6) -> tuple[Groups, Structure]:
-        """These people with their triangulated joints."""
+        """People seen by cameras except `without`, with their triangulated joints."""
         groups = self.groups(without)
         return groups, triangulate(*observed(groups, self.sightings), self.views, steps)
 
     def others(self, *without: int) -> Others:
-        """People seen by all cameras except these."""
+        """People seen by all cameras except `without`."""
         if without not in self._others:
             groups, structure = self.structure(without, steps=2)
             self._others[without] = Others(groups.frame, structure.points)
@@ -314,7 +314,7 @@ class Look:
 
     @property
     def _pair_score(self) -> float:
-        """Score of two cameras for each other, if there are no more."""
+        """Score of the only two cameras; 0 for fewer."""
         views = np.unique(self.sightings.view).tolist()
         if len(views) < 2:
             return 0.0

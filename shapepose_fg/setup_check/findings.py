@@ -126,12 +126,12 @@ def _words(finding: Finding, rig: Rig) -> str:
     )
 
 
-_POSE_AGAIN = "calibrate its pose again, or let shapepose-fg refine-calibration find it by the people"
+_POSE_AGAIN = "calibrate its pose again, or refine it with shapepose-fg refine-calibration"
 
 
 def _turned(finding: Finding, side_px: int) -> str:
     return (
-        "{who} looks turned by about {degrees} degrees"
+        "{who} appears to be rotated by about {degrees} degrees"
         + (" and moved by {moved}" if finding.moved > 0.1 else "")
         + f"; {_POSE_AGAIN}"
     )
@@ -140,8 +140,11 @@ def _turned(finding: Finding, side_px: int) -> str:
 def _principal_point(finding: Finding, side_px: int) -> str:
     cure = "check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
     if len(finding.cameras) == 1:
-        return f"the principal point of {{who}} looks off, it should lie {{shift}}; {cure}"
-    return f"principal points look off, they should lie {{shifts}} (at most a turn of {{degrees}} degrees); {cure}"
+        return f"the principal point of {{who}} appears to be wrong, it should be {{shift}}; {cure}"
+    return (
+        f"principal points appear to be wrong, they should be {{shifts}} (equivalent to rotations of at"
+        f" most {{degrees}} degrees); {cure}"
+    )
 
 
 def _late(finding: Finding, side_px: int) -> str:
@@ -149,8 +152,8 @@ def _late(finding: Finding, side_px: int) -> str:
         late, rest = "late", "its first {frames}"
     else:
         late, rest = "early", "the first {frames} of all others"
-    words = "what the others show at frame 100 it shows at frame {at}; leave out"
-    return f"{{who}} looks about {{frames}} {late}: {words} {rest}"
+    words = "it shows at frame {at} what the others show at frame 100; leave out"
+    return f"{{who}} appears to be about {{frames}} {late}: {words} {rest}"
 
 
 def _focal(finding: Finding, side_px: int) -> str:
@@ -158,17 +161,20 @@ def _focal(finding: Finding, side_px: int) -> str:
     by, more = (
         ("{percent:.0f} %", "")
         if 0.8 < finding.amount < 1.25
-        else ("{amount:.2g} times what fits,", " and the size of its pictures")
+        else ("{amount:.2g} times the fitting value,", " and the size of its pictures")
     )
-    return f"{{who}} has a focal length in the calibration that looks {by} too {what}; check its intrinsics{more}"
+    return (
+        f"{{who}} has a focal length in the calibration that appears to be {by} too {what}; check its"
+        f" intrinsics{more}"
+    )
 
 
 def _duplicate(finding: Finding, side_px: int) -> str:
     if finding.same == "":
-        return "{first} and {second} are one camera listed twice; take one of them out"
+        return "{first} and {second} are one camera listed twice; remove one of them"
     detections = finding.same == "detections"
-    same, others = ("the same detections", "files") if detections else ("one and the same pose", "calibration")
-    return f"{{first}} and {{second}} have {same}; one of them has the other's {others}: give its own"
+    same, others = ("the same detections", "files") if detections else ("the same pose", "calibration")
+    return f"{{first}} and {{second}} have {same}; one of them has the {others} of the other; give its own"
 
 
 ADULT_M = 1.7
@@ -188,86 +194,92 @@ def _unit(finding: Finding, side_px: int) -> str:
     factor = finding.amount / ADULT_M
     for times, truth, taken in _UNITS:
         if 0.55 < factor / times < 1.45:
-            unit = f"the calibration is probably in {truth}, and was read as {taken}; say its unit with --unit"
-            return f"people come out {{stature}} tall: {unit}"
+            unit = f"the calibration is probably in {truth}, but was read as {taken}; give its unit with --unit"
+            return f"the stature of people is {{stature}}: {unit}"
     off = f"{1 / factor:.2g} times too small" if factor < 1 else f"{factor:.2g} times too large"
     return (
-        f"people come out {{stature}} tall: lengths in the calibration are about {off}; check its unit, and the"
-        " size of the squares of the board that it was made with"
+        f"the stature of people is {{stature}}: lengths in the calibration are about {off}; check its unit, and"
+        " the size of the squares of the calibration board"
     )
 
 
 def _joint_order(finding: Finding, side_px: int) -> str:
     if len(finding.joints) == 2:
         fits, read_as = finding.joints
-        order = f"joints do not lie as a body's do in the order of {read_as}, and do in that of {fits}"
+        order = f"people do not look like a body in the joint order of {read_as}, but do in that of {fits}"
         return f"{order}; give --skeleton {fits}"
     if finding.joints == ("left and right",):
-        what = "left and right of everybody look exchanged: knees and faces point backwards"
-        return f"{what}; exchange them in a --skeleton file, or see whether all pictures were mirrored"
+        what = "left and right appear to be exchanged: knees and faces point backwards"
+        return f"{what}; exchange them in a --skeleton file, or check whether all pictures are mirrored"
     if any(finding.joints):
-        return f"{finding.joints[0]} look exchanged in all detections; give their order in a --skeleton file"
+        return (
+            f"{finding.joints[0]} appear to be exchanged in all detections; give their order in a --skeleton file"
+        )
     return (
-        "joints do not lie as a body's do: they are in another order than they are read in; name the detector's"
-        " joints, or its layout, with --skeleton"
+        "people do not look like a body: the joints are in another order; give the keypoint layout of the"
+        " detector with --skeleton"
     )
 
 
 def _nobody(finding: Finding, side_px: int) -> str:
     if len(finding.cameras) > 0:
-        return "{who} {sees} nobody in the frames that were looked at; check the detections"
+        return "{who} {sees} no people in the checked frames; check the detections"
     if finding.amount < 1:
-        return "no camera sees a person in the frames that were looked at; check the detections"
+        return "no camera sees a person in the checked frames; check the detections"
     return (
-        "nobody is seen by two cameras that agree, although cameras saw {amount:.0f} people; check that"
+        "no person is seen by two cameras that agree, although cameras saw {amount:.0f} people; check that"
         " calibration and detections are of one recording, and that the cameras are in the same order"
     )
 
 
 def _unfit(finding: Finding, side_px: int) -> str:
-    check = "check that its calibration and its detections are its own"
+    check = "check that its calibration and its detections belong to it"
     if len(finding.cameras) == 1:
-        return f"{{who}} fits the others in nothing that was tried; {check}"
-    since = "" if finding.frames == (None, None) else " {when}, while they agree else: one of them was moved"
-    return f"{{who}} contradict {{others}}{since}; {check.replace('its', 'their')}"
+        return f"{{who}} fits the others under no tested explanation; {check}"
+    since = "" if finding.frames == (None, None) else " {when}, but agree in other frames: one of them was moved"
+    return (
+        f"{{who}} contradict {{others}}{since};"
+        f" {check.replace('its', 'their').replace('belong to it', 'belong to them')}"
+    )
 
 
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TURNED: _turned,
-    Kind.MOVED: f"{{who}} looks moved by about {{moved}} and turned by {{amount:.1f}} degrees; {_POSE_AGAIN}",
+    Kind.MOVED: f"{{who}} appears to be moved by about {{moved}} and rotated by {{amount:.1f}} degrees;"
+    f" {_POSE_AGAIN}",
     Kind.LATE: _late,
-    Kind.EXCHANGED: "{who} look exchanged: each sees what the other should see; exchange their names in the"
+    Kind.EXCHANGED: "{who} appear to be exchanged: each sees what the other should see; exchange their names in"
+    " the"
     " calibration, or their detections",
-    Kind.INVERTED: "the extrinsics of {who} look inverted: camera from world was taken for world from camera, or"
-    " the other way round; write the inverse",
-    Kind.TRANSPOSED: "the rotation of {who} looks transposed, with the translation as it is; transpose it",
-    Kind.AXES: "the camera axes of {who} look like those of OpenGL or Blender, y up and z backwards; turn y and z"
-    " round",
-    Kind.MIRRORED: "the pictures of {who} look mirrored; mirror them back",
-    Kind.BUMPED: "{who} looks turned by {degrees} degrees {when}: somebody moved it; calibrate it for"
-    " each part, or take it out of one",
-    Kind.DRIFTING: "{who} looks as if it slowly turned, by {degrees} degrees over the recording; fix it on its"
-    " stand, and take it out of this recording",
+    Kind.INVERTED: "the extrinsics of {who} appear to be inverted: camera-from-world was read as"
+    " world-from-camera, or the reverse; write the inverse",
+    Kind.TRANSPOSED: "the rotation of {who} appears to be transposed, but not the translation; transpose it",
+    Kind.AXES: "the camera axes of {who} appear to be those of OpenGL or Blender (y up, z backwards); reverse y"
+    " and z",
+    Kind.MIRRORED: "the pictures of {who} appear to be mirrored; mirror them back",
+    Kind.BUMPED: "{who} appears to be rotated by {degrees} degrees {when}: it was moved; calibrate it for each"
+    " part, or leave it out of one",
+    Kind.DRIFTING: "{who} appears to rotate slowly, by {degrees} degrees over the recording; fix it on its"
+    " stand, and leave it out of this recording",
     Kind.FOCAL: _focal,
-    Kind.RESIZED: "the detections of {who} look as if they were made on pictures {amount:.2g} times the calibrated"
-    " size ({resized} instead of {calibrated}); give detections on pictures of the calibrated size, or the"
-    " calibration of these",
+    Kind.RESIZED: "the detections of {who} appear to be from pictures of {amount:.2g} times the calibrated size"
+    " ({resized} instead of {calibrated}); give detections from pictures of the calibrated size, or the"
+    " calibration of these pictures",
     Kind.PRINCIPAL_POINT: _principal_point,
     Kind.DUPLICATE: _duplicate,
     Kind.UNIT: _unit,
-    Kind.UP: "people stand along {axis}, and the calibration says that {up} is up; give --up {axis}"
-    " unless they lie",
+    Kind.UP: "people stand along {axis}, but {up} is up in the calibration; give --up {axis} unless they lie",
     Kind.JOINT_ORDER: _joint_order,
     Kind.NOBODY: _nobody,
-    Kind.STOPPED: "{who} shows the picture before once more in {percent:.0f} % of the frames that were looked at;"
-    " what it sees there is left out: look at its recording",
+    Kind.STOPPED: "{who} repeats the previous picture in {percent:.0f} % of the checked frames; the repeated"
+    " pictures are left out; check its recording",
     Kind.UNFIT: _unfit,
-    Kind.CROWDED: "pictures show {amount:.0f} people or more, who hide each other: whether cameras fit they do not"
-    " tell; check it in frames with fewer",
-    Kind.BIASED: "{who} sees one person {percent:.0f} % of a stature beside where the others see that person: the"
-    " detector errs",
-    Kind.PICTURE_SIZE: "the pictures of {first} are {found} pixels, and the calibration says {calibrated}; say how"
-    " the one became the other, or calibrate the pictures as they are",
+    Kind.CROWDED: "pictures show {amount:.0f} people or more, who occlude each other, so the cameras cannot be"
+    " checked; use frames with fewer people",
+    Kind.BIASED: "{who} sees one person beside where the others see this person, by {percent:.0f} % of the"
+    " stature: this is an error of the detector",
+    Kind.PICTURE_SIZE: "the pictures of {first} have {found} pixels, but the calibration is for {calibrated};"
+    " give --image-placement, or calibrate with these pictures",
 }
 """Sentence of each kind: a template for `sentence`, or a function that chooses it by the finding
 and the longer side of the camera's picture, pixels."""
@@ -276,7 +288,7 @@ and the longer side of the camera's picture, pixels."""
 def _when(first: int | None, last: int | None) -> str:
     """The affected frames in words."""
     if first is None:
-        return "all the time" if last is None else f"before frame {last}"
+        return "in all frames" if last is None else f"before frame {last}"
     return f"from frame {first} on" if last is None else f"in frames {first} to {last - 1}"
 
 
@@ -284,7 +296,7 @@ def _shift(x: float, y: float) -> str:
     """A shift in a picture in words."""
     parts = [(abs(x), "right" if x > 0 else "left"), (abs(y), "down" if y > 0 else "up")]
     told = [f"{size:.0f} px {way}" for size, way in parts if size >= 0.5]
-    return " and ".join(told) or "under a pixel"
+    return " and ".join(told) or "less than a pixel"
 
 
 def _length(metres: float) -> str:

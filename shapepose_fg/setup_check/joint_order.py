@@ -170,5 +170,5 @@ def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Ar
 
 
 def _some(people: Array) -> Array:
-    """At most `_MOST_PEOPLE` of them, evenly spread."""
+    """At most `_MOST_PEOPLE` of the `people`, evenly spread."""
     return people[:: -(-len(people) // _MOST_PEOPLE) if len(people) > 0 else 1]

@@ -33,7 +33,7 @@ class CameraFigures:
     people: int
     """Number of people seen in the frames used."""
     matched: float
-    """Share of them that another camera sees too."""
+    """Share of these people that another camera sees too."""
     median_px: float | None
     """Median reprojection error of all matched joints, pixels."""
     high_px: float | None
@@ -45,7 +45,7 @@ class CameraFigures:
     left_out_px: float | None
     """Median distance from joints triangulated by the other cameras only, pixels."""
     left_out_mm: float | None
-    """Median of this distance as a length, millimetres."""
+    """Median distance from these joints as a length, millimetres."""
     left_out_matched: float
     """Share of the possible matches with people of the others that the camera has."""
     late_frames: int
@@ -91,14 +91,14 @@ class SetupReport:
         """The warnings, with their consequences for a reconstruction."""
         out = {view for view, _, _ in self.trust.left_out}
         words = [
-            f"{said}. It is left out there (--no-check keeps it)" if out & set(found.cameras) else said
+            f"{said}. It is left out of these frames (--no-check keeps it)" if out & set(found.cameras) else said
             for found, said in zip(self.findings, self.warnings, strict=True)
         ]
         if len(self.trust.doubted) > 0:
             names = ", ".join(rig.names[view] for view in sorted({view for view, _, _ in self.trust.doubted}))
             words.append(
-                f"nothing says which of {names} is wrong: rows that rest on them have the status"
-                f" {str(Status.CONTRADICTED)!r}, not 'ok'"
+                f"it is unknown which of {names} is wrong: rows that depend on them have the status"
+                f" {str(Status.CONTRADICTED)!r} instead of 'ok'"
             )
         return words
 
@@ -149,8 +149,8 @@ def _children(build: Build | None) -> list[str]:
         return []
     lengths = f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they should be"
     return [
-        f"people come out {build.stature:.2f} m tall, as children are; if they are adults, {lengths}: check the"
-        " size of the board's squares"
+        f"the stature of people is {build.stature:.2f} m, as of children; if they are adults, {lengths}: check"
+        " the size of the board's squares"
     ]
 
 
@@ -234,7 +234,7 @@ _REASONS = {
     Gate.TOO_FAR: "are too far from the joint",
     Gate.CONTRADICTS_BODY: "contradict the body",
     Gate.BEHIND_CAMERA: "are of joints behind the camera",
-    Gate.NOT_PLACED: "are of joints that have no place",
+    Gate.NOT_PLACED: "are of joints without a position",
 }
 """Reasons why assigned detections were not used."""
 _LEAST_USED = 0.1
@@ -317,9 +317,9 @@ def result_check(
     warnings = report.with_consequences(rig)
     if len(people) == 0 and Kind.NOBODY not in {finding.kind for finding in report.findings}:
         warnings.append(
-            "Nobody was found; see what the check of the set-up says"
+            "No people were found; see the findings of the set-up check"
             if warnings
-            else "Nobody was found; look with check-calibration whether cameras and detections fit"
+            else "No people were found; check with check-calibration whether cameras and detections fit"
         )
     warnings += [*_shapes(people), *_speeds(people)]
     chance = [*_too_many(people), *_clutter(uses)][:1]
@@ -360,7 +360,7 @@ def camera_use(
     ]
 
 
-LEFT_OUT, NOBODY = "are left out with the camera", "belong to nobody who was found"
+LEFT_OUT, NOBODY = "are left out with the camera", "are not assigned to any person"
 """Reasons why detections were not assigned."""
 
 
@@ -397,7 +397,7 @@ def _shapes(people: Reconstruction) -> Iterator[str]:
     far = largest > _MOST_BETA
     if far.sum() > 0 and far.mean() >= _SHARE:
         yield (
-            f"{far.sum()} of {len(far)} bodies have a shape that nobody has (a component of {largest.max():.0f}"
+            f"{far.sum()} of {len(far)} bodies have an implausible shape (a component of {largest.max():.0f}"
             " standard deviations); check the calibration's unit, and whether its poses are inverted"
         )
 
@@ -417,8 +417,8 @@ def _speeds(people: Reconstruction) -> Iterator[str]:
     if fast >= _FASTEST_M_S:
         rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
         yield (
-            f"people move at {fast:.0f} m/s, and nobody does: --fps is probably wrong ({rate:.0f} a second; a"
-            " camera gives 25 to 60), or frames are missing, or the calibration's unit is wrong"
+            f"people move at {fast:.0f} m/s, which is implausible: --fps is probably wrong ({rate:.0f} Hz;"
+            " usual cameras have 25 to 60), or frames are missing, or the calibration's unit is wrong"
         )
 
 
@@ -427,8 +427,9 @@ def _too_many(people: Reconstruction) -> Iterator[str]:
     frames = sum(last - first for first, last in people.run.get("thinned_frames", {}).get("detections", []))
     if frames > 0:
         yield (
-            f"{frames} frames have more detections than people could make: who is who is chance there, and rows"
-            f" have the status {str(Status.CONTRADICTED)!r}; ask the detector for surer ones only"
+            f"{frames} frames have more detections than people could cause: identities are arbitrary there, and"
+            f" rows have the status {str(Status.CONTRADICTED)!r}; use a higher confidence threshold in the"
+            " detector"
         )
 
 
@@ -437,8 +438,8 @@ def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
     offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
     if 0 < used < _LEAST_USED * offered:
         yield (
-            f"people explain {100 * used / offered:.1f} % of the detections, and nobody the rest: who is who may"
-            " be chance; ask the detector for surer ones only"
+            f"people explain only {100 * used / offered:.1f} % of the detections: identities may be arbitrary;"
+            " use a higher confidence threshold in the detector"
         )
 
 
@@ -449,7 +450,7 @@ def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
             continue
         why = [f"{count} {words}" for words, count in sorted(use.unused.items(), key=lambda each: -each[1])]
         cure = (
-            "; either other cameras do not see these people, or it does not fit: look with check-calibration"
+            "; either other cameras do not see these people, or this camera does not fit: run check-calibration"
             if use.unused.get(NOBODY, 0) > use.offered / 2
             else ""
         )
@@ -491,12 +492,12 @@ def unseen(
     by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
     if by_two - here < max(_LOST, _LOST_SHARE * by_two):
         return []
-    why = "the others too little, or not as one"
+    why = "the others are seen too little, or the cameras do not agree on them"
     if lasts_s is not None and lasts_s < _SHORT_S:
-        why = f"{lasts_s:.2g} s are too little to be sure of everybody; give more frames, or --no-temporal"
+        why = f"{lasts_s:.2g} s are too short to confirm all people; give more frames, or --no-temporal"
     two: list[int] = sorted(np.argsort(-np.asarray(seen.mean(axis=0)), kind="stable")[:2].tolist())
     most = " and ".join(names[view] for view in two)
-    return [f"two cameras see {by_two:.1f} people a frame, and {here:.1f} are found: {why} ({most} see most)"]
+    return [f"two cameras see {by_two:.1f} people per frame, but {here:.1f} are found: {why} ({most} see most)"]
 
 
 def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
@@ -508,6 +509,6 @@ def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
     usual = float(np.nanmedian(np.delete(lengths, worst)))
     if lengths[worst] >= max(_WORST * usual, _FAR_MM):
         yield (
-            f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras put its joints"
-            f" (median), they are {usual:.0f} mm from each other; look at its calibration and its pictures"
+            f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras place its joints"
+            f" (median), and they are {usual:.0f} mm from each other; check its calibration and its pictures"
         )

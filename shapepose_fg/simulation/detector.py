@@ -160,7 +160,9 @@ class Detector:
     def skip_to(self, frame: int) -> None:
         """Advance the errors until `frame` is next; raises ValueError if it has passed."""
         if frame < self._frame:
-            raise ValueError(f"frames must come in order: frame {frame} asked for, {self._frame} is next")
+            raise ValueError(
+                f"frames must be requested in order: frame {frame} was requested, but {self._frame} is next"
+            )
         while self._frame < frame:
             self._noise.next(self._frame)
             self._false.next(self._frame)

@@ -74,7 +74,7 @@ class DetectorStatistics:
     swap: float
     """Share of joints, distant from their mirrored joint, that are reported as the mirrored one."""
     double: float
-    """Share of these joints that are reported under both names."""
+    """Share of the swapped joints that are reported under both names."""
     double_m: float
     """Standard deviation of each coordinate of the distance between the two, m."""
     double_confidence: Array
@@ -115,11 +115,11 @@ class DetectorStatistics:
     affinity_wrong_share: Array
     """(B,) share of the pairs of two people that get an affinity."""
     affinity_wrong: Array
-    """(B, K) quantiles of the affinity of those pairs."""
+    """(B, K) quantiles of the affinity of pairs of two people."""
     affinity_nobody_share: Array
     """(B,) share of the pairs of a person and a false candidate that get an affinity."""
     affinity_nobody: Array
-    """(B, K) quantiles of the affinity of those pairs."""
+    """(B, K) quantiles of the affinity of pairs of a person and a false candidate."""
     provenance: str = "not known"
     """Origin of the tables."""
 

@@ -51,7 +51,7 @@ def named_scene(
     built-in scene and 30 Hz for a sequence.
     """
     if name not in NAMES:
-        raise InputError(f"{name}: there is no such scene; give one of {' '.join(NAMES)}")
+        raise InputError(f"{name}: must be one of {' '.join(NAMES)}")
     if not 2 <= cameras <= 12:
         raise InputError(f"--cameras {cameras}: must be 2 to 12")
     rate: dict[str, Any] = {} if fps is None else {"fps": fps}
@@ -64,7 +64,7 @@ def named_scene(
         raise InputError(f"--split {split}: must be {' or '.join(get_args(Split))}")
     if people is not None:
         raise InputError(
-            f"--people {people}: {name} has {SEQUENCES[name].people} people; leave it out, or take demo"
+            f"--people {people}: {name} has {SEQUENCES[name].people} people; leave it out, or use demo"
         )
     until = frames if frames > 0 else None
     motions = Mocap.load(_motions(mocap))
@@ -133,7 +133,7 @@ def _motions(path: Path | None) -> Path:
     path = Path(os.environ.get("SHAPEPOSE_DATA", Path("..") / "shared")) / _MOCAP
     if not path.is_file():
         raise InputError(
-            f"{path}: the recorded motions are not here; give their file with --mocap, set SHAPEPOSE_DATA to the"
+            f"{path}: the recorded motions are missing; give their file with --mocap, set SHAPEPOSE_DATA to the"
             " folder that holds data/cmu_mocap, or simulate demo, which needs none"
         )
     return path

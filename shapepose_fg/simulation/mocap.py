@@ -185,7 +185,7 @@ def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
         yield "fps and leg_m must be positive; write the file again"
     start, length = arrays["seq_start"].astype(np.int64), arrays["seq_len"].astype(np.int64)
     if not ((start >= 0) & (length > 0) & (start + length <= sizes["N"])).all():
-        yield "seq_start and seq_len reach beyond the last frame; write the file again"
+        yield "seq_start and seq_len go beyond the last frame; write the file again"
     pairs = arrays["pairs"].astype(np.int64)
     if not ((pairs >= 0) & (pairs < sizes["S"])).all() or (length[pairs[:, 0]] != length[pairs[:, 1]]).any():
         yield "pairs must name two clips of one length each; write the file again"

@@ -29,7 +29,7 @@ _HALF_ROOM_M = 1.75
 _LIMBS_M = 0.12
 """Minimum distance of a standing person's joints from those of others, if space permits, m."""
 _TORSO_M = 0.2
-"""Minimum distance of another person's joints from these, m."""
+"""Minimum distance of another person's joints from pelvis, spine and neck, m."""
 _MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
 """Pelvis and chest; elbows, wrists, hands, knees."""
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
@@ -88,7 +88,7 @@ class Room:
         self.performed: list[Performance] = []
         """Motions of the people, in order of arrival."""
         self.names: list[str] = []
-        """Names of their recordings."""
+        """Names of the recordings of these motions."""
 
     def add_pair(self, betas: Array, pair: tuple[Clip, Clip]) -> None:
         """Add two people who dance together, with a common scale, so that held hands
@@ -339,7 +339,7 @@ def _dances(
         drawn = [takes[index] for index in rng.permutation(len(takes))]
         segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]
         if len(segments) == 0:
-            raise ValueError("in none of these salsa takes the two dance together: give the whole file")
+            raise ValueError("there is no salsa take in which the two dance together: give the whole file")
         yield from segments
 
 
@@ -369,7 +369,7 @@ def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
 def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
     """Draw `count` clips; none is repeated before all are drawn once."""
     if count > 0 and len(clips) == 0:
-        raise ValueError("no one but the dancers stands or walks in these recordings: give the whole file")
+        raise ValueError("there are no standing or walking people in these recordings: give the whole file")
     rounds = -(-count // max(len(clips), 1))
     return [clips[index] for _ in range(rounds) for index in rng.permutation(len(clips))][:count]
 

@@ -136,11 +136,11 @@ def solve_anew(edited: Edited, solve: Solve) -> Reconstruction:
     if len(changed) == 0:
         return people
     if people.observations is None:
-        raise ValueError("people without observations cannot be solved anew; reconstruct them again")
+        raise ValueError("people without observations cannot be solved again; reconstruct them again")
     touched = np.isin(people.person, changed)
     solved = solve(people.rows(touched))
     if not np.isin(solved.person, changed).all() or solved.observations is None:
-        raise ValueError("solve must return rows, with their observations, of the people that it was given")
+        raise ValueError("solve must return rows of the given people, with their observations")
     return in_order(Reconstruction.concatenate([people.rows(~touched), replace(solved, run=people.run)]))
 
 
@@ -153,7 +153,7 @@ def _merge(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edit
     both = np.intersect1d(people.frame[rows], people.frame[others])
     if len(both) > 0:
         raise ValueError(
-            f"{edit.person} and {edit.other} are both there in {len(both)} frames, the first is {both[0]}:"
+            f"{edit.person} and {edit.other} are both present in {len(both)} frames, first in {both[0]}, so"
             " they are two people; split one of them there, or drop one"
         )
     return _relabelled(people, {_other(edit): edit.person}, others, changed={edit.person})
@@ -165,7 +165,7 @@ def _split(people: Reconstruction, edit: Edit, rows: Mask) -> Edited:
     if not later.any() or (later == rows).all():
         frames = people.frame[rows]
         raise ValueError(
-            f"{edit.person} is there in frames {frames.min()} to {frames.max()}, and cannot be split at"
+            f"{edit.person} is present in frames {frames.min()} to {frames.max()} and cannot be split at"
             f" {edit.frame}; give a frame from {frames.min() + 1} to {frames.max()}"
         )
     return _relabelled(people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)})
@@ -177,7 +177,8 @@ def _swap(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edite
     if not later.any():
         last = people.frame[rows | others].max()
         raise ValueError(
-            f"neither {edit.person} nor {edit.other} is there from frame {edit.frame} on; give one up to {last}"
+            f"neither {edit.person} nor {edit.other} is present from frame {edit.frame} on; give a frame up to"
+            f" {last}"
         )
     names = {edit.person: _other(edit), _other(edit): edit.person}
     only_names = later.sum() == (rows | others).sum()  # both begin at or after `frame`
@@ -207,10 +208,11 @@ def _rows_of(people: Reconstruction, person: int) -> Mask:
 def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
     """Raise ValueError if the new number is in use or out of range."""
     if not 0 <= _other(edit) <= MOST_NUMBER:
-        raise ValueError(f"{edit.other} cannot be a person's number; give one from 0 to {MOST_NUMBER}")
+        raise ValueError(f"{edit.other} is not a valid number of a person; give one from 0 to {MOST_NUMBER}")
     if (people.person == edit.other).any():
         raise ValueError(
-            f"{edit.other} is somebody already; give another number such as {free_number(people.person)}, or merge"
+            f"{edit.other} is the number of another person; give a free one such as"
+            f" {free_number(people.person)}, or merge"
             f" {edit.person} and {edit.other}"
         )
 

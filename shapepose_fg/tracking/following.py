@@ -46,7 +46,7 @@ class FollowingConfig(Settings):
     new person may turn out to have been present earlier."""
 
 
-_UNLIKELY = "too little that nobody else explains, or there too briefly"
+_UNLIKELY = "too few detections of their own, or present for too short a time"
 """Reason for dropping a person over time."""
 
 Decided = tuple[Input, Observations]

@@ -33,7 +33,7 @@ _TWINS_S = 0.1
 _RESTART_S = 1.3
 """Interval between the frames from which the selected people are tracked again, s."""
 _ROUNDS = 2
-"""Maximum number of these rounds."""
+"""Maximum number of rounds of tracking again."""
 _ALIKE = 0.95
 """Agreement of detections above which two selections count as one. The best selection is tracked
 again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is

@@ -256,7 +256,7 @@ def test_misuse_is_told(fitter, targets):
         fitter.fit_sequence(targets, GROUP[:5], TIME_S)
     with pytest.raises(ValueError, match="has two rows at"):
         fitter.fit_sequence(targets, GROUP, np.round(TIME_S, 1))
-    with pytest.raises(ValueError, match="fixed_shapes needs the shapes"):
+    with pytest.raises(ValueError, match="fixed_shapes needs shapes"):
         fitter.fit_sequence(targets, GROUP, TIME_S, fixed_shapes=True)
     shapes = Shapes(np.zeros((2, 10)), np.tile(np.eye(10), (2, 1, 1)))
     with pytest.raises(ValueError, match="one row for each of the 3 groups, got 2"):

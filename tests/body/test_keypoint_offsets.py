@@ -92,7 +92,7 @@ def test_symmetric_offsets_are_mirrored():
     assert xyz["LKnee"] == [0.0, 0.0, 0.0]
     with pytest.raises(ValueError, match="give LHip or RHip, not both"):
         KeypointOffsets.symmetric({"LHip": (0.0, 0.0, 0.0), "RHip": (0.0, 0.0, 0.0)})
-    with pytest.raises(ValueError, match="Neck is in the middle"):
+    with pytest.raises(ValueError, match="Neck is on the plane of symmetry"):
         KeypointOffsets.symmetric({"Neck": (0.01, 0.0, 0.0)})
     with pytest.raises(ValueError, match="no joint 'Hip'"):
         KeypointOffsets.symmetric({"Hip": (0.0, 0.0, 0.0)})

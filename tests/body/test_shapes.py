@@ -31,7 +31,7 @@ def test_saved_and_loaded_is_the_same(tmp_path):
 
 def test_shapes_of_another_body_are_refused(tmp_path):
     two_shapes("their body").save(tmp_path / "subjects.npz")
-    with pytest.raises(InputError, match=r"subjects.npz: these are shapes of another body model, .* give --body"):
+    with pytest.raises(InputError, match=r"subjects.npz: these are shapes of another body model, .* with --body"):
         SubjectShapes.load(tmp_path / "subjects.npz", fingerprint(BodyModel.default()))
     with pytest.raises(ValueError, match="same body model"):
         two_shapes().updated(two_shapes("their body"))
@@ -49,8 +49,8 @@ def test_a_newer_shape_takes_the_place_of_the_older():
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        ({"names": np.array(["Ann", "Ann"])}, "names must differ, 'Ann' occurs twice"),
-        ({"betas": np.full((2, 10), np.nan)}, "betas and information must be finite, those of 'Ann' are not"),
+        ({"names": np.array(["Ann", "Ann"])}, "names must differ, but 'Ann' occurs twice"),
+        ({"betas": np.full((2, 10), np.nan)}, "betas and information must be finite, but those of 'Ann' are not"),
         ({"betas": np.zeros((2, 11))}, "betas must be (2, 10), got (2, 11)"),
         ({"information": np.tile(-np.eye(10), (2, 1, 1))}, "information must be symmetric and positive definite"),
         ({"information": np.tile(1e-9 * np.eye(10), (2, 1, 1))}, "information must be symmetric and positive"),

@@ -29,7 +29,7 @@ def test_missing_key(name, save, make_smpl_arrays):
 def test_nan(name, save, make_smpl_arrays):
     arrays = make_smpl_arrays()
     arrays[name].flat[3] = np.nan
-    with pytest.raises(InputError, match=rf"body\.npz: {name} holds NaN"):
+    with pytest.raises(InputError, match=rf"body\.npz: {name} has values that are not finite"):
         BodyModel.load(save(arrays))
 
 
@@ -77,7 +77,7 @@ def test_not_a_body_file(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         BodyModel.load(tmp_path / "none.npz")
     (tmp_path / "body.obj").write_text("v 0 0 0")
-    with pytest.raises(InputError, match=r"read from \.npz or \.pkl"):
+    with pytest.raises(InputError, match=r"must be \.npz or \.pkl"):
         BodyModel.load(tmp_path / "body.obj")
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 torn")
     with pytest.raises(InputError, match=r"torn\.npz: cannot be read"):

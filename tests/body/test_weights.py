@@ -77,7 +77,7 @@ def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
         b"\xff" * 64,
     ):
         (tmp_path / "damaged.safetensors").write_bytes(damage)
-        assert_refused(tmp_path / "damaged.safetensors", "not readable as safetensors")
+        assert_refused(tmp_path / "damaged.safetensors", "cannot be read as safetensors")
     with pytest.raises(InputError, match="this is a folder"):
         FitterWeights.load(tmp_path)
 
@@ -86,7 +86,7 @@ def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
 def test_other_safetensors_files_are_refused(file, metadata):
     tensors, _ = contents(file)
     save_file(tensors, file, metadata=metadata)
-    assert_refused(file, r"not weights of the learned fitter; make some with shapepose-fg train-fitter")
+    assert_refused(file, r"not weights of the learned fitter; train some with shapepose-fg train-fitter")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -95,7 +95,7 @@ def test_numbers_that_are_not_finite_are_refused(file, name, value):
     tensors, about = contents(file)
     tensors[name].reshape(-1)[3] = value
     save_file(tensors, file, metadata=about)
-    assert_refused(file, "hold NaN or infinity")
+    assert_refused(file, "have values that are not finite")
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_weights_of_another_version_are_refused(file, damage):
 
 
 def test_weights_belong_to_one_body(weights, tiny_body, file):
-    with pytest.raises(InputError, match=r"trained on another body model: train some on yours .* --body"):
+    with pytest.raises(InputError, match=r"trained on another body model: train weights for yours .* --body"):
         SmplFitter(tiny_body, weights=weights)
     with pytest.raises(InputError, match="another body model"):
         make_fitter(BodyConfig(method="learned", weights=str(file)), tiny_body)

@@ -85,7 +85,7 @@ def test_people_who_stand_tell_nothing(rig, two_people):
 
 def test_a_camera_that_sees_nobody_is_named(rig, recording):
     blind = Recording(recording.skeleton, [each.only(each.view != 2) for each in recording.frames])
-    with pytest.raises(InputError, match="camera cam2: hardly anybody is seen"):
+    with pytest.raises(InputError, match="camera cam2: too few people are seen"):
         synchronise(blind, rig, FPS, range(100), 1.0)
 
 

@@ -167,7 +167,7 @@ def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monk
     assert "body.pkl: there is no such file" in said(own + 'body = "body.pkl"')
     assert "fps 0: must be 0.01 to 100000 Hz" in said(own + "fps = 0")
     (tmp_path / "out" / "a" / "people.npz").mkdir(parents=True)
-    assert "people.npz: this is a folder, and a file is to be written here" in said(own)
+    assert "people.npz: this is a folder, but a file must be written here" in said(own)
     (tmp_path / "out" / "a" / "people.npz").rmdir()
     (tmp_path / "out" / "a" / "parts").mkdir()
     assert "there is an interrupted run; continue with --resume" in said(own)
@@ -192,7 +192,7 @@ def test_another_program_on_a_worker_is_noticed(monkeypatch):
         ({**own, "numpy": "1.0"}, r"its process tcp://b:2 has another version of numpy \(1\.0 there, .* here\)"),
         (
             {**own, "shapepose-fg itself": "x"},
-            "has another version of shapepose-fg itself; install the same there",
+            "has another version of shapepose-fg itself; install the same version there",
         ),
         (ModuleNotFoundError("No module named 'shapepose_fg'"), r"cannot run this program \(No module named"),
     ):

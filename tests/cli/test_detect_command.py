@@ -81,7 +81,7 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
     said = capsys.readouterr()
     told = " ".join(said.err.split())
     assert told.count("of the same shape: taken as resized") == 3
-    assert f"camera {a}: frames that another camera has no picture for were left out, 4 at the start" in told
+    assert f"camera {a}: frames without a picture of every camera are left out, 4 at the start" in told
     (command,) = re.findall("next: (.*)", said.out)
     assert command == (
         f"shapepose-fg reconstruct --calibration {kitchen}/calibration.json --detections {kitchen}/out"
@@ -126,7 +126,7 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     Path(f"shots/{rig.names[1]}/img_102.png").unlink()
     assert run(*COMMON, "--images", "shots") == 0
     said = capsys.readouterr()
-    assert "1 of 4 pictures are missing" in said.err and "sees no people there" in said.err
+    assert "1 of 4 pictures are missing" in said.err and "they are read as frames without people" in said.err
     assert "--timestamps" not in said.out and not Path("out/times.csv").exists()
     table = read_detections("out", rig)
     assert [frame.view.tolist() for frame in table] == [[0, 1, 2], [0, 1, 2], [0, 2], [0, 1, 2]]
@@ -174,7 +174,7 @@ def test_one_camera_is_enough_to_detect(kitchen):
     (["--videos", "shots", "--start", "{a}=2"], "--start 2: must be seconds, such as 0.2s, or frames"),
     (["--videos", "shots", "--start", "{a}=2s"], "the frame rate is unknown; give --fps"),
     (["--videos", "shots", "--start", "{a}=2f", "--start", "{a}=3f"], "is given twice"),
-    (["--videos", "shots", "--start", "{a}=50f"], "have no moment in common; check --start"),
+    (["--videos", "shots", "--start", "{a}=50f"], "have no time in common; check --start"),
     (["--videos", "shots", "--image-placement", "bent"], "must be one of same crop crop-centre scale letterbox"),
     (["--videos", "shots", "--image-placement", "same"], "1280 x 720; give another --image-placement"),
     (["--videos", "shots"], "give --image-placement: letterbox"),

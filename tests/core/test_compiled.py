@@ -198,7 +198,9 @@ def test_compiling_is_done_side_by_side_and_said_once_before_it_ends(program):
     program.program = SLOW + PROGRAM
     result, hits, complaints = program()
     assert (result, hits) == (21.0, [1, 1])  # neither was compiled there
-    assert complaints.count("\n") == 1 and "compiling 2 functions for this machine, about" in complaints
+    assert (
+        complaints.count("\n") == 1 and "compiling 2 functions for this machine, which takes about" in complaints
+    )
     assert program()[2] == ""
 
 

@@ -47,10 +47,10 @@ def test_a_rate_of_no_camera_stays_what_it_is_and_29_97_is_30000_by_1001():
 @pytest.mark.parametrize(
     ("time_s", "message"),
     [
-        ([0.0, 0.1, 0.1], "time_s must rise from frame to frame, at frame 2 it does not"),
-        ([[0.0, 0.0], [0.1, -0.1]], "at frame 1 it does not"),
-        ([0.0, 1e-300, 0.1], "at frame 1 it does not"),
-        ([0.0, np.nan], "time_s must be finite, at frame 1 it is not"),
+        ([0.0, 0.1, 0.1], "time_s must increase by more than .* but does not at frame 2"),
+        ([[0.0, 0.0], [0.1, -0.1]], "but does not at frame 1"),
+        ([0.0, 1e-300, 0.1], "but does not at frame 1"),
+        ([0.0, np.nan], "time_s must be finite, but is not at frame 1"),
         (np.zeros((2, 2, 2)), r"time_s must be \(T,\) or \(T, V\), got \(2, 2, 2\)"),
     ],
 )
@@ -65,7 +65,7 @@ def test_times_of_another_recording():
     with pytest.raises(ValueError, match="each of the 3 cameras, got 2"):
         FrameTimes(np.array([[0.0, 0.0]])).check(1, 3)
     for fps in (0, -1, np.nan, np.inf):
-        with pytest.raises(ValueError, match="fps must be a positive number"):
+        with pytest.raises(ValueError, match="fps must be"):
             FrameTimes.from_fps(fps, 4)
 
 
@@ -77,5 +77,5 @@ def test_a_recording_from_cut_to_cut():
     assert segments(range(4, 4), cuts) == []
     assert check_cuts((), 0) == ()
     for wrong in ([0], [20], [3, 3], [5, 2], [1.5], [[1]]):
-        with pytest.raises(ValueError, match="cuts must be rising frame numbers between 1 and 19"):
+        with pytest.raises(ValueError, match="cuts must be increasing frame numbers between 1 and 19"):
             check_cuts(wrong, 20)

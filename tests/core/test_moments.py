@@ -19,7 +19,7 @@ def test_a_camera_that_starts_later_and_ends_earlier_cuts_the_others():
     moments = align([clock("a", 30, 100), clock("b", 30, 50, start_s=0.5)], True)
     assert moments.picture[0].tolist() == [15, 0] and moments.picture[-1].tolist() == [64, 49]
     assert moments.notes == (
-        "camera a: frames that another camera has no picture for were left out, 15 at the start and 35 at the end",
+        "camera a: frames without a picture of every camera are left out, 15 at the start and 35 at the end",
     )
 
 
@@ -32,7 +32,7 @@ def test_of_a_faster_camera_the_nearest_frames_are_taken():
     assert off.max() == pytest.approx(1 / 300, abs=1e-9)
     np.testing.assert_array_equal(moments.picture[:, 1], np.round(np.arange(30) * 100 / 30))
     assert moments.notes == (
-        "camera fast: pictures are up to 3.3 ms from the moment they stand for (2.2 ms in the mean)",
+        "camera fast: pictures are up to 3.3 ms from the time of their synchronised frame (2.2 ms on average)",
     )
     assert not moments.synchronised
 
@@ -43,7 +43,10 @@ def test_half_a_frame_is_the_most():
     late = CameraClock("b", np.delete(late.time, [4, 5, 6]), late.period)
     moments = align([clock("a", 10, 12), late], True)
     assert moments.picture[:, 1].tolist() == [0, 1, 2, 3, -1, -1, -1, 4, 5, 6, 7, 8]
-    assert "no picture within half a frame of 3 of 12 moments (the first is frame 4)" in moments.notes[0]
+    assert (
+        "3 of 12 synchronised frames have no picture within half a frame (the first is frame 4)"
+        in moments.notes[0]
+    )
     assert moments.time_s is not None and np.isfinite(moments.time_s).all()
     assert moments.time_s[4, 1] == moments.time_s[4, 0]
 

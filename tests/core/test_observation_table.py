@@ -62,10 +62,14 @@ def test_rows_and_back_together():
         (
             "gate",
             np.ones((2, 2, 2), int),
-            "xy and gate must agree on what was seen, at row 1, wrist, view B",
+            "xy and gate must agree on what was seen, but do not at row 1, wrist, view B",
         ),
         ("candidate", np.full((2, 2, 2), 3), "candidate and gate must agree .* row 1, wrist, view B"),
-        ("xy", np.zeros((2, 2, 2, 2)), "xy and gate must agree on what was seen, at row 1, wrist, view B"),
+        (
+            "xy",
+            np.zeros((2, 2, 2, 2)),
+            "xy and gate must agree on what was seen, but do not at row 1, wrist, view B",
+        ),
         ("confidence", np.ones((2, 2, 2)), "confidence and gate must agree"),
         ("candidate", np.zeros((2, 2, 2)), "candidate must hold int32 values, got float64"),
         ("candidate", np.full((2, 2, 2), 2**40), "candidate must hold -2147483648 to 2147483647"),

@@ -55,7 +55,7 @@ def test_what_changes_while_it_is_read_is_refused_and_afterwards_is_not_looked_a
     found = reading.checksums([camera, None, folder])
     assert list(found) == [str(camera), str(folder)] and found == checksums([camera, folder])
     (folder / "000.json").write_text("12")
-    with pytest.raises(InputError, match=r"000\.json: this changed while it was read"):
+    with pytest.raises(InputError, match=r"000\.json: this file changed while it was read"):
         reading.checksums([folder])
     camera.unlink()
     with pytest.raises(InputError, match=r"a\.json: there is no such file"):

@@ -336,9 +336,9 @@ def test_the_run_of_parts_put_together():
         (
             {"configuration": {"refine": {"settled_m": 0.1}}},
             {"configuration": {"refine": {"settled_m": 0.2}}},
-            "same configuration, refine.settled_m differs",
+            "same configuration, but refine.settled_m differs",
         ),
-        ({"frames": [0, 10]}, {"frames": [9, 12]}, "must not cover the same frame, two of them cover frame 9"),
+        ({"frames": [0, 10]}, {"frames": [9, 12]}, "must not overlap, but two of them cover frame 9"),
         ({"frames": [0, 10]}, {"frames": 9}, r'"frames" must be \[start, stop\] or a list of those, got 9'),
         ({"inputs": {"a": "x"}}, {"inputs": {"a": "y"}}, "a changed between two of them"),
     ],

@@ -70,7 +70,11 @@ def two_results(tmp_path):
 def test_files_of_two_results_are_not_taken_together(two_results):
     a, b = two_results / "a", two_results / "b"
     shutil.copy(a / "run.json", b / "run.json")
-    with pytest.raises(InputError, match=r"b/run\.json: this is of another run than the people\.npz beside it"):
+    with pytest.raises(
+        InputError,
+        match=r"b/run\.json: this file is of another run than the people\.npz beside"
+        r" it",
+    ):
         Reconstruction.load(b)
     # Files of earlier versions have no id.
     run = json.loads((b / "run.json").read_text())

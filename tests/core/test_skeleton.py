@@ -77,5 +77,5 @@ def test_target_skeletons_have_the_detectors_order():
 def test_an_anchor_needs_two_joints_that_mirror_each_other_beside_it():
     parts = {"limbs": [("A", "B"), ("B", "LC"), ("B", "RC")], "mirror": [("RC", "LC")], "core": ["A", "B"]}
     assert Skeleton.of("four", ["A", "B", "LC", "RC"], anchor="B", **parts).parents == (1, -1, 1, 1)
-    with pytest.raises(ValueError, match="two joints beside the anchor A must mirror each other"):
+    with pytest.raises(ValueError, match="two joints next to the anchor A must be left and right"):
         Skeleton.of("four", ["A", "B", "LC", "RC"], anchor="A", **parts)

@@ -156,5 +156,5 @@ def test_where_a_picture_cannot_be_read_nobody_is_seen(rolled_rig, pictures, tmp
 
 def test_no_camera_s_name_leads_out_of_the_folder(rolled_rig):
     """Its detections are a file called so: the camera itself is refused."""
-    with pytest.raises(ValueError, match="must not lead out of a folder"):
+    with pytest.raises(ValueError, match="must not contain a path"):
         replace(rolled_rig.cameras[0], name="../a")

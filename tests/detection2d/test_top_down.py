@@ -145,12 +145,13 @@ def test_a_network_of_whole_pictures_may_find_several_people(tmp_path):
 
 @pytest.mark.parametrize("lines, problem", [
     (['decoding = "guess"'], "decoding must be 'simcc', 'heat map' or 'coordinates', got text 'guess'; docs/det"),
-    (["outputs = ['a', 'b']"], "the network has no 'a', but simcc_x simcc_y; name that instead"),
-    (["input = 'picture'"], "the network has no 'picture', but x; name that instead"),
-    (['decoding = "heat map"'], "gives 1 x 26 x 192 and 1 x 26 x 384, which is no heat map"),
-    (['skeleton = "COCO_17"'], "the network finds 26 joints, 17 are named (COCO_17)"),
-    (['joints = ["Nose", "Nose"]'], "joints has 'Nose', which must be a keypoint of HALPE_26, once (Nose LEye"),
-    (['joints = ["Tail"]'], "joints has 'Tail', which must be a keypoint of HALPE_26, once"),
+    (["outputs = ['a', 'b']"], "the network has no 'a', but simcc_x simcc_y; name one of these"),
+    (["input = 'picture'"], "the network has no 'picture', but x; name one of these"),
+    (['decoding = "heat map"'], "is 1 x 26 x 192 and 1 x 26 x 384, which is not a heat map"),
+    (['skeleton = "COCO_17"'], "the network has 26 joints, but 17 are named (COCO_17)"),
+    (['joints = ["Nose", "Nose"]'], "joints has 'Nose', which must be a keypoint of HALPE_26 without repetition"
+        " (Nose LEye"),
+    (['joints = ["Tail"]'], "joints has 'Tail', which must be a keypoint of HALPE_26 without repetition"),
     (["padding = 0.5"], "padding is not valid"),
     (["colour = 'rgb'"], "colour is not a known key"),
     (["skeleton = '../mine.toml'"], "skeleton '../mine.toml' must be a file in the same folder"),
@@ -175,18 +176,21 @@ def test_networks_in_each_other_s_place_are_refused(tmp_path):
     yolox = str(yolox_file(tmp_path / "yolox.onnx", (416, 416), 0))
     with pytest.raises(InputError, match=r"--boxes"):
         open_network(pose, None, Path)
-    with pytest.raises(InputError, match=r"pose.onnx: .* YOLOX gives 1 x 1008 x 6 numbers or more.*--boxes"):
+    with pytest.raises(InputError, match=r"pose.onnx: .* YOLOX has an output of 1 x 1008 x 6 or more.*--boxes"):
         open_network(pose, pose, Path)
     with pytest.raises(
-        InputError, match="the network gives 1 x 3549 x 6, which is no simcc; describe it in a TOML"
+        InputError,
+        match="the output of the network is 1 x 3549 x 6, which is not a simcc; describe the network in a TOML",
     ):
         open_network(yolox, yolox, Path)
-    with pytest.raises(InputError, match="--long-side is for networks of OpenPose's kind; leave it out"):
+    with pytest.raises(InputError, match="--long-side is for networks such as OpenPose; leave it out"):
         open_network(pose, yolox, Path, long_side=656)
-    with pytest.raises(InputError, match="--device cuda: the onnxruntime that is installed has cpu"):
+    with pytest.raises(InputError, match="--device cuda: the installed onnxruntime supports cpu"):
         open_network(pose, yolox, Path, "cuda")
     five = str(rtmpose_file(tmp_path / "five.onnx", 5, (192, 256), 0))
-    with pytest.raises(InputError, match="no skeleton known here has 5 joints; name one in a network's TOML file"):
+    with pytest.raises(
+        InputError, match="no known skeleton has 5 joints; describe it in a TOML file of the network"
+    ):
         open_network(five, yolox, Path)
 
 

@@ -41,7 +41,7 @@ def test_it_may_lean_and_up_may_be_any_axis():
     points = points @ np.array([[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]])
     floor = find_floor(points[:, [1, 2, 0]], look, np.array([0.0, 1.0, 0.0]))
     assert isinstance(floor, Floor)
-    # 60 looks outweigh a prior of half a degree.
+    # 60 measurements outweigh a prior of half a degree.
     assert np.rad2deg(np.arccos(floor.normal[1])) == pytest.approx(0.8, abs=0.1)
     assert np.abs(floor.above(points[:, [1, 2, 0]])).max() < 0.04
 
@@ -49,11 +49,11 @@ def test_it_may_lean_and_up_may_be_any_axis():
 @pytest.mark.parametrize(
     ("heights", "why"),
     [
-        ([0.0] * 5, "5 looks"),
+        ([0.0] * 5, "5 measurements"),
         (np.linspace(0, 1, 40), "agree"),  # stairs
         ([0.0] * 20 + [0.4] * 20, "agree"),  # a stage
         ([0.4] * 30 + [0.0] * 2, "below"),  # a stage that somebody stepped down from
-        ([], "0 looks"),
+        ([], "0 measurements"),
     ],
 )
 def test_there_may_be_none(heights, why):

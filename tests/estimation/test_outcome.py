@@ -125,21 +125,21 @@ def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
     assert set(reasons(solved([0.9, 0.0], sigma_m=0.04), here)) == {0}
     # With the body beside the views 4 cm is 2.8 cm: 0.6 m are 21 of them.
     both = reasons(solved([0.6, 0.0], sigma_m=0.04, body_sigma_m=0.04), here)
-    assert both == {0: "ran away from what views and body say of it"}
+    assert both == {0: "diverged from its views and the body"}
 
 
 def test_a_joint_with_a_factor_of_one_s_own_ran_away_after_a_metre():
     here = window([0.0], [False, False, False])
     here.touched = np.array([True, True, False])
     first = np.array([[[1.01, 0, 0], [0.99, 0, 0], [5.0, 0, 0]]])
-    assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "ran away from its views"}
+    assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "diverged from its views"}
 
 
 def test_what_nothing_determines_and_what_the_solver_says():
     here = window([0.0], [False, False])
     covariance = np.full((1, 2, 3, 3), np.nan)
     covariance[0, 1] = I3
-    assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "nothing determines it: its system is singular"}
+    assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "undetermined: its system is singular"}
     here.failure = "the solver left the finite numbers"
     solution = solved([0.0, np.nan])
     assert reasons(solution, here, covariance) == {0: here.failure}, "who is not placed has no problem"

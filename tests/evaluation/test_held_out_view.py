@@ -99,5 +99,5 @@ def test_what_a_camera_saw_lies_where_the_others_say(scene, recording, people):
     found = held_out(recording, scene.rig, 1, people, reconstruct, CONFIG)
     assert len(found.squared) > 10
     assert 0.7 < found.inside <= 1.0
-    with pytest.raises(ValueError, match="without observations"):
+    with pytest.raises(ValueError, match="no observations"):
         held_out(recording, scene.rig, 1, replace(people, observations=None), reconstruct, CONFIG)

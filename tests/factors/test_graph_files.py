@@ -108,7 +108,7 @@ def test_what_would_not_come_back_is_refused_by_name(tmp_path):
         save_graph(tmp_path / "graph.json", graph, values)
 
     custom = gtsam.CustomFactor(isotropic(3, 1.0), [one], lambda this, at, H: np.zeros(3))
-    with pytest.raises(ValueError, match="factor 0, CustomFactor: is of a class that has no record"):
+    with pytest.raises(ValueError, match="factor 0, CustomFactor: is of a class that cannot be saved"):
         saved(custom)
     held = gtsam.PriorFactorPoint3(one, np.zeros(3), noiseModel.Constrained.All(3))
     with pytest.raises(ValueError, match="a constraint has no noise"):

@@ -224,7 +224,7 @@ def test_a_reported_joint_goes_with_a_pose_and_tells_nothing_of_it():
     assert SPACE.format(key) == "reported position(person 7, joint 3, frame 5)"
     still = reported_factor(key, joint, own)
     assert isinstance(still, gtsam.PriorFactorPoint3) and still.error(values) == 0
-    with pytest.raises(ValueError, match="two poses at the most"):
+    with pytest.raises(ValueError, match="at most two poses"):
         reported_factor(key, joint, own, [(X(n), pose, goes) for n in range(3)])
 
 
@@ -232,7 +232,7 @@ def test_what_is_given_wrongly_is_refused():
     joined, made = PeopleInGraph(SPACE), world(6880)
     robot = PosedCamera(LENS, X(0), SENSOR)
     joined.add(sightings(made, 1, robot))
-    with pytest.raises(ValueError, match=r"person 0: frames must rise in time, 0.0 s comes too late"):
+    with pytest.raises(ValueError, match=r"person 0: frames must be in order of time, but 0.0 s is not"):
         joined.add(sightings(made, 0, robot))
     with pytest.raises(ValueError, match=r"joints must be \(J, 3\)"):
         one = sightings(made, 2, robot)[0]

@@ -183,7 +183,7 @@ def test_some_of_the_cameras(rig_file):
     for call in (lambda: read_rig(file, cameras=["nobody"]), lambda: rig.without(["nobody"])):
         with pytest.raises(ValueError, match=rf"there is no camera 'nobody'; there are {first} {second}"):
             call()
-    with pytest.raises(InputError, match="no camera is chosen"):
+    with pytest.raises(InputError, match="no camera is selected"):
         read_rig(file, without=rig.names)
 
 

@@ -337,7 +337,7 @@ def renamed(rig: Rig, names: tuple[str, ...]) -> Rig:
 MALFORMED = {
     "Caliscope": ("translation", "verschiebung", 'camera "0": translation is missing; calibrate the extrinsics'),
     "Pose2Sim": ("matrix = [[", "matrix = [[1.0, ", 'camera "cam_0": matrix must hold 9 numbers, got 10; write'),
-    "AniPose": ("rotation = [", "rotation = [[", "is not TOML"),
+    "AniPose": ("rotation = [", "rotation = [[", "cannot be read as TOML"),
     "FreeMoCap": ("distortions = [-0.2", "distortions = [nan", "distortions[0] must be a finite number, got NaN"),
     "Qualisys": ('x="', 'x="one', 'camera 0 "alpha": <transform>: x must be a number, got text'),
     "Vicon": ('POSITION="', 'POSITION="one ', 'camera 0 "alpha": POSITION must hold 3 numbers, got'),

@@ -58,7 +58,7 @@ def test_corrections_are_listed_and_taken_back_to_the_last_byte(folder):
 
 def test_a_correction_that_cannot_be_made_changes_nothing(folder):
     before = contents(folder)
-    with pytest.raises(InputError, match="results: 0 and 1 are both there in 10 frames"):
+    with pytest.raises(InputError, match="results: 0 and 1 are both present in 10 frames"):
         correct(folder, Edit(Action.MERGE, 0, 1))
     assert contents(folder) == before
 
@@ -190,7 +190,7 @@ def test_tracks_on_the_command_line(folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["merge", 0, 1], "0 and 1 are both there in 10 frames, the first is 0: they are two people"),
+        (["merge", 0, 1], "0 and 1 are both present in 10 frames, first in 0, so they are two people"),
         (["drop", 7], "there is no person 7; there are 0 1 2"),
         (["undo"], "there is no correction to undo"),
         (["split", 0, 0], "cannot be split at 0; give a frame from 1 to 9"),
@@ -213,7 +213,7 @@ def test_a_folder_without_a_result(tmp_path, capsys):
 
 def test_a_number_that_no_result_has(folder, capsys):
     assert run(folder, "rename", 0, 2**53) == 2
-    assert "9007199254740992 cannot be a person's number; give one from 0 to" in capsys.readouterr().err
+    assert "9007199254740992 is not a valid number of a person; give one from 0 to" in capsys.readouterr().err
     assert run(folder, "rename", 0, 2**53 - 1) == 0
     assert Reconstruction.load(folder).person.max() == 2**53 - 1
 

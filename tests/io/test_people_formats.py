@@ -393,24 +393,24 @@ BAD_SKELETONS = [
         "the body has no point 'Tail'; write under [body] which of its points head is",
     ),
     ('["head", "neck"]', '["head", "throat"]', "ours has no joint 'throat'; it has Nose"),
-    ('["r_sho", "r_wri"],', "", "no limbs lead from the anchor MidHip to RWrist; add limbs"),
+    ('["r_sho", "r_wri"],', "", "no limbs connect the anchor MidHip with RWrist; add limbs"),
     ('anchor = ["r_hip", "l_hip"]', 'anchor = "head"', "ours has no joint 'MidHip'; it has Nose"),
     ('anchor = ["r_hip", "l_hip"]', 'anchor = ["r_sho", "l_sho"]', "an anchor of two joints must be the hips"),
     ('name = "ours"', "", "name is missing; docs/conventions.md describes the file"),
     ('neck = "Neck"', 'nick = "Neck"', "body.nick is not a keypoint of ours; it has head"),
     ('r_wri = "RWrist"', 'r_wri = "LWrist"', "joint LWrist occurs twice"),
-    ("limbs = [", "limbs = ", "is not TOML"),
+    ("limbs = [", "limbs = ", "cannot be read as TOML"),
     (
         'neck = ["r_sho", "l_sho"]',
         'neck = ["neck", "l_sho"]',
-        "the middle Neck is made of Neck, which must be a key",
+        "the midpoint Neck uses Neck, which must be a key",
     ),
     (
         'neck = ["r_sho", "l_sho"]',
         'neck = ["MidHip", "l_sho"]',
-        "the middle Neck is made of MidHip, which must be",
+        "the midpoint Neck uses MidHip, which must be",
     ),
-    ("[middles]", "core = []\n[middles]", "core must have a joint at least, by which a person is recognised"),
+    ("[middles]", "core = []\n[middles]", "core must have at least one joint, by which a person is found"),
 ]
 
 

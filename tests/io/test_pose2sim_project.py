@@ -144,7 +144,7 @@ def test_what_is_missing_is_named_with_the_cure(project):
         ({"rate": "0.009"}, "frame_rate must be"),
         ({"frames": "[9, 3]"}, "frame_range must be 'auto', 'all', or two frame numbers"),
         ({"multi": "'yes'"}, "multi_person must be true or false"),
-        ({"multi": "="}, "this is not TOML"),
+        ({"multi": "="}, "cannot be read as TOML"),
     ],
 )
 def test_a_malformed_config_is_named(project, change, words):

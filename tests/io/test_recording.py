@@ -69,7 +69,7 @@ def test_frames_are_what_all_cameras_saw_at_one_time(scene, together, apart, tmp
     for frame in (0, 1, BLOCK_FRAMES - 1, BLOCK_FRAMES, len(recording) - 1):
         for found, expected in zip(sets(recording[frame]), sets(together[frame + LATE]), strict=True):
             np.testing.assert_allclose(found, expected, atol=1e-4)  # the digits that files have
-    assert any("frames that another camera has no picture for were left out" in note for note in recording.notes)
+    assert any("frames without a picture of every camera are left out" in note for note in recording.notes)
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ def test_cameras_that_began_apart_are_put_together_by_their_times(tmp_path, rig)
     assert moments is not None and moments.picture.tolist() == [[2, 0], [3, 1], [4, 2], [5, -1], [6, 4]]
     expected = [[0.08, 0.084], [0.12, 0.124], [0.16, 0.164], [0.2, 0.2], [0.24, 0.244]]
     np.testing.assert_allclose(times.time_s, expected)
-    assert "no picture within half a frame of 1 of 5 moments" in " ".join(moments.notes)
+    assert "1 of 5 synchronised frames have no picture within half a frame" in " ".join(moments.notes)
 
 
 def test_what_is_written_is_read(tmp_path, rig):
@@ -105,7 +105,7 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("0\n33\n67\n", "frames are 33.5 s apart; write seconds"),
         (
             "cam0 cam1\n0 1000\n1 1001\n2 1002\n",
-            "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no moment in common; give times",
+            "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no time in common; give times",
         ),
         ("cam0 cam1\n0 -\n1 -\n2 -\n", "camera cam1 has no times; leave it out with --without"),
         ("frame cam0 cam1\n0 0 0\n- 1 1\n2 2 2\n", "line 3 must hold numbers, got '-'"),

@@ -142,7 +142,7 @@ def test_misuse_is_refused(made, start):
         live.push_view("cam2", own, 0.0, np.eye(3))
     with pytest.raises(ValueError, match="rotations must be orthonormal"):
         live.push_view("cam2", own, 0.0, 2 * np.eye(4))
-    with pytest.raises(ValueError, match="cam2 moves: give a pose with what it sees at 99 s"):
+    with pytest.raises(ValueError, match="camera cam2 moves; give a pose with its view at 99 s"):
         live.push_view("cam2", own, 99.0)
 
 
@@ -152,5 +152,5 @@ def test_a_line_may_have_a_pose(made):
     camera, seen, time_s, read, surely = read_view_line(line, "line 1", made.rig, BODY_25)
     assert (camera, len(seen), time_s, surely) == ("cam2", 0, 1.5, None) and np.array_equal(read, np.eye(4))
     for wrong in ("[[1, 2]]", str((2 * np.eye(4)).tolist())):
-        with pytest.raises(InputError, match=r"line 1.*(pose|orthonormal).*that moves"):
+        with pytest.raises(InputError, match=r"line 1.*(pose|orthonormal).*moving camera"):
             read_view_line(line.replace(pose, wrong), "line 1", made.rig, BODY_25)

@@ -199,7 +199,7 @@ def with_turned(rig, view: int, degrees: float):
 
 def turned_by(found: Explanation) -> tuple[float, float]:
     """Degrees by which the finding says that a camera is off, and their sigma."""
-    turn, sigma = re.search(r"turned by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words).groups()
+    turn, sigma = re.search(r"rotated by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words).groups()
     return float(turn), float(sigma)
 
 
@@ -267,9 +267,9 @@ def test_the_command_says_the_same(people, scene, tmp_path, capsys):
 
 
 def test_who_is_not_there_is_said(people, scene):
-    with pytest.raises(InputError, match="person 77: is not in the result"):
+    with pytest.raises(InputError, match="person 77: not in the result"):
         explain(people, scene.rig, person=77, joint="LElbow", frame=5)
-    with pytest.raises(InputError, match="joint Tail: the result has none of that name"):
+    with pytest.raises(InputError, match="joint Tail: the result has no joint of this name"):
         explain(people, scene.rig, person=int(people.person[0]), joint="Tail", frame=int(people.frame[0]))
     with pytest.raises(InputError, match="is not in frame 99"):
         explain(people, scene.rig, person=int(people.person[0]), joint="LElbow", frame=99)
@@ -278,9 +278,9 @@ def test_who_is_not_there_is_said(people, scene):
 @pytest.mark.parametrize(
     ("words", "change"),
     {
-        "time_s must rise": lambda people: replace(people, time_s=np.zeros(len(people))),
+        "time_s must increase": lambda people: replace(people, time_s=np.zeros(len(people))),
         "does not at person": lambda people: replace(people, time_s=np.full(len(people), np.nan)),
-        "is twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
+        "occurs twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
         "persons must be at most": lambda people: with_both(people, person=people.person + 10**6),
         "people.problems must be": lambda people: people.with_run(people={"problems": 3}),
         "setup.left_out": lambda people: people.with_run(setup={"left_out": [{"camera": {}, "frames": [0, 9]}]}),

@@ -74,4 +74,4 @@ def test_bodies_stay_above_the_floor(dance):
 def test_frames_alone_have_neither():
     scene = built_in_scene(frames=2)
     people = reconstruct(simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False))
-    assert people.run["floor"] == {"found": False, "why": "frames stand alone"}
+    assert people.run["floor"] == {"found": False, "why": "frame by frame"}

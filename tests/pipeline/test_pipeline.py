@@ -262,7 +262,7 @@ def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recor
     assert named == set(zip(result.person.tolist(), result.frame.tolist(), strict=True))
     assert {person for person, _ in named} == {0, 1, 2, 3}
     # Who goes when detections are given out again has no problem of their own; there is hardly anybody.
-    gone = "next to no detections of their own, or in somebody else's place"
+    gone = "hardly any detections of their own, or at the position of another person"
     assert result.run["people"]["dropped"].get(gone, 0) <= 3
 
 

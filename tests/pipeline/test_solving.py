@@ -115,7 +115,7 @@ def test_a_swap_is_mended_and_only_who_was_in_it_is_solved(scene, people):
 
 
 def test_without_observations_it_is_said(scene, people):
-    with pytest.raises(ValueError, match="rows without observations cannot be solved anew"):
+    with pytest.raises(ValueError, match="rows without observations cannot be solved again"):
         solve(replace(people, observations=None), scene)
 
 
@@ -182,7 +182,11 @@ def test_the_setup_of_a_result(scene, people, tmp_path):
         Solver.read(folder, loaded)
     other = replace(loaded, run=loaded.run | {"configuration": {"speed": 3}})
     write_rig(scene.rig, folder / CAMERAS)
-    with pytest.raises(InputError, match=r"run.json: speed is not a known key; another version .* reconstruct"):
+    with pytest.raises(
+        InputError,
+        match=r"run.json: speed is not a known key; it was written by another"
+        r" version .* reconstruct",
+    ):
         Solver.read(folder, other)
     with pytest.raises(InputError, match=r"run.json: configuration is missing"):
         Solver.read(folder, replace(loaded, run={}))

@@ -214,7 +214,7 @@ def test_mistakes_of_all_cameras_are_named(recording, room):
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(0.001, "in m, and was read as mm"), *slow((100, "in cm, and was read as m"))]
+    ("factor", "words"), [(0.001, "in m, but was read as mm"), *slow((100, "in cm, but was read as m"))]
 )
 def test_a_wrong_unit_is_named(recording, room, factor, words):
     rig = scaled(room, factor)

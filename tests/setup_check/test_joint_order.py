@@ -42,11 +42,11 @@ def order_findings(recording, rig) -> list[str]:
 
 
 WRONG = {
-    "everything": (SIDES, "left and right of everybody look exchanged"),
-    "arms": (both(*ARMS), "left and right shoulder, elbow and wrist look exchanged"),
-    "legs": (both(*LEGS), "left and right hip, knee and ankle look exchanged"),
-    "wrists": (both("Wrist"), "left and right wrist look exchanged"),
-    "elbow and wrist": ([("RElbow", "RWrist")], "RElbow and RWrist look exchanged"),
+    "everything": (SIDES, "left and right appear to be exchanged"),
+    "arms": (both(*ARMS), "left and right shoulder, elbow and wrist appear to be exchanged"),
+    "legs": (both(*LEGS), "left and right hip, knee and ankle appear to be exchanged"),
+    "wrists": (both("Wrist"), "left and right wrist appear to be exchanged"),
+    "elbow and wrist": ([("RElbow", "RWrist")], "RElbow and RWrist appear to be exchanged"),
     "many": (
         [("RElbow", "LKnee"), ("LWrist", "RHip"), ("Nose", "LAnkle"), ("RShoulder", "LHip"), ("RWrist", "LElbow")],
         "in another order than they are read in",
@@ -75,7 +75,7 @@ def test_a_known_layout_that_fits_is_named(shared_cases):
     assert "in that of BODY_25B; give --skeleton BODY_25B" in words
     detections = read_detections(shared_cases / "h36m_coco" / "detections_end_to_end", rig, "COCO_17")
     (words,) = order_findings(detections, rig)
-    assert "do not lie as a body's do in the order of COCO_17, and do in that of H36M_17" in words
+    assert "do not look like a body in the joint order of COCO_17, but do in that of H36M_17" in words
 
 
 @pytest.mark.slow

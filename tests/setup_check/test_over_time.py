@@ -114,7 +114,7 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     assert result_check(report, people, recording, room, range(60)).warnings == ()
     fast = replace(people, time_s=people.time_s * 25 / 1000)
     (said,) = result_check(report, fast, recording, room, range(60)).warnings
-    assert "m/s" in said and "--fps is probably wrong (1000 a second" in said
+    assert "m/s" in said and "--fps is probably wrong (1000 Hz" in said
     assert np.isfinite(people.time_s).all()
     none = np.zeros((0, 2), dtype=np.intp), np.zeros(0)
     crowd = [
@@ -142,7 +142,7 @@ def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, ro
         replace(report, findings=(), warnings=(), trust=Trust()), alone, turned, room, range(20)
     )
     (said,) = [each for each in checked.warnings if each.startswith(f"{name}: ")]
-    assert "belong to nobody who was found" in said and "check-calibration" in said
+    assert "are not assigned to any person" in said and "check-calibration" in said
     use = checked.cameras[2]
     assert use.used + sum(use.unused.values()) == use.offered
     others = [each for view, each in enumerate(checked.cameras) if view != 2]

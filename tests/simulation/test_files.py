@@ -79,7 +79,7 @@ def test_any_number_of_people_and_cameras(tmp_path: Path, people: int, cameras: 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["tango"], "there is no such scene; give one of demo salsa crossing crowd"),
+        (["tango"], "tango: must be one of demo salsa crossing crowd"),
         (["demo", "--cameras", "1"], "--cameras 1: must be 2 to 12"),
         (["demo", "--people", "13"], "--people 13: must be 0 to 12"),
         (["demo", "--seed", "-1"], "--seed -1: must be 0 or more"),

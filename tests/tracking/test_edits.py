@@ -128,19 +128,22 @@ def test_swap_from_a_frame(people):
     [
         (
             Edit(Action.MERGE, 1, 5),
-            "1 and 5 are both there in 5 frames, the first is 3: they are two people; split",
+            "1 and 5 are both present in 5 frames, first in 3, so they are two people; split",
         ),
         (Edit(Action.MERGE, 1, 1), "merge needs two people, got 1 twice"),
         (Edit(Action.MERGE, 1, 6), "there is no person 6; there are 1 2 5 7"),
         (
             Edit(Action.SPLIT, 5, 8, 3),
-            "5 is there in frames 3 to 7, and cannot be split at 3; give a frame from 4 to 7",
+            "5 is present in frames 3 to 7 and cannot be split at 3; give a frame from 4 to 7",
         ),
         (Edit(Action.SPLIT, 5, 8, 8), "cannot be split at 8"),
-        (Edit(Action.SPLIT, 5, 7, 5), "7 is somebody already; give another number such as 8, or merge 5 and 7"),
-        (Edit(Action.RENAME, 5, 7), "7 is somebody already"),
-        (Edit(Action.RENAME, 5, -1), "-1 cannot be a person's number; give one from 0"),
-        (Edit(Action.SWAP, 1, 2, 20), "neither 1 nor 2 is there from frame 20 on; give one up to 19"),
+        (
+            Edit(Action.SPLIT, 5, 7, 5),
+            "7 is the number of another person; give a free one such as 8, or merge 5 and 7",
+        ),
+        (Edit(Action.RENAME, 5, 7), "7 is the number of another person"),
+        (Edit(Action.RENAME, 5, -1), "-1 is not a valid number of a person; give one from 0"),
+        (Edit(Action.SWAP, 1, 2, 20), "neither 1 nor 2 is present from frame 20 on; give a frame up to 19"),
         (Edit(Action.DROP, 3), "there is no person 3"),
     ],
 )
@@ -203,9 +206,9 @@ def test_a_solver_may_fill_gaps_but_not_return_other_people(people):
     assert frames_of(solved, 5) == [*range(3, 9), *range(10, 20)]
     assert (np.diff(solved.frame) >= 0).all()
     for wrong in (lambda rows: people, lambda rows: replace(rows, observations=None)):
-        with pytest.raises(ValueError, match="rows, with their observations, of the people that it was given"):
+        with pytest.raises(ValueError, match="rows of the given people, with their observations"):
             solve_anew(apply(people, Edit(Action.MERGE, 5, 7)), wrong)
-    with pytest.raises(ValueError, match="people without observations cannot be solved anew"):
+    with pytest.raises(ValueError, match="people without observations cannot be solved again"):
         solve_anew(apply(replace(people, observations=None), Edit(Action.MERGE, 5, 7)), solve)
 
 

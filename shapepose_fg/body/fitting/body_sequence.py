@@ -62,7 +62,7 @@ class SequenceFitter:
             count = f"{len(numbers)} groups, got {len(shapes.mean)}"
             raise ValueError(f"shapes must have one row for each of the {count}")
         if fixed_shapes and shapes is None:
-            raise ValueError("fixed_shapes needs the shapes: give them")
+            raise ValueError("fixed_shapes needs shapes: give them")
         evidence = weigh(targets, self.config.model_sigma_m)
         fit = BodyFit.failed(evidence.status, joints)
         free, origin, rows, found = self._start(evidence, group, time_s)

@@ -82,7 +82,7 @@ class Evaluated(FitRows):
     xyz: Array
     """(B, K, 3) keypoints, metres."""
     squared: Array
-    """(B, K) squared Mahalanobis distance of each to its target."""
+    """(B, K) squared Mahalanobis distance of each keypoint to its target."""
     gradient: Array
     """(B, P) half the gradient."""
     system: Array

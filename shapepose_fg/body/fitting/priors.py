@@ -56,7 +56,7 @@ class PosePrior:
             if value.shape != shape:
                 raise ValueError(f"the pose prior's {name} must be {shape}, got {value.shape}")
             if np.isnan(value).any():
-                raise ValueError(f"the pose prior's {name} holds NaN: fit it again")
+                raise ValueError(f"the pose prior's {name} has values that are not finite: fit it again")
             object.__setattr__(self, name, value)
         if np.abs(self.covariance - self.covariance.T).max() > 1e-9:
             raise ValueError("the pose prior's covariance must be symmetric")

@@ -76,10 +76,10 @@ class FitterWeights:
         about, tensors = _read_tensors(path)
         if about.get("format") != _FORMAT:
             raise InputError(
-                f"{path}: not weights of the learned fitter; make some with shapepose-fg train-fitter"
+                f"{path}: these are not weights of the learned fitter; train some with shapepose-fg train-fitter"
             )
         if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
-            raise InputError(f"{path}: the weights hold NaN or infinity; train or fetch them again")
+            raise InputError(f"{path}: the weights have values that are not finite; train or fetch them again")
         try:
             spread = tensors.pop(_SPREAD)
             learnt = {name: value for name, value in tensors.items() if not name.startswith(_FRAME)}
@@ -88,7 +88,10 @@ class FitterWeights:
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in placed.items()})
             return cls(network, frame, about["body"], spread.astype(np.float64), json.loads(about["card"]), path)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            why = f"weights of another version of the fitter ({str(error).splitlines()[0]}); train them anew"
+            why = (
+                f"the weights are of another version of the fitter ({str(error).splitlines()[0]}); train"
+                " them again"
+            )
             raise InputError(f"{path}: {why}") from error
 
     def save(self, path: Path) -> None:
@@ -110,8 +113,8 @@ class FitterWeights:
         """
         if fingerprint(model) != self.body:
             raise InputError(
-                "these weights of the learned fitter were trained on another body model: train some on yours with"
-                " shapepose-fg train-fitter --body, or choose the plain fitter"
+                "these weights were trained on another body model: train weights for yours with shapepose-fg"
+                " train-fitter --body, or use the plain fitter"
             )
 
 
@@ -126,7 +129,7 @@ def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.floa
                     raise InputError(f"{path}: {name} holds {kind}, not numbers of {' '.join(_KINDS)}; {_CURE}")
             return file.metadata() or {}, {name: file.get_tensor(name) for name in names}
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: not readable as safetensors ({error}); {_CURE}") from error
+        raise InputError(f"{path}: cannot be read as safetensors ({error}); {_CURE}") from error
 
 
 def fingerprint(model: BodyModel) -> str:

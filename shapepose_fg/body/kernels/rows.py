@@ -90,7 +90,7 @@ class Linear(NamedTuple):
     xyz: Array
     """(B, K, 3) keypoints, metres."""
     squared: Array
-    """(B, K) squared Mahalanobis distance of each to its target."""
+    """(B, K) squared Mahalanobis distance of each keypoint to its target."""
     gradient: Array
     """(B, P) half the gradient."""
     system: Array
@@ -139,9 +139,9 @@ class Work(NamedTuple):
     J: Array
     """(K, 3, 85) Jacobian of each point, its first `count` columns."""
     column: Index
-    """(K, 85) unknown of each of these columns."""
+    """(K, 85) index of the unknown of each column."""
     count: Index
-    """(K,) number of these columns."""
+    """(K,) number of columns used for each point."""
     squared: Array
     """(K,) squared Mahalanobis distance of each point to its target."""
     weight: Array

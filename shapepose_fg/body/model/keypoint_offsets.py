@@ -71,7 +71,9 @@ class KeypointOffsets:
                 raise ValueError(f"{name} must be finite numbers")
             object.__setattr__(self, name, value.astype(kind))
         if np.linalg.norm(self.xyz_m, axis=1).max() > LARGEST_M:
-            raise ValueError(f"xyz_m must be metres, none longer than {LARGEST_M}: it was learnt from nonsense")
+            raise ValueError(
+                f"xyz_m must be metres, none longer than {LARGEST_M}; learn them from other detections"
+            )
         if (self.sigma_m < 0).any() or (self.count < 0).any():
             raise ValueError("sigma_m and count must not be negative")
         if (self.bones < 0).any() or (self.bones >= len(SMPL_24)).any():
@@ -97,7 +99,9 @@ class KeypointOffsets:
             if mirror != joint and mirror in given:
                 raise ValueError(f"give {BODY_25.joints[joint]} or {BODY_25.joints[mirror]}, not both")
             if mirror == joint and offset[0] != 0:
-                raise ValueError(f"{BODY_25.joints[joint]} is in the middle: its x must be 0, got {offset[0]}")
+                raise ValueError(
+                    f"{BODY_25.joints[joint]} is on the plane of symmetry: its x must be 0, got {offset[0]}"
+                )
             xyz[mirror] = np.array(offset) * (-1.0, 1.0, 1.0)
             xyz[joint] = offset
         return cls(xyz, np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
@@ -142,7 +146,7 @@ class KeypointOffsets:
             return cls.from_dict(content)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-            raise InputError(f"{path}: {reason}; restore the file, or learn the offsets anew") from None
+            raise InputError(f"{path}: {reason}; restore the file, or learn the offsets again") from None
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "KeypointOffsets":
@@ -161,7 +165,7 @@ class KeypointOffsets:
 def _bone(name: object) -> int:
     """The index of a joint of SMPL; raises ValueError for any other name."""
     if name not in SMPL_24:
-        raise ValueError(f"{name!r:.80} is no joint of SMPL")
+        raise ValueError(f"{name!r:.80} is not a joint of SMPL")
     return SMPL_24.index(str(name))
 
 

@@ -101,20 +101,21 @@ def read_smpl_file(path: Path, keypoint_regressor: Real | None = None) -> SmplAr
 def _read_entries(path: Path) -> dict[str, Any]:
     """The file's arrays, or records of them, by name."""
     if path.suffix not in (".npz", ".pkl"):
-        raise InputError(f"{path}: a body model is read from .npz or .pkl; give one of those")
+        raise InputError(f"{path}: a body model must be .npz or .pkl; give one of these")
     try:
         if path.suffix == ".pkl":
             return read_smpl_pickle(path)
-        return read_npz(path, (*_KEYS, _KEYPOINTS), "fetch the file again")
+        return read_npz(path, (*_KEYS, _KEYPOINTS), "download the file again")
     except InputError:
         raise
     except RefusedPickle as error:
         raise InputError(
-            f"{path}: refused, {error}: use the unchanged file from the model's site, or save its arrays as .npz"
+            f"{path}: cannot be read safely ({error}); use the unchanged file from the model's site, or save"
+            " its arrays as .npz"
         ) from error
     except Exception as error:  # a damaged pickle can raise any error
         raise InputError(
-            f"{path}: cannot be read as a body model ({type(error).__name__}: {error}): fetch the file again"
+            f"{path}: cannot be read as a body model ({type(error).__name__}: {error}); download the file again"
         ) from error
 
 
@@ -132,7 +133,7 @@ class _Entries:
         try:
             return value if isinstance(value, np.ndarray) else as_array(value)
         except Exception as error:  # records of a damaged pickle can contain anything
-            raise InputError(f"{self.path}: {name} is not an array ({error}): fetch the file again") from error
+            raise InputError(f"{self.path}: {name} is not an array ({error}); download the file again") from error
 
     def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> Array:
         """The array `name`, or `value` in its place, validated as finite and of this shape; None is
@@ -146,10 +147,10 @@ class _Entries:
             expected = ", ".join("Nv" if n is None else str(n) for n in shape)
             raise InputError(
                 f"{self.path}: {name} must be numbers ({expected}), got {value.dtype} {value.shape}: "
-                "use a file of one and the same model"
+                "use an unchanged file of one model"
             )
         if not np.all(np.isfinite(value)):
-            raise InputError(f"{self.path}: {name} holds NaN or infinity: fetch the file again")
+            raise InputError(f"{self.path}: {name} has values that are not finite; download the file again")
         return np.ascontiguousarray(value, dtype=np.float64)
 
     def shapes(self, count: int) -> Array:
@@ -183,7 +184,7 @@ class _Entries:
             raise InputError(f"{self.path}: f must be whole numbers (F, 3), got {faces.dtype} {faces.shape}")
         faces = faces.astype(np.int64)
         if np.any(faces < 0) or np.any(faces >= count):
-            raise InputError(f"{self.path}: f names vertices outside 0..{count - 1}: fetch the file again")
+            raise InputError(f"{self.path}: f names vertices outside 0..{count - 1}; download the file again")
         return faces
 
     def check_tree(self) -> None:
@@ -197,8 +198,8 @@ class _Entries:
             fits = np.array_equal(parents[1:], SMPL_PARENTS[1:]) and np.array_equal(table[1], np.arange(24))
         if not fits:
             raise InputError(
-                f"{self.path}: kintree_table is not the tree of SMPL's 24 joints (shape {table.shape}): "
-                "use a SMPL body; SMPL-H, SMPL-X and others are not read"
+                f"{self.path}: kintree_table is not the tree of SMPL's 24 joints (shape {table.shape}): use a"
+                " SMPL body; SMPL-H, SMPL-X and others are not supported"
             )
 
 
@@ -232,9 +233,7 @@ def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Ar
     for name, regressor in (("J_regressor", joint_regressor), ("keypoint_regressor", keypoint_regressor)):
         off = np.abs(regressor.sum(axis=1) - 1).max()
         if off > _SUM_TOLERANCE:
-            return (
-                f"{name} has rows that do not sum to 1 (off by {off:.2g}): use the file of one and the same model"
-            )
+            return f"{name} has rows that do not sum to 1 (off by {off:.2g}): use an unchanged file of one model"
     joints: dict[str, Array] = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
     keypoints: dict[str, Array] = dict(zip(BODY_25.joints, keypoint_regressor @ template, strict=True))
     for part in (*_RISING, "elbow", "wrist"):

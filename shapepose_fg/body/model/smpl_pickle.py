@@ -84,7 +84,7 @@ def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
     def run(reader: Any) -> None:
         reader.steps += 1
         if reader.steps > _MOST_STEPS:
-            raise RefusedPickle(f"it takes over {_MOST_STEPS} steps, and a body model a few thousand")
+            raise RefusedPickle(f"it has over {_MOST_STEPS} instructions, but a body model has a few thousand")
         step(reader)
 
     return run
@@ -119,7 +119,7 @@ class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
     def call(self) -> None:
         arguments, made = self.stack.pop(), self.stack.pop()
         if not isinstance(made, Name) or not isinstance(arguments, tuple):
-            raise RefusedPickle("it calls what is no name")
+            raise RefusedPickle("it calls something that is not a name")
         if made in _REBUILDS:
             made, arguments = arguments[0], ()
         if not isinstance(made, Name) or made in _REBUILDS:
@@ -135,7 +135,7 @@ class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
     def fill(self, values: list[Any]) -> None:
         """Add entries to a dict; keys other than text could have very slow comparisons."""
         if not isinstance(self.stack[-1], dict) or not all(isinstance(key, str | int) for key in values[::2]):
-            raise RefusedPickle("it has keys that are no text")
+            raise RefusedPickle("it has keys that are not text")
         self.stack[-1].update(zip(values[::2], values[1::2], strict=True))
 
     def filled(self) -> None:
@@ -171,7 +171,7 @@ def read_smpl_pickle(path: Path) -> dict[str, Any]:
     """
     content = _Reader(read_bytes(path, _MOST_BYTES)).load()
     if not isinstance(content, dict):
-        raise RefusedPickle(f"it holds a {type(content).__name__} where SMPL's files hold a dict")
+        raise RefusedPickle(f"it holds a {type(content).__name__}, but SMPL's files hold a dict")
     return {str(name): value for name, value in content.items()}
 
 
@@ -220,7 +220,7 @@ def _raw_bytes(value: Any) -> bytes:
     if isinstance(value, Record) and value.name in _BYTES:
         text, encoding = value.arguments
         if encoding != "latin1":
-            raise TypeError("bytes written in another way than NumPy does")
+            raise TypeError("bytes in an encoding that NumPy does not use")
         return text.encode("latin1")
     if isinstance(value, str):
         return value.encode("latin1")

@@ -25,7 +25,7 @@ def reconstruct(
     try:
         frames = () if cuts is None else tuple(int(word) for word in re.split(r"[,\s]+", cuts.strip()))
     except ValueError:
-        raise InputError(f"--cuts {cuts}: must be rising frame numbers, such as 300,600") from None
+        raise InputError(f"--cuts {cuts}: must be increasing frame numbers, such as 300,600") from None
     known = prepare(replace(request, cuts=frames), output)
     from shapepose_fg.cli.reconstruct.run import carry_out
     from shapepose_fg.pipeline.execution import Execution

@@ -146,7 +146,7 @@ class Prepared:
             return check_cuts(self.request.cuts, count)
         except ValueError:
             raise InputError(
-                f"--cuts {','.join(map(str, self.request.cuts))}: must be rising frame numbers between 1 and"
+                f"--cuts {','.join(map(str, self.request.cuts))}: must be increasing frame numbers between 1 and"
                 f" {count - 1}, such as 300,600"
             ) from None
 

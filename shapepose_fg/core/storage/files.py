@@ -51,7 +51,7 @@ def open_regular(path: Path, cure: str = "check the path", most: int | None = No
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     except ValueError:  # a zero byte in the path
-        raise InputError(f"{str(path)!r}: no file has such a name; check the path") from None
+        raise InputError(f"{str(path)!r}: this is not a valid file name; check the path") from None
     _refuse_unusable(path, os.fstat(stream.fileno()), most)
     return stream
 
@@ -60,7 +60,7 @@ def _refuse_unusable(path: Path, status: os.stat_result, most: int | None) -> No
     if stat.S_ISDIR(status.st_mode):
         raise InputError(f"{path}: this is a folder; give the file inside it")
     if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path}: this is a pipe or a device, no file; write it into a file first")
+        raise InputError(f"{path}: this is a pipe or a device; write it into a file first")
     if most is not None:
         _check_size(path, status.st_size, most)
 
@@ -81,7 +81,7 @@ def inside(folder: Path, name: str) -> Path:
     """
     if not is_inside(folder, name):
         cure = "remove it, or give that folder"
-        raise InputError(f"{folder / name}: this is a link that leads out of its folder; {cure}")
+        raise InputError(f"{folder / name}: this link leads out of its folder; {cure}")
     return folder / name
 
 
@@ -97,7 +97,7 @@ def read_bytes(path: Path, most: int = LARGE) -> bytes:
 
 def _check_size(path: Path, size: int, most: int) -> None:
     if size > most:
-        raise InputError(f"{path}: over {most >> 20} MiB are too much for such a file; check the path")
+        raise InputError(f"{path}: the file is over {most >> 20} MiB, too large for its kind; check the path")
 
 
 def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> str:
@@ -162,7 +162,7 @@ def parse_json(text: str, path: Path | str) -> Any:
 
 def not_text(path: Path, byte: int) -> InputError:
     """The error for a file that is not UTF-8 text at `byte`."""
-    return InputError(f"{path}: byte {byte} is not UTF-8 text; check that this is the file that you mean")
+    return InputError(f"{path}: byte {byte} is not UTF-8 text; check the path")
 
 
 def not_json(path: Path | str, line: int, column: int, problem: str, *, rest: str | None) -> InputError:
@@ -172,8 +172,7 @@ def not_json(path: Path | str, line: int, column: int, problem: str, *, rest: st
     cut = rest is not None and (problem.startswith("Unterminated") or _BROKEN_OFF.fullmatch(rest))
     ends = " (the file ends too early)" if cut else ""
     return InputError(
-        f"{path}: line {line} column {column} is not JSON: {problem}{ends};"
-        " correct it there or write the file again"
+        f"{path}: line {line} column {column} is not JSON: {problem}{ends}; correct it or write the file again"
     )
 
 
@@ -190,14 +189,14 @@ def read_toml(path: Path, *, may_be_empty: bool = False) -> dict[str, Any]:
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
     """Parse the TOML `text` of the file at `path`."""
     if len(text) > SMALL:
-        raise InputError(f"{path}: {len(text)} characters are too many for TOML; check that this is the file")
+        raise InputError(f"{path}: the file has {len(text)} characters, too many for TOML; check the path")
     for number, line in enumerate(text.splitlines(), 1):
         if line.count(".") > _MOST_DOTS and not line.lstrip().startswith("#"):
-            raise InputError(f"{path}: line {number} has over {_MOST_DOTS} dots; break it into several lines")
+            raise InputError(f"{path}: line {number} has over {_MOST_DOTS} dots; split it into several lines")
     try:
         return bounded(tomllib.loads(text), path)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: this is not TOML: {error}; correct it there or write the file again") from None
+        raise InputError(f"{path}: cannot be read as TOML ({error}); correct it or write the file again") from None
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # such as an invalid date, or an integer of 5,000 digits
@@ -223,7 +222,7 @@ def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
             elif numbers and type(child) is int and not -(2**63) <= child < 2**63:
                 place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in (*way, key))
                 place = place.removeprefix(".")[:80]
-                raise InputError(f"{path}: {place} is a whole number of over 18 digits; correct it there")
+                raise InputError(f"{path}: {place} is a whole number of over 18 digits; correct it")
     return value
 
 

@@ -171,7 +171,7 @@ class NpzFile(ExitStack):
             if len(index) == 0:
                 return array
             if index[-1] >= member.shape[0]:
-                raise ValueError(f"{name} has {member.shape[0]} rows, and row {index[-1]} is asked for")
+                raise ValueError(f"{name} has {member.shape[0]} rows, but row {index[-1]} was requested")
             step = max(1, PIECE // max(member.row_bytes, 1))
             for first in range(int(index[0]), int(index[-1]) + 1, step):
                 count = min(step, int(index[-1]) + 1 - first)
@@ -195,7 +195,7 @@ class NpzFile(ExitStack):
             if dtype.kind not in "biufU":
                 raise ValueError(f"{info.filename} holds {dtype}, neither numbers nor text")
             if stream.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
-                raise ValueError(f"{info.filename} is {shape}, which its {info.file_size} bytes do not hold")
+                raise ValueError(f"{info.filename} is {shape}, which does not fit its {info.file_size} bytes")
             self._open[name] = _Member(stream, stream.tell(), shape, dtype, fortran and len(shape) > 1)
         return self._open[name]
 
@@ -221,7 +221,7 @@ def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[
     """
     version = npy.read_magic(stream)
     if version not in _HEADERS:
-        raise ValueError(f"it is of NumPy's format {version}, 1.0 and 2.0 are read")
+        raise ValueError(f"its NumPy format is {version}, but only 1.0 and 2.0 are supported")
     return _HEADERS[version](stream)
 
 
@@ -242,9 +242,9 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
         if member.flag_bits & 1:
             raise ValueError(f"{member.filename} is encrypted")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"{member.filename} is packed in another way than NumPy does")
+            raise ValueError(f"{member.filename} has a compression that NumPy does not use")
     if len({member.filename for member in members}) < len(members):
-        raise ValueError("an array is there twice")
+        raise ValueError("an array occurs twice")
     total = sum(member.file_size for member in members)
     if total > max(SMALL_BYTES, MOST_PACKED * size):
         raise ValueError(f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file")
@@ -257,5 +257,5 @@ def _with_letters(name: str, array: NDArray[Any]) -> NDArray[Any]:
     if array.dtype.kind == "U" and array.size > 0 and array.dtype.itemsize > 0:
         letters = np.frombuffer(array.tobytes(), np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
         if np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))):
-            raise ValueError(f"{name}.npy holds letters that there are not")
+            raise ValueError(f"{name}.npy holds invalid characters")
     return array

@@ -22,11 +22,11 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
             trial.write(b"trial")
     except OSError as error:
         problem = f"results cannot be written here ({error.strerror})"
-        raise InputError(f"{folder}: {problem}; give a folder that can be written") from None
+        raise InputError(f"{folder}: {problem}; give a writable folder") from None
     for name in names:
         if (folder / name).exists() and not (folder / name).is_file():
             what = "folder" if (folder / name).is_dir() else "pipe"
-            raise InputError(f"{folder / name}: this is a {what}, and a file is to be written here; move it away")
+            raise InputError(f"{folder / name}: this is a {what}, but a file must be written here; move it")
 
 
 @contextmanager
@@ -41,7 +41,7 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
     prepare_output(folder, names)
     file = folder / _LOCK
     if file.is_symlink() or (file.exists() and not file.is_file()):
-        raise InputError(f"{file}: this is a link or a pipe, and no run's; remove it")
+        raise InputError(f"{file}: this is a link or a pipe, not a file of a run; remove it")
     lock = FileLock(file, timeout=0)
     try:
         lock.acquire()

@@ -214,7 +214,7 @@ def checkpoint_of(
     decided = range(solved - before, solved - before + len(counts))
     possible = frames.start <= decided.start <= solved <= decided.stop <= following <= frames.stop
     if not possible or following - decided.stop > (MOST_FRAMES if "state.numbers" in arrays else 0):
-        raise ValueError(f"it goes on at frame {following}, and the parts end at {solved}")
+        raise ValueError(f"it continues at frame {following}, but the parts end at {solved}")
     if "state.numbers" not in arrays:
         border = Border(*(arrays[f"border.{name}"] for name in Border.ROWS)) if "border.frame" in arrays else None
         return Checkpoint(following, next_id, border=border)

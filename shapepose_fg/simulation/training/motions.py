@@ -94,7 +94,7 @@ class Motions(Table):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not np.isfinite(self.poses).all():
-            raise ValueError("poses must be finite: leave frames that were not recorded out")
+            raise ValueError("poses must be finite: leave out frames that were not recorded")
 
     def of(self, split: Split) -> "Motions":
         """The frames of the subjects of one split."""
@@ -192,7 +192,7 @@ def _amass_arrays(path: Path) -> tuple[Array, float]:
     poses, fps = arrays["poses"].astype(np.float64), arrays[rate].astype(np.float64)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < _BODY_COLUMNS or poses.shape[1] % 3:
         raise InputError(
-            f"{path}: poses must be (T, 66 or more), is {poses.shape}; give motions in AMASS's format"
+            f"{path}: poses must be (T, 66 or more), got {poses.shape}; give motions in AMASS's format"
         )
     if not np.isfinite(poses).all():
         raise InputError(f"{path}: poses holds values that are not finite; leave the file out")

@@ -120,7 +120,10 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWri
     writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     try:
         if not writer.isOpened():
-            raise InputError(f"{path}: a video of {size[0]} x {size[1]} cannot be written; check space and rights")
+            raise InputError(
+                f"{path}: a video of {size[0]} x {size[1]} cannot be written; check the free disk"
+                " space and the permissions"
+            )
         yield writer
         writer.release()
         part.replace(path)

@@ -44,8 +44,8 @@ def pictures_of(
         paths = dict(zip(drawn, places, strict=True))
     elif len(unknown) > 0:
         raise InputError(
-            f"nothing says where the pictures of camera {unknown[0]} are; give --videos, or with --detections the"
-            " folder that `shapepose-fg detect` wrote"
+            f"the pictures of camera {unknown[0]} are unknown; give --videos, or with --detections the folder"
+            " that `shapepose-fg detect` wrote"
         )
     else:
         paths = {name: used[name].path for name in drawn}
@@ -64,8 +64,9 @@ def pictures_of(
         if placement.calibrated_size != size:
             theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
             raise InputError(
-                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, and the cameras.json of the"
-                f" result is for {ours}; give --detections with the folder of this result, or --image-placement"
+                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, but cameras.json of the"
+                f" result is for {ours}; give --detections with the folder of this result, or"
+                " --image-placement"
             )
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
     placements, concluded = placements_of(image_placement, sizes, rig)
@@ -74,7 +75,7 @@ def pictures_of(
         first = run.get("numbered_from")
         picture = "the first picture" if first is None else f"picture {first}"
         notes.append(
-            f"frame {first or 0} of the result is taken to be {picture} of {' '.join(unknown)}, and so on"
+            f"frame {first or 0} of the result is assumed to be {picture} of {' '.join(unknown)}, and so on"
         )
     for text in notes:
         tell(text)

@@ -98,7 +98,7 @@ def _time(seconds: Run) -> str:
     spent = {name: value for name, each in seconds.items() if (value := number(each)) is not None}
     longest = sorted((each for each in spent.items() if each[1] >= 0.05), key=lambda each: -each[1])
     listed = ", ".join(f"{name} {value:.1f}" for name, value in longest)
-    return f"{sum(spent.values()):.1f} s of processors: {listed}" if len(spent) > 0 else ""
+    return f"{sum(spent.values()):.1f} s of processor time: {listed}" if len(spent) > 0 else ""
 
 
 def lists(value: object) -> list[Any]:
@@ -131,4 +131,4 @@ def _frames_words(spans: object) -> str:
         if len(ends) == 2 and None not in ends:
             start, stop = int(ends[0] or 0), int(ends[1] or 0)
             told.append(f"{start}" if stop == start + 1 else f"{start}–{stop - 1}")
-    return ", ".join(told[:12]) + (f" and {len(told) - 12} segments more" if len(told) > 12 else "")
+    return ", ".join(told[:12]) + (f" and {len(told) - 12} more segments" if len(told) > 12 else "")

@@ -48,21 +48,21 @@ def write_report(
     """
     arrays, remarks = _body(people, body)
     if every > 1:
-        remarks.append(f"the result is long: all on this page is of every {th(every)} frame")
+        remarks.append(f"the result is long: this page uses every {th(every)} frame")
     if rig is None or isinstance(rig, str):
         up, rig = rig or _standing(people), None
-        remarks.append(f"{CAMERAS} is not there: no cameras are drawn, and {up} is taken to be up")
+        remarks.append(f"{CAMERAS} is missing: cameras are not drawn, and {up} is assumed to be up")
     else:
         up = rig.up
     scene: Scene | None = None
     if len(people) > 0:
         if fps is None and not _timed(people):
             fps = ASSUMED_FPS
-            remarks.append(f"nothing says when the frames were taken: the scene plays {fps:g} a second (--fps)")
+            remarks.append(f"the times of the frames are unknown: the scene plays at {fps:g} Hz (--fps)")
         try:
             scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, SCENE_BYTES)
         except ValueError as error:
-            remarks.append(f"there is no scene: {error}")
+            remarks.append(f"the scene is not drawn: {error}")
     title = str(people.run.get("project") or folder.resolve().name or folder)
     text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks)
     file = folder / REPORT
@@ -97,7 +97,7 @@ def _body(people: Reconstruction, given: Path | None) -> tuple[SmplArrays | None
     except InputError as error:
         if given is not None:
             raise
-        return None, [f"no bodies and heights: {error}"]
+        return None, [f"bodies are not drawn, and heights are unknown: {error}"]
 
 
 def _timed(people: Reconstruction) -> bool:

@@ -159,7 +159,7 @@ def test_whatever_has_the_body_uses_the_weights_and_says_so_before_there_are_any
     # Damaged weights are one sentence, and no other fitter in their place.
     adapted_file(second_body()).write_bytes(b"\xff" * 64)
     assert run(*common, "--body", "second.npz", "--output", "damaged") == 2
-    assert f"{name}: not readable as safetensors" in capsys.readouterr().err
+    assert f"{name}: cannot be read as safetensors" in capsys.readouterr().err
 
 
 def test_a_network_in_another_body_s_words_says_the_same_of_the_same_body():
@@ -197,7 +197,7 @@ def test_a_network_in_another_body_s_words_says_the_same_of_the_same_body():
         (["--body", "second.npz", "--output", "notes.txt/w"], "notes.txt: results cannot be written here"),
         (
             ["--body", "second.npz", "--output", "empty"],
-            "empty: this is a folder, and a file is to be written here",
+            "empty: this is a folder, but a file must be written here",
         ),
         ([], "Missing option"),
     ],

@@ -124,7 +124,7 @@ def test_people_stand_upright_whatever_axis_is_up(result, tmp_path, up):
     packed = array(scene["joints"], "<i2").reshape(-1, 25, 3).astype(float)
     upright = np.median(packed[:, BODY_25.index("Neck")] - packed[:, BODY_25.index("MidHip")], axis=0)
     assert upright[2] > 400
-    assert f"{up} is taken to be up" in page.text
+    assert f"{up} is assumed to be up" in page.text
 
 
 def test_figures_are_those_of_the_observations(result):
@@ -161,7 +161,7 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
     }
     text = Page(write_report(tmp_path, result.with_run(**run), scene.rig)).text
     for part in (
-        "2 people in 24 frames of 6 cameras, 1.0 s at 25 a second, a rate that is assumed",
+        "2 people in 24 frames of 6 cameras, 1.0 s at 25 Hz, an assumed frame rate",
         "cam2 looks turned by 5 degrees.",
         "3 joints were left out.",
         "too few parts in the box4100–102, 110",
@@ -192,7 +192,7 @@ def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path, monkey
     monkeypatch.setattr("shapepose_fg.viz.report.writing.SCENE_BYTES", 8000)
     thin = Page(write_report(tmp_path, result, scene.rig))
     assert len(thin.source) < whole - 8000
-    every = int(np.ceil(whole / 8000)) and re.search(r"one frame in (\d+) \((\d+) of 24\)", thin.text)
+    every = int(np.ceil(whole / 8000)) and re.search(r"One frame in (\d+) is drawn \((\d+) of 24\)", thin.text)
     assert every is not None
     kept = array(thin.scene["frames"], "<i4")
     assert len(kept) == int(every[2]) == len(range(0, 24, int(every[1])))
@@ -206,7 +206,7 @@ def test_nobody_found_is_a_page_too(scene, tmp_path):
     page = Page(write_report(tmp_path, nobody, scene.rig))
     assert_closed(page)
     assert page.scripts == []
-    assert "Nobody was found in 10 frames" in page.text
+    assert "No people were found in 10 frames" in page.text
 
 
 def test_one_frame_without_a_rate_is_a_page_too(result, scene, tmp_path):
@@ -219,14 +219,14 @@ def test_without_times_the_scene_plays_at_the_usual_rate(result, scene, tmp_path
     timeless = replace(result, time_s=np.full(len(result), np.nan)).with_run(time={})
     page = Page(write_report(tmp_path, timeless, scene.rig))
     np.testing.assert_allclose(array(page.scene["times"], "<f4"), np.arange(FRAMES) / 30, atol=1e-5)
-    assert "the scene plays 30 a second" in page.text
+    assert "the scene plays at 30 Hz" in page.text
 
 
 def test_people_on_no_timeline_are_a_page_without_a_scene(result, scene, tmp_path):
     twice = replace(result, person=np.full(len(result), 3), observations=None)
     page = Page(write_report(tmp_path, twice, scene.rig))
     assert_closed(page)
-    assert page.scripts == [] and "there is no scene: person 3 has two rows of frame 100" in page.text
+    assert page.scripts == [] and "the scene is not drawn: person 3 has two rows of frame 100" in page.text
 
 
 def test_every_reason_has_words(result, scene, tmp_path):
@@ -238,7 +238,7 @@ def test_every_reason_has_words(result, scene, tmp_path):
     candidate = np.where(gate == Gate.NOT_SEEN, -1, table.candidate)
     changed = replace(table, gate=gate, xy=xy, confidence=confidence, candidate=candidate)
     text = Page(write_report(tmp_path, replace(result, observations=changed), scene.rig)).text
-    for words in ("too far", "against the body", "behind camera", "joint not placed"):
+    for words in ("too far", "against the body", "behind camera", "no position"):
         assert f"{words}: " in text
 
 
@@ -246,7 +246,7 @@ def test_result_without_observations_or_body_file(result, scene, tmp_path):
     bare = replace(result, observations=None).with_run(body=str(tmp_path / "gone.pkl"))
     page = Page(write_report(tmp_path, bare, scene.rig))
     assert "mesh" not in page.scene
-    assert "no bodies and heights" in page.text and "There is no observations.npz" in page.text
+    assert "bodies are not drawn" in page.text and "observations.npz is missing" in page.text
 
 
 def test_the_command_makes_the_page_anew(saved, page, capsys, tmp_path):
