@@ -2,7 +2,7 @@
 intersection of rays.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -83,33 +83,6 @@ class Pairwise:
         normal = normals(one.rays[rows], self.views, a, b)
         miss = np.einsum("njk,njk->nj", normal, rays) / size[:, None]
         return miss, np.einsum("njk,njk->nj", normal, speed) / size[:, None]
-
-    def nearest(self, reach: float, step: float) -> "Pairwise":
-        """Return a copy with the best shifts within `reach` frames, found camera by camera."""
-        V, shift = len(self.tracks), self.shift.copy()
-        pairs = {pair: self.matched(*pair) for pair in combinations(range(V), 2)}
-        tried = np.arange(-reach, reach + step / 2, step)
-        cost = {}
-        wide = np.arange(-2 * reach, 2 * reach + step / 2, step)
-        for (a, b), (rows, track) in pairs.items():
-            apart = shift[b] - shift[a]
-            thin = max(1, len(rows) // 600)
-            misses = [self.miss(a, b, rows[::thin], track[::thin], apart + each)[0] for each in wide]
-            stack = np.stack(misses) if len(rows) > 0 else np.full((len(wide), 1, 1), np.nan)
-            both = np.isfinite(stack).all(axis=0)
-            width = 1.5 * np.median(np.abs(stack).min(axis=0)[both]) + 0.005 if both.any() else 1.0
-            cost[a, b] = np.log1p((stack[:, both] / width) ** 2).sum(axis=1)
-        place = np.full(V, len(tried) // 2)
-        for _ in range(3):
-            for view in range(1, V):
-                total = np.zeros(len(tried))
-                for (a, b), each in cost.items():
-                    if view in (a, b):
-                        own, its = np.arange(len(tried)), place[a if view == b else b]
-                        apart = own - its if view == b else its - own
-                        total += each[apart + len(wide) // 2]
-                place[view] = int(np.argmin(total))
-        return replace(self, shift=shift + tried[place])
 
     def solved(self) -> tuple[Array, Array]:
         """(V,) shifts in frames and their covariance (V, V), estimated jointly from all pairs."""

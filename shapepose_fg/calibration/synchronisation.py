@@ -155,7 +155,6 @@ def offsets(
     coarse, sure = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
     tracks = [Tracks.of(sightings, views, view, fps) for view in range(len(rig))]
     fine = Pairwise(tracks, views, coarse.astype(float), fps)
-    fine = fine.nearest(2.0 * step, 1.0).nearest(2.0, 0.25)
     shift, covariance = fine.solved()
     if len(rig) > 2:
         shift, covariance = InSpace.of(replace(fine, shift=shift)).settled()
