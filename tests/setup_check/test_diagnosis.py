@@ -315,7 +315,7 @@ def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part)
     assert report.findings == () and report.stature_m == pytest.approx(1.7 * part, rel=0.12)
     assert len(report.notes) == 1
     assert (
-        "tall, as children are; if they are adults" in report.notes[0] and f"{part:.1f} times" in report.notes[0]
+        "m, as of children; if they are adults" in report.notes[0] and f"{part:.1f} times" in report.notes[0]
     )
 
 
