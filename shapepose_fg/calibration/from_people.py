@@ -24,7 +24,7 @@ from shapepose_fg.calibration.levelling import (
     scaled,
     sigma_of_scale,
 )
-from shapepose_fg.calibration.people import Footage, People, missed_px
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.calibration.relative import Relative, relative
 from shapepose_fg.calibration.tracks import OneClock, Tracks, seen_at
@@ -45,8 +45,6 @@ _STILL_DEG = 0.03
 """Rotation per round below which cameras have converged, degrees."""
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
 """Minimum score of a pair of cameras, and minimum common person-seconds."""
-_LEAST_PEOPLE = 10
-"""Minimum number of people, one per frame, from which a camera is adjusted."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """Maximum standard deviation of a rotation, and maximum difference between halves of the recording, degrees."""
 _UNUSUAL = 3.0
@@ -256,7 +254,7 @@ class _How:
         adjusted: Adjusted | None = None
         for step in range(rounds):
             people = footage.people(now)
-            if len(people) < _LEAST_PEOPLE or not people.seen.any():
+            if len(people) < LEAST_PEOPLE or not people.seen.any():
                 raise Undetermined(
                     (
                         f"only {len(people)} people are seen by two cameras at once, but at least 10 are needed;"
@@ -303,13 +301,13 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
     held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan
     found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed)
     sigma = np.degrees(adjusted.sigma(TURN))
-    few, vague = counts < _LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
+    few, vague = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
     torn = apart_deg > _MOST_APART_DEG
     kinds = (
         (
             few,
             counts,
-            f"only {{}} people are seen by another camera, too, but at least {_LEAST_PEOPLE} are needed",
+            f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} are needed",
         ),
         (~few & vague, sigma.round(1), "the motion of the people determines the rotation to {} degrees only"),
         (~few & ~vague & torn, apart_deg.round(1), "the two halves of the recording are {} degrees apart"),

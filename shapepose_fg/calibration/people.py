@@ -14,6 +14,8 @@ from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.setup_check.evidence import observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
+LEAST_PEOPLE = 10
+"""Minimum number of people, one per frame, from which a camera is adjusted."""
 _LEAST_STEP_S = 0.1
 """Minimum time between used frames, s: errors of nearer ones are correlated (0.8)."""
 _MOST_FRAMES = 100

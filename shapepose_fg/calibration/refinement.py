@@ -11,7 +11,7 @@ import numpy as np
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.levelling import scaled
-from shapepose_fg.calibration.people import Footage, missed_px
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -24,8 +24,6 @@ from shapepose_fg.setup_check.small import Problem
 
 _ROUNDS = 4
 """Number of rounds, each with people associated by the cameras of the round before."""
-_LEAST_PEOPLE = 10
-"""Minimum number of people, one per frame, from which a camera is adjusted."""
 _SAME_PERSON = 2.5
 """Number of joints of one person in one view whose correlated errors count as one independent error."""
 _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
@@ -207,7 +205,7 @@ def _fitted(
     rig_now, adjusted = rig, None
     for step in range(_ROUNDS):
         people = footage.people(rig_now)
-        if len(people) < _LEAST_PEOPLE or not people.seen.any():
+        if len(people) < LEAST_PEOPLE or not people.seen.any():
             raise InputError(
                 f"only {len(people)} people are seen by two cameras at once in the checked frames, but at least"
                 " 10 are needed; film people where views overlap, or run shapepose-fg check-calibration"
@@ -241,7 +239,7 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     }
     notes = []
     for view, camera in enumerate(adjusted.rig.cameras):
-        if counts[view] < _LEAST_PEOPLE:
+        if counts[view] < LEAST_PEOPLE:
             few = f"shares only {counts[view]} people with other cameras, too few"
             notes.append(f"camera {camera.name}: {few}; it is not changed")
             continue

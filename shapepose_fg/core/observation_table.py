@@ -156,9 +156,9 @@ class ObservationTable(Table):
         return cls.without_rows(joint_names=np.array(joint_names, str), view_names=np.array(view_names, str))
 
     @classmethod
-    def concatenate(cls, parts: Sequence["ObservationTable"]) -> "ObservationTable":
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
         """The rows of `parts`, one after the other; ValueError if joints or views differ."""
-        return ObservationTable.joined(parts) if len(parts) > 0 else cls.empty()
+        return super().concatenate(parts) if len(parts) > 0 else cls.empty()
 
     def observations(self, initial: Array, time_s: Array) -> Observations:
         """The rows as observations, gated detections included, for solving them again.

@@ -1,6 +1,5 @@
 """Detections assigned to people: the output of stage I and of the tracker, and the input of stage II."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -63,11 +62,6 @@ class Observations(Table):
     def seen(self) -> Mask:
         """(N, J, V) whether there is an observation."""
         return self.confidence > 0
-
-    @classmethod
-    def concatenate(cls, parts: Sequence["Observations"]) -> "Observations":
-        """The rows of several parts, one after the other."""
-        return Observations.joined(parts)
 
 
 def rows_in(before: Observations, now: Observations) -> Index:

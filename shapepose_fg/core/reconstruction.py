@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,12 +135,12 @@ class Reconstruction(Table):
                 raise ValueError(f"observations must have the same {name} as the people (see `relabelled`)")
 
     @classmethod
-    def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> "Reconstruction":
+    def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> Self:
         """A result without people."""
         return cls.without_rows(joint_names=np.array(joint_names))
 
     @classmethod
-    def concatenate(cls, parts: Sequence["Reconstruction"]) -> "Reconstruction":
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
         """The rows of `parts`, one after the other.
 
         `run` is merged by `merged_run`: ValueError if configurations differ, or if two parts cover
@@ -155,7 +155,7 @@ class Reconstruction(Table):
         # A part without rows and without a run does not affect the merged run.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
         rig = parts[0].rig if all(part.rig is parts[0].rig for part in parts) else None
-        return Reconstruction.joined(parts, observations=together, shapes=None, rig=rig, run=merged_run(runs))
+        return super().concatenate(parts, observations=together, shapes=None, rig=rig, run=merged_run(runs))
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows selected by `index`: a mask (N,) or row numbers."""

@@ -41,9 +41,9 @@ class Rows:
         return changed
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Self]) -> Self:
+    def concatenate(cls, parts: Sequence[Self], **others: Any) -> Self:
         """The rows of one or more parts, one after the other; fields that apply to all rows are
-        those of the first part.
+        `others`, or those of the first part.
         """
         joined = {
             name: type(value).concatenate([getattr(part, name) for part in parts])
@@ -51,4 +51,4 @@ class Rows:
             else np.concatenate([getattr(part, name) for part in parts])
             for name, value in parts[0]._columns().items()
         }
-        return replace(cast(Any, parts[0]), **joined)
+        return replace(cast(Any, parts[0]), **joined, **others)

@@ -75,7 +75,7 @@ class SubjectShapes(Table):
         """
         if other.body != self.body:
             raise ValueError("shapes must be of the same body model")
-        return SubjectShapes.joined([self.rows(~np.isin(self.names, other.names)), other])
+        return SubjectShapes.concatenate([self.rows(~np.isin(self.names, other.names)), other])
 
     def save(self, file: str | Path) -> None:
         """Write the shapes as `.npz`, atomically (docs/conventions.md)."""

@@ -12,8 +12,8 @@ from shapepose_fg.core.repeated_pictures import repeated_views
 
 _OVER_S = 1.0
 """Time over which a camera's distances are averaged, s: a crowd hides people for less."""
-_SILENT_S = 0.5
-"""Time without detections after which a camera is silent, s."""
+SILENT_S = 0.5
+"""Time without detections after which a camera is silent, and is not waited for, s."""
 _NEAREST = 0.25
 """Quantile of the distances between people's joints and detections that measures a camera: other people may be
 hidden from it, and it may see further ones."""
@@ -76,7 +76,7 @@ class CameraWatch:
         there = np.bincount(given.view, minlength=views) > 0
         frozen = repeated_views(before, given, views) if before is not None else np.zeros(views, dtype=bool)
         heard_s = np.where(there, time_s, np.where(np.isinf(self.heard_s), time_s, self.heard_s))
-        silent = time_s - heard_s > _SILENT_S
+        silent = time_s - heard_s > SILENT_S
         state = self._judged()
         state = np.where(silent, CameraState.SILENT, state)
         state = np.where(frozen, CameraState.FROZEN, state)

@@ -14,11 +14,11 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import LEAST_STEP_S
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import read_npz, write_npz
-from shapepose_fg.core.storage.schema import Column
+from shapepose_fg.core.storage.schema import Column, checked_columns
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import CommonClock
@@ -43,6 +43,13 @@ _LEAST_VARIANCE = 1e-12
 """Minimum variance of a position in any direction, m²: smaller ones have no finite inverse."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """Names of the counters in a saved state."""
+_CAMERAS = {
+    "counts": Column(f"{len(_COUNTS)}", _WHOLE, most=MOST_NUMBER),
+    "cameras": Column("4 V"),
+    "clock": Column("2"),
+    "waiting_s": Column("V"),
+}
+"""Arrays of the cameras and of the views that wait for a frame."""
 _COLUMNS = {
     "slots": Column("T 8", _WHOLE),
     "times": Column("T 2"),
@@ -141,9 +148,7 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
     """
     J, B = nobody.views.shape[1], nobody.count.shape[1]
     sizes = {"V": len(rig), "J": J, "B": B, "S": nobody.tracks.joints.mean.shape[2]}
-    found = {name: column.checked(name, arrays[name], sizes) for name, column in _COLUMNS.items()}
-    for name, column in _COLUMNS.items():
-        column.check_range(name, found[name])
+    found = checked_columns(_COLUMNS, arrays, sizes)
     counts = found["slots"]
     if (counts < 0).any() or any(
         counts[:, n].sum() != sizes.get(letter, 0) for n, letter in zip((4, 5, 6, 7), "ADEG", strict=True)
@@ -253,8 +258,7 @@ def write_state(path: Path, arrays: Mapping[str, NDArray[Any]], setup: str) -> N
 
 def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState:
     """Read a state. Raises InputError if the file is not a state, or of another set-up."""
-    names = ["counts", "cameras", "clock", "waiting_s"]
-    names += [f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS]
+    names = [*_CAMERAS, *(f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS)]
     optional = [f"settled.{each}" for each in Reconstruction.ROWS]
     optional += [f"pose.{each}" for each in ("carrier", *_POSES)]
     arrays = read_npz(path, ("format", "setup", *_COLUMNS, *names, *optional), _CURE)
@@ -276,11 +280,8 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
 def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -> LiveState:
     """The state from its arrays. Raises ValueError if they do not fit."""
     V, skeleton = len(rig), following.tracker.skeleton
-    shapes = {"counts": (len(_COUNTS),), "cameras": (4, V), "clock": (2,), "waiting_s": (V,)}
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape or arrays[name].dtype.kind not in "if":
-            raise ValueError(f"{name} must be {shape}, got {arrays[name].shape}")
-    apart_m, heard_s, code, last_s = arrays["cameras"]
+    told = checked_columns(_CAMERAS, arrays, {"V": V})
+    apart_m, heard_s, code, last_s = told["cameras"]
     seen = {}
     for name in ("waiting", "before"):
         sizes, own = dict[str, int](), {each: arrays[f"{name}.{each}"] for each in _DETECTIONS}
@@ -288,26 +289,24 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
         seen[name] = Detections(**own)
         _check(seen[name], np.zeros((0, len(skeleton), V), dtype=np.int64), V, len(skeleton))
     waiting = {
-        view: (seen["waiting"].only(seen["waiting"].view == view), float(arrays["waiting_s"][view]))
-        for view in np.flatnonzero(np.isfinite(arrays["waiting_s"])).tolist()
+        view: (seen["waiting"].only(seen["waiting"].view == view), float(told["waiting_s"][view]))
+        for view in np.flatnonzero(np.isfinite(told["waiting_s"])).tolist()
     }
-    done_s, period_s = arrays["clock"].tolist()
-    late = np.concatenate([arrays["waiting_s"], last_s, heard_s, [done_s]])
+    done_s, period_s = told["clock"].tolist()
+    late = np.concatenate([told["waiting_s"], last_s, heard_s, [done_s]])
     if (np.abs(late[np.isfinite(late)]) > MOST_S).any() or np.isposinf(late).any() or np.isnan(last_s).any():
         raise ValueError(f"times must be at most {MOST_S:g} s")
     if np.isnan(done_s) or not SHORTEST_S <= period_s <= 2 * MOST_S:
         raise ValueError(f"clock must hold a time, and a period of {SHORTEST_S:g} s at least")
     if not (np.isnan(apart_m) | ((apart_m >= 0) & (apart_m < _MOST_APART_M))).all() or np.isnan(heard_s).any():
         raise ValueError("cameras must hold distances, and times")
-    if (arrays["counts"] < 0).any():
-        raise ValueError("counts must not be negative")
     if not np.isin(code, list(CameraState)).all():
         raise ValueError("cameras must have states that there are")
     watch = CameraWatch(apart_m, heard_s, code.astype(np.int64))
     rig = _carried(arrays, rig)
-    views = ViewsInStep(V, waiting, last_s, *arrays["clock"].tolist())
+    views = ViewsInStep(V, waiting, last_s, *told["clock"].tolist())
     state = LiveState(rig, watch, views, CommonClock(V), following.nobody)
-    for name, value in zip(_COUNTS, arrays["counts"].tolist(), strict=True):
+    for name, value in zip(_COUNTS, told["counts"].tolist(), strict=True):
         setattr(state, name, int(value))
     if "settled.frame" in arrays:
         state.settled.append(_rows(arrays, "settled", skeleton))

@@ -8,10 +8,9 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.live.cameras import SILENT_S
 from shapepose_fg.live.clock import JUMP_S
 
-_HEARD_S = 0.5
-"""Time since the last view of a camera, s, after which frames no longer wait for it."""
 _ASSUMED_S = 1 / 30
 """Assumed time between a camera's pictures until two have come, s."""
 _FRESH = 0.05
@@ -66,7 +65,7 @@ class ViewsInStep:
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
         # The first frame waits for every camera, until one comes again.
-        awaited = (time_s - self.heard_s <= _HEARD_S) | np.isinf(self.done_s)
+        awaited = (time_s - self.heard_s <= SILENT_S) | np.isinf(self.done_s)
         alive = np.flatnonzero(awaited).tolist()
         return found + (self.rest() if all(each in self.waiting for each in alive) else [])
 

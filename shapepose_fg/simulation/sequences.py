@@ -321,7 +321,7 @@ def sequence(
         parts.append(together(betas, room.performed, room.frames))
         clips.append(tuple(room.names))
         starts.append(starts[-1] + room.frames)
-    return Scene(rig, body, Motion.joined(parts), fps, tuple(starts[1:-1]), tuple(clips))
+    return Scene(rig, body, Motion.concatenate(parts), fps, tuple(starts[1:-1]), tuple(clips))
 
 
 def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:

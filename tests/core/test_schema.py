@@ -53,12 +53,12 @@ def test_rows_are_picked_and_joined():
     whole = walk(4)
     assert Walk.ROWS == ["frame", "place", "gait"] and Walk.shared() == ["feet"]
     parts = [whole.rows(whole.frame < 1), whole.rows(np.array([3, 1]))]
-    joined = Walk.joined(parts)
+    joined = Walk.concatenate(parts)
     assert joined.frame.tolist() == [0, 3, 1]
     np.testing.assert_array_equal(joined.place, whole.place[[0, 3, 1]])
     assert len(Walk.without_rows(feet=np.array(["left"]))) == 0
     with pytest.raises(ValueError, match="parts must have the same feet"):
-        Walk.joined([whole, Walk(whole.frame, np.array(["a", "b"]), whole.place)])
+        Walk.concatenate([whole, Walk(whole.frame, np.array(["a", "b"]), whole.place)])
 
 
 def saved(tmp_path, columns) -> SavedTable:

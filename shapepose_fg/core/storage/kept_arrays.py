@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.storage.files import LARGE, inside, open_regular, write_content
-from shapepose_fg.core.storage.schema import Column
+from shapepose_fg.core.storage.schema import Column, checked_columns
 
 Arrays = Mapping[str, NDArray[Any]]
 """Arrays of numbers by name."""
@@ -74,10 +74,7 @@ class KeptArrays:
     def columns(self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
         """Arrays of a set; InputError if one does not match its column, or these `sizes`."""
         with naming(self.place(name), ANEW):
-            found = {key: column.checked(key, self.array(name, key), sizes) for key, column in columns.items()}
-            for key, column in columns.items():
-                column.check_range(key, found[key])
-            return found
+            return checked_columns(columns, {key: self.array(name, key) for key in columns}, sizes)
 
 
 InMemory = KeptArrays

@@ -21,13 +21,11 @@ from shapepose_fg.core.storage.files import PIECE, open_regular
 
 _LEVEL = 1
 """Compression level: half the time of zlib's default 6, for files that are 3 % larger."""
-_SMALL_BYTES = 2**28
+SMALL_BYTES = 2**28
 """Maximum total size of the arrays of a small file, bytes, independent of their compression: NaN
 compresses 1000 to 1."""
 MOST_PACKED = 50
 """Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
-_BLOCK_BYTES, _PASSED_BYTES = 2**22, 2**18
-"""Number of bytes of rows that are decompressed at a time, and that are skipped at a time."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
@@ -174,7 +172,7 @@ class NpzFile(ExitStack):
                 return array
             if index[-1] >= member.shape[0]:
                 raise ValueError(f"{name} has {member.shape[0]} rows, but row {index[-1]} was requested")
-            step = max(1, _BLOCK_BYTES // max(member.row_bytes, 1))
+            step = max(1, PIECE // max(member.row_bytes, 1))
             for first in range(int(index[0]), int(index[-1]) + 1, step):
                 count = min(step, int(index[-1]) + 1 - first)
                 begin, end = np.searchsorted(index, (first, first + count))
@@ -232,7 +230,7 @@ def _go_to(stream: IO[bytes], place: int) -> None:
     if place < stream.tell():
         stream.seek(0)
     while stream.tell() < place:
-        if len(stream.read(min(_PASSED_BYTES, place - stream.tell()))) == 0:
+        if len(stream.read(min(PIECE, place - stream.tell()))) == 0:
             raise ValueError("the file ends too early")
 
 
@@ -248,7 +246,7 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
     if len({member.filename for member in members}) < len(members):
         raise ValueError("an array occurs twice")
     total = sum(member.file_size for member in members)
-    if total > max(_SMALL_BYTES, MOST_PACKED * size):
+    if total > max(SMALL_BYTES, MOST_PACKED * size):
         raise ValueError(f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file")
 
 

@@ -4,8 +4,8 @@ table is created.
 For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self, cast, get_type_hints
@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Self, cast, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.storage.npz import Pieces
 
 _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
@@ -97,6 +98,16 @@ class Column:
             raise ValueError(f"{name} must be at most {self.most:g} or unknown (NaN), got {largest:g}")
 
 
+def checked_columns(
+    columns: Mapping[str, Column], arrays: Mapping[str, Any], sizes: dict[str, int]
+) -> dict[str, NDArray[Any]]:
+    """Arrays as their `columns` say, and in range; ValueError that names the first that is not."""
+    found = {name: column.checked(name, arrays[name], sizes) for name, column in columns.items()}
+    for name, column in columns.items():
+        column.check_range(name, found[name])
+    return found
+
+
 @cache
 def columns_of(kind: type) -> dict[str, Column]:
     """The columns of a table class, by the names of its fields, in their order."""
@@ -105,7 +116,7 @@ def columns_of(kind: type) -> dict[str, Column]:
     return {name: mark for name, found in marks.items() for mark in found if isinstance(mark, Column)}
 
 
-class Table:
+class Table(Rows):
     """Base of frozen dataclasses whose fields are arrays, each annotated with its `Column`.
 
     ValueError that names the column if its shape or type does not match.
@@ -125,8 +136,8 @@ class Table:
         if len(cls.ROWS) == 0:
             cls.ROWS = [name for name, column in columns_of(cls).items() if column.has_rows]
 
-    def __len__(self) -> int:
-        return len(getattr(self, self.ROWS[0]))
+    def _columns(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.ROWS}
 
     @classmethod
     def shared(cls) -> list[str]:
@@ -144,7 +155,7 @@ class Table:
         return cls(**values, **rows)
 
     @classmethod
-    def joined(cls, parts: Sequence[Self], **others: Any) -> Self:
+    def concatenate(cls, parts: Sequence[Self], **others: Any) -> Self:
         """Concatenate the rows of one or more parts; shared columns, and `others`, are taken
         unchanged.
 
@@ -154,12 +165,7 @@ class Table:
             for name in cls.shared():
                 if not np.array_equal(getattr(part, name), getattr(parts[0], name)):
                     raise ValueError(f"parts must have the same {name}")
-        rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in cls.ROWS}
-        return replace(cast(Any, parts[0]), **rows, **others)
-
-    def rows(self, index: Any) -> Self:
-        """The rows selected by `index`: a mask (N,) or row numbers."""
-        return replace(cast(Any, self), **{name: getattr(self, name)[index] for name in self.ROWS})
+        return super().concatenate(parts, **others)
 
     def check_ranges(self) -> None:
         """ValueError for impossible values, such as negative frames, or joints thousands of

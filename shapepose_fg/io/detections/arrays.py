@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import SMALL, open_regular
-from shapepose_fg.core.storage.npz import MOST_PACKED, read_npy_header
+from shapepose_fg.core.storage.npz import MOST_PACKED, SMALL_BYTES, read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.csv_people import BLAZEPOSE, body_parts, taken
@@ -23,10 +23,8 @@ _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Maximum number of values in a file: as many as one hour of four cameras with MediaPipe's 553
 points at 30 Hz."""
-_SMALL_BYTES = 2**27
-"""Total size of a file's arrays, bytes, up to which the compression ratio is not limited."""
 _MOST_CAMERAS = 1000
-_MOST_NAMES, _LONGEST_NAME, _LARGEST_HEAP = 1000, 1000, 2**20
+_MOST_NAMES, _LONGEST_NAME = 1000, 1000
 _TABLE = "df_with_missing/table"
 """Path of the table in files of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
@@ -257,7 +255,7 @@ def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes
     stream.seek(address)
     head = stream.read(16)
     size = int.from_bytes(head[8:], "little")
-    if head[:4] != b"GCOL" or not 16 <= size <= _LARGEST_HEAP or length > _LONGEST_NAME:
+    if head[:4] != b"GCOL" or not 16 <= size <= SMALL or length > _LONGEST_NAME:
         raise ValueError("the position of a text is invalid")
     heap, at = stream.read(size - 16), 0
     while at + 16 <= len(heap):
@@ -286,5 +284,5 @@ def _numbers(path: Path, dataset: Any) -> Array:
 
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
     """InputError if the file is too small for this number of values."""
-    if 8 * count > max(_SMALL_BYTES, MOST_PACKED * path.stat().st_size):
+    if 8 * count > max(SMALL_BYTES, MOST_PACKED * path.stat().st_size):
         raise InputError(f"{path}: its arrays {shape} are too large; export a part of the recording")

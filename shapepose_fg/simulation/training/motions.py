@@ -33,10 +33,6 @@ VALIDATION_SUBJECTS = ("06", "12", "127", "140")
 UNKNOWN_SUBJECT = "?"
 """Subject of a recording without one: used for training only."""
 
-ACKNOWLEDGEMENT = (
-    "The data used in this project was obtained from mocap.cs.cmu.edu. "
-    "The database was created with funding from NSF EIA-0196217."
-)
 MIRROR_JOINTS = tuple(place - BODY_POINTS.index(SMPL_24[0]) for place in MIRROR[-len(SMPL_24) :])
 """(24,) index of each SMPL joint's partner on the other side of the body; its own for joints in the middle."""
 
