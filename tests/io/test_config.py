@@ -96,7 +96,7 @@ def test_printed_settings_carry_their_docstrings():
             "[gate\ngate_px = 3",
             "cannot be read as TOML (Expected ']' at the end of a table declaration (at line 1, column 6)",
         ),
-        ("seed = 1\nseed = 2", "cannot be read as TOML: Cannot overwrite a value"),
+        ("seed = 1\nseed = 2", "cannot be read as TOML (Cannot overwrite a value"),
     ],
 )
 def test_bad_settings(tmp_path, text, sentence):
