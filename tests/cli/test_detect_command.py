@@ -219,7 +219,7 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     assert run(*words, "--frames", "10:16") == 0
     said = " ".join((told := capsys.readouterr()).err.split())
     for name in ("cam01", "cam02"):
-        assert f"camera {name}: the pictures have 1080 x 1920 pixels, but the calibration is for 1088 x 1920" in said
+        assert f"camera {name}: the pictures have 1080 x 1920 pixels, but the calibration is for 1088" in said
     assert "-14°" in told.out and "26°" in told.out
     words = ("--calibration", calibration, "--detections", found, "--timestamps", found / "times.csv")
     assert command("reconstruct", *words, "--output", results) == 0
