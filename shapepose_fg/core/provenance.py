@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.storage.files import files_below, open_regular
 
 _PACKAGES = {
     "shapepose-fg": ("shapepose-fg",),
@@ -77,17 +77,13 @@ def program_digest() -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()
 
 
-def _files(folder: Path, endings: tuple[str, ...]) -> Iterator[Path]:
-    return (file for file in folder.rglob("*") if file.suffix in endings)
-
-
 def _states(paths: Iterable[str | Path | None]) -> Iterator[tuple[str, int]]:
     """Size and modification time, as one number, of files, and of the data files in folders.
 
     Only path and number are kept, because hours of footage are half a million files.
     """
     for path in (Path(path) for path in paths if path is not None):
-        for file in _files(path, _INPUTS) if path.is_dir() else (path,):
+        for file in files_below(path, _INPUTS) if path.is_dir() else (path,):
             with suppress(OSError):
                 state = file.stat()
                 yield str(file), state.st_size << 64 | state.st_mtime_ns
@@ -98,7 +94,7 @@ def _digest(path: Path, endings: tuple[str, ...]) -> str:
     try:
         if path.is_dir():
             whole = hashlib.sha256()
-            for file in sorted(_files(path, endings)):
+            for file in sorted(files_below(path, endings)):
                 whole.update(f"{file.relative_to(path).as_posix()} {_digest(file, endings)}\n".encode())
             return whole.hexdigest()
         with open_regular(path) as stream:

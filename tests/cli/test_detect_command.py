@@ -80,7 +80,7 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
     assert run(*COMMON, "--videos", "videos", "--start", f"{c}=4f") == 0
     said = capsys.readouterr()
     told = " ".join(said.err.split())
-    assert told.count("of the same shape: taken as resized") == 3
+    assert told.count("of the same aspect ratio: they are assumed to be resized") == 3
     assert f"camera {a}: frames without a picture of every camera are left out, 4 at the start" in told
     (command,) = re.findall("next: (.*)", said.out)
     assert command == (
@@ -219,7 +219,7 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     assert run(*words, "--frames", "10:16") == 0
     said = " ".join((told := capsys.readouterr()).err.split())
     for name in ("cam01", "cam02"):
-        assert f"camera {name}: the pictures are 1080 x 1920, the calibration is for 1088 x 1920" in said
+        assert f"camera {name}: the pictures have 1080 x 1920 pixels, but the calibration is for 1088" in said
     assert "-14°" in told.out and "26°" in told.out
     words = ("--calibration", calibration, "--detections", found, "--timestamps", found / "times.csv")
     assert command("reconstruct", *words, "--output", results) == 0

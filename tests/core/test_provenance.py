@@ -62,5 +62,22 @@ def test_what_changes_while_it_is_read_is_refused_and_afterwards_is_not_looked_a
         reading.checksums([camera])
 
 
+def test_folders_that_are_links_are_looked_into_once(tmp_path):
+    """Detections of each camera may lie on another disk; a link may lead back to where it is."""
+    disk, folder = tmp_path / "disk" / "cam1", tmp_path / "pose"
+    disk.mkdir(parents=True)
+    folder.mkdir()
+    (disk / "000.json").write_text("1")
+    (folder / "cam1").symlink_to(disk)
+    (disk / "back").symlink_to(folder)
+    reading = ReadInputs([folder])
+    before = reading.checksums([folder, folder / "cam1"])
+    assert before == checksums([folder, folder / "cam1"])
+    (disk / "000.json").write_text("2")
+    assert checksums([folder])[str(folder)] != before[str(folder)]
+    with pytest.raises(InputError, match=r"000\.json: this file changed while it was read"):
+        reading.checksums([folder])
+
+
 def test_the_program_is_the_same_as_long_as_its_files_are():
     assert program_digest() == program_digest() and len(program_digest()) == 64

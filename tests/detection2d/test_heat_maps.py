@@ -77,7 +77,7 @@ def test_what_is_no_such_network_is_said(tmp_path, backend):
         InputError, match=r"output .* is 1 x 7 x 8 x 8: no known layout.*give another network, or --boxes"
     ):
         HeatMapNetwork.load(other, backend=backend)
-    with pytest.raises(InputError, match=r"makes 1 x 7 x 8 x 8 numbers.* no layout known does"):
+    with pytest.raises(InputError, match=r"output .* is 1 x 7 x 8 x 8: no known layout"):
         HeatMapNetwork.load(other, "tf-pose", backend)
     with pytest.raises(InputError, match="--layout mine: must be one of tf-pose"):
         HeatMapNetwork.load(other, "mine", backend)

@@ -140,7 +140,7 @@ def test_what_nothing_determines_and_what_the_solver_says():
     covariance = np.full((1, 2, 3, 3), np.nan)
     covariance[0, 1] = I3
     assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "undetermined: its system is singular"}
-    here.failure = "the solver left the finite numbers"
+    here.failure = "the solver diverged"
     solution = solved([0.0, np.nan])
     assert reasons(solution, here, covariance) == {0: here.failure}, "who is not placed has no problem"
 

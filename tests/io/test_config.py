@@ -94,9 +94,9 @@ def test_printed_settings_carry_their_docstrings():
         ("kernel = 'welsch'", "kernel must be 'huber' or 'cauchy', got text 'welsch'"),
         (
             "[gate\ngate_px = 3",
-            "this is not TOML: Expected ']' at the end of a table declaration (at line 1, column 6)",
+            "cannot be read as TOML (Expected ']' at the end of a table declaration (at line 1, column 6)",
         ),
-        ("seed = 1\nseed = 2", "this is not TOML: Cannot overwrite a value"),
+        ("seed = 1\nseed = 2", "cannot be read as TOML (Cannot overwrite a value"),
     ],
 )
 def test_bad_settings(tmp_path, text, sentence):
@@ -125,7 +125,7 @@ def test_the_pipelines_own_settings(tmp_path):
 def test_what_took_the_place_of_old_settings_is_said(tmp_path, old):
     (tmp_path / "old.toml").write_text(f"[{old}]\ngate_m = 0.2\n")
     with pytest.raises(
-        InputError, match=f"{old} is no table any more: .*; `shapepose-fg config` prints the defaults"
+        InputError, match=f"{old} is not a table any more: .*; `shapepose-fg config` prints the defaults"
     ):
         read_config(tmp_path / "old.toml", PipelineConfig)
 

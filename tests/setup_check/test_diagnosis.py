@@ -314,9 +314,7 @@ def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part)
     report = check_setup(look_at(room, people * part), room)
     assert report.findings == () and report.stature_m == pytest.approx(1.7 * part, rel=0.12)
     assert len(report.notes) == 1
-    assert (
-        "tall, as children are; if they are adults" in report.notes[0] and f"{part:.1f} times" in report.notes[0]
-    )
+    assert "m, as of children; if they are adults" in report.notes[0] and f"{part:.1f} times" in report.notes[0]
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ WRONG = {
     "elbow and wrist": ([("RElbow", "RWrist")], "RElbow and RWrist appear to be exchanged"),
     "many": (
         [("RElbow", "LKnee"), ("LWrist", "RHip"), ("Nose", "LAnkle"), ("RShoulder", "LHip"), ("RWrist", "LElbow")],
-        "in another order than they are read in",
+        "the joints are in another order",
     ),
 }
 

@@ -31,7 +31,7 @@ from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.terminal import note, use_any_streams
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
-from shapepose_fg.core.storage.files import inside, open_regular
+from shapepose_fg.core.storage.files import files_below, inside, open_regular
 from shapepose_fg.core.storage.output_folder import prepare_output
 from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detections.reading import find_places
@@ -294,5 +294,5 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
         )
     if (folder / PEOPLE).exists() and not begun:
         raise InputError(f"{folder}: there is a finished result; move it, or give another --output")
-    files = (file for path in places for file in (path.rglob("*") if path.is_dir() else (path,)))
+    files = (file for path in places for file in (files_below(path) if path.is_dir() else (path,)))
     return sum(file.stat().st_size for file in files if file.is_file())

@@ -85,6 +85,16 @@ def inside(folder: Path, name: str) -> Path:
     return folder / name
 
 
+def files_below(folder: Path, suffixes: tuple[str, ...] | None = None) -> Iterator[Path]:
+    """Files in a folder and its subfolders, with one of the `suffixes`; links to folders are followed."""
+    entered = {folder.resolve()}
+    for place, folders, names in os.walk(folder, followlinks=True):
+        real = {name: Path(place, name).resolve() for name in folders}
+        folders[:] = [name for name in folders if real[name] not in entered]
+        entered.update(real.values())
+        yield from (Path(place, name) for name in names if suffixes is None or Path(name).suffix in suffixes)
+
+
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
     """Content of the file at `path`. Raises InputError as `open_regular` does, also if it has more
     than `most` bytes.

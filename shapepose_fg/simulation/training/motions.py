@@ -16,6 +16,7 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.storage.files import files_below
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
@@ -128,7 +129,7 @@ def load_motions(path: str | Path) -> Motions:
     """
     path = Path(path)
     if path.is_dir():
-        files = [file for file in sorted(path.rglob("*.npz")) if not file.name.endswith(_NOT_MOTIONS)]
+        files = [file for file in sorted(files_below(path, (".npz",))) if not file.name.endswith(_NOT_MOTIONS)]
         recordings = [_read_amass(file) for file in files]
     else:
         mocap = Mocap.load(path)
