@@ -1,4 +1,4 @@
-"""Fit the parameters of joint covariances (`estimation/calibration.py`) to the errors in simulated
+"""Fit the parameters of joint covariances (`estimation/covariance_calibration.py`) to the errors in simulated
 recordings.
 
     python scripts/fit_covariances.py --mocap ../shared/data/cmu_mocap/cmu_smpl24.npz --output calibration.json
@@ -25,7 +25,7 @@ import torch
 
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.calibration import WEIGHTS, Calibration, Clues
+from shapepose_fg.estimation.covariance_calibration import WEIGHTS, Calibration, CovarianceFeatures
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.pipeline import reconstruct
@@ -81,7 +81,7 @@ def mean_law(laws: list[NoiseLaw]) -> dict:
 
 def errors(
     name: str, split: Split, seed: int, cameras: int, mocap: Mocap, laws: list[NoiseLaw]
-) -> Iterator[tuple[Clues, np.ndarray]]:
+) -> Iterator[tuple[CovarianceFeatures, np.ndarray]]:
     """For each window of a recording, the features of its joints, and their errors (N, J, 3),
     metres; NaN for false positives. Its noise law is appended to `laws`.
     """
@@ -103,7 +103,7 @@ def errors(
         yield clues, clues.joints - true
 
 
-def fitted(found: list[tuple[Clues, np.ndarray]]) -> dict:
+def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
     """The fitted parameters, as the content of the output file."""
     names = BODY_25.joints
     group = np.array(

@@ -16,7 +16,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.setup_check.biases import COMMON
 from shapepose_fg.setup_check.evidence import Look, gather
-from shapepose_fg.setup_check.small import Problem
+from shapepose_fg.setup_check.small_errors import Problem
 
 LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 RATIOS = (0.3, 1.0, 3.0)

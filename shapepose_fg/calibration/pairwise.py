@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from shapepose_fg.calibration.scanning import normals
+from shapepose_fg.calibration.offset_scan import normals
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views

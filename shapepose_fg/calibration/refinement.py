@@ -20,7 +20,7 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.small import Problem
+from shapepose_fg.setup_check.small_errors import Problem
 
 _ROUNDS = 4
 """Number of rounds, each with people associated by the cameras of the round before."""

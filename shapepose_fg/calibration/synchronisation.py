@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.calibration.in_space import InSpace
+from shapepose_fg.calibration.offset_scan import Scan, chosen
+from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
-from shapepose_fg.calibration.scanning import Scan, chosen
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views

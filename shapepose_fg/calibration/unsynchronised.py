@@ -8,7 +8,7 @@ import numpy as np
 
 from shapepose_fg.calibration.from_people import Calibrated, Undetermined, calibrate, own_tracks
 from shapepose_fg.calibration.levelling import Measured
-from shapepose_fg.calibration.rise_and_fall import offsets_without_poses
+from shapepose_fg.calibration.offsets_from_heights import offsets_without_poses
 from shapepose_fg.calibration.synchronisation import WHOLE_S, Synchronised, offsets
 from shapepose_fg.calibration.tracks import next_of, on_one_clock
 from shapepose_fg.core.camera import Rig

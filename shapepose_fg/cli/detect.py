@@ -120,7 +120,7 @@ def detect(
     if pictures.videos is None or output is None:
         missing = "--videos" if pictures.videos is None else "--output"
         raise InputError(f"{missing}: missing; give it, or --project with the folder of a Pose2Sim project")
-    from shapepose_fg.core.moments import align, own_frames
+    from shapepose_fg.core.frame_sets import align, own_frames
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
     from shapepose_fg.io.footage.placement import placements_of

@@ -39,7 +39,7 @@ class Observations(Table):
     """(N, J, V) probability that the observation belongs to the other side of the body; 0 by
     default."""
     evidence: Annotated[Array, Column("N", missing=np.nan)] = _LATER
-    """(N,) evidence for the existence of the person: `own_evidence` of `tracking/presence.py`, or a
+    """(N,) evidence for the existence of the person: `own_evidence` of `tracking/track_selection.py`, or a
     probability for frame-by-frame results; NaN by default."""
 
     def __post_init__(self) -> None:

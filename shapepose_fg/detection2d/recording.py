@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.moments import Moments
+from shapepose_fg.core.frame_sets import Moments
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.opening import Network

@@ -23,7 +23,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.carried_error import reported_with_poses
+from shapepose_fg.estimation.camera_pose_uncertainty import reported_with_poses
 from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.trajectory_graph import Mounted, dilution

@@ -16,10 +16,10 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import symmetric_root
-from shapepose_fg.core.pieces import ROBUST
+from shapepose_fg.core.kernel_geometry import ROBUST
 from shapepose_fg.estimation.in_time import spanned
 from shapepose_fg.estimation.kernels import ready, solve_chains
-from shapepose_fg.estimation.motion_model import Lasting
+from shapepose_fg.estimation.motion_model import CorrelatedError
 
 _SETTLED_M = 5e-4
 """Convergence: maximum motion of a joint in a step, metres."""
@@ -70,7 +70,7 @@ class Said:
     """The estimates in information form, T rows."""
     scale: float
     """Factor on the covariances."""
-    errors: Lasting
+    errors: CorrelatedError
     """Temporal correlation of the error."""
     where: Mask
     """(T, J) where the estimate is used, with an offset variable."""

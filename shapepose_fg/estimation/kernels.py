@@ -10,7 +10,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.pieces import ROBUST, add_view, project, robust_weight, triangulated
+from shapepose_fg.core.kernel_geometry import ROBUST, add_view, project, robust_weight, triangulated
 
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _SINGULAR = 1e-11

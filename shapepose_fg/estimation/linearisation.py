@@ -13,8 +13,8 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.kernel_geometry import ROBUST
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.pieces import ROBUST
 from shapepose_fg.estimation.kernels import complete, look, ready
 
 MIN_DEPTH_M = 0.2

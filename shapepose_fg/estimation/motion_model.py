@@ -43,7 +43,7 @@ class MotionConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Lasting:
+class CorrelatedError:
     """Temporal correlation of the error of estimates of a joint."""
 
     white_share: float
@@ -73,9 +73,9 @@ class MotionModel:
     psd_lost: Array
     """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum is
     the mean over all speeds."""
-    views: Lasting
+    views: CorrelatedError
     """Error of estimates of a joint from all views of one frame."""
-    body: Lasting
+    body: CorrelatedError
     """Error of estimates of a joint from the body, without the joint's own views."""
     around_s: float = 0.5
     """Time around frames with a lost joint in which the difference between joint and body is
@@ -126,7 +126,7 @@ class MotionModel:
             if any(len(numbers) != 3 for numbers in known.values()):
                 raise ValueError("a joint must have 3 densities")
             views, body = (
-                Lasting(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
+                CorrelatedError(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
                 for name in ("views", "body")
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

@@ -31,7 +31,7 @@ from factors import (
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.carried_error import POSES_LAST_S
+from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
 
 CameraFactors = Callable[["TrajectoryGraph", NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]

@@ -34,13 +34,13 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.asynchronous_views import leads
 from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import motion_of, near_in_time, spanned
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.out_of_step import leads
 
 _OF_VIEWS, _OF_BODY = 0, 1
 """Numbers of the sources of estimates, for the keys of their offsets."""
@@ -58,7 +58,7 @@ class UserFactor:
 
 
 @dataclass
-class Ties:
+class CoupledGraph:
     """People of a window, and user variables, that user factors couple, and that are solved as one
     graph.
 
@@ -82,7 +82,7 @@ class Ties:
         apart = [each for each in self.parts if not each & joined]
         self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]
 
-    def take_in(self, other: "Ties") -> None:
+    def take_in(self, other: "CoupledGraph") -> None:
         """Merge with the coupling of other people, who share this object from now on."""
         if other is self:
             return
@@ -171,7 +171,7 @@ class WindowGraph:
         use them to choose what their factors connect."""
         self.people: list[WindowGraph] = [self]
         """All people in the window, including this one; for single frames, in the frame."""
-        self.ties = Ties([self])
+        self.ties = CoupledGraph([self])
         """The people coupled to this one by user factors, and these factors."""
         self.touched: Mask = np.zeros(J, dtype=bool)
         """(J,) joints with a user factor."""
@@ -273,7 +273,7 @@ class WindowGraph:
                 new.erase(key)
         self.ties.start.insert(new)
 
-    def _holder(self, key: int) -> Ties | None:
+    def _holder(self, key: int) -> CoupledGraph | None:
         """The coupling that contains a user variable."""
         return next((each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None)
 

@@ -19,9 +19,9 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.estimation.asynchronous_views import carried_to_frames
 from shapepose_fg.estimation.minimise import undetermined_key
-from shapepose_fg.estimation.motion_model import Lasting
-from shapepose_fg.estimation.out_of_step import carried_to_frames
+from shapepose_fg.estimation.motion_model import CorrelatedError
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 LEAST_M = 1e-4
@@ -123,7 +123,7 @@ class PersonGraph:
     """(T, J, 3) joints of the solver, metres."""
     solved_covariance: Array
     """(T, J, 3, 3) covariance of `solved`: marginals of the solver's graph, m²."""
-    lasting: Lasting
+    lasting: CorrelatedError
     """Temporal correlation of the error that is in the report but not in the solver's graph."""
     body: JointTargets
     """(T, J) constraints from the body without each joint's own views; none where it is

@@ -12,8 +12,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.frame_sets import CameraClock, Moments, align
 from shapepose_fg.core.frame_times import MOST_FPS, FrameTimes
-from shapepose_fg.core.moments import CameraClock, Moments, align
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.number_table import MISSING, read_number_table
 from shapepose_fg.io.validation import is_number

@@ -16,12 +16,12 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.proposal.nearby import Sight
-from shapepose_fg.tracking.following import observed
-from shapepose_fg.tracking.presence import APPEARS_S, LEAST_S, own_evidence, weighed
+from shapepose_fg.tracking.global_hypotheses import PLACED_M
+from shapepose_fg.tracking.identities import observed
 from shapepose_fg.tracking.sides import hold_now
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
+from shapepose_fg.tracking.track_selection import APPEARS_S, LEAST_S, own_evidence, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.worlds import PLACED_M
 
 ON_TRIAL = -1
 """The identity of a track with insufficient evidence."""

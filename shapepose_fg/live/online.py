@@ -22,13 +22,13 @@ from shapepose_fg.core.frame_times import LEAST_STEP_S
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
-from shapepose_fg.estimation.doubt import mirrored_spread
+from shapepose_fg.estimation.association_uncertainty import mirrored_spread
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import JUMP_S, CommonClock
 from shapepose_fg.live.filtering import Filter
-from shapepose_fg.live.now import Newest, fed_back, of_poses, people_at
+from shapepose_fg.live.newest_frame import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Refinery, Slot
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
 from shapepose_fg.live.views import MOST_S, ViewsInStep, with_pose

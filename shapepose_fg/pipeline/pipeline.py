@@ -38,8 +38,8 @@ from shapepose_fg.pipeline.setup import find_people as find_people
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.trajectories import about, keep, kept_rig, refine, unrefined
 from shapepose_fg.proposal.thinning import ThinnedFrames
-from shapepose_fg.tracking.presence import probability
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
+from shapepose_fg.tracking.track_selection import probability
 
 
 def reconstruct(

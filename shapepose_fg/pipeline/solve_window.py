@@ -14,14 +14,14 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations, rows_in
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.asynchronous_views import carried_to_frames, velocities_of, widened
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.joint_step import solve_between, solve_joints
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.out_of_step import carried_to_frames, velocities_of, widened
-from shapepose_fg.estimation.outcome import outcome
+from shapepose_fg.estimation.reported_covariance import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
 from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph, functions_of

@@ -21,7 +21,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.pipeline.keyframes import STRAY_M, strays_m
 from shapepose_fg.proposal.thinning import thinned
-from shapepose_fg.tracking.following import Decided, FollowState, alone, finish, follow
+from shapepose_fg.tracking.identities import Decided, FollowState, alone, finish, follow
 from shapepose_fg.tracking.tracker import Tracker
 
 

@@ -16,7 +16,7 @@ from shapepose_fg.core.bounds import Count, Metres, Settings
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.pieces import project, solved
+from shapepose_fg.core.kernel_geometry import project, solved
 
 _ANYWHERE_M = 10.0
 """Gate that any pair of rays in a room passes, m."""

@@ -16,7 +16,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.pieces import project
+from shapepose_fg.core.kernel_geometry import project
 from shapepose_fg.core.skeleton import Skeleton
 
 LEAST_AFFINITY = 0.3

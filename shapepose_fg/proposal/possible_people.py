@@ -9,7 +9,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.pieces import solved
+from shapepose_fg.core.kernel_geometry import solved
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, nearby

@@ -18,15 +18,15 @@ from shapepose_fg.core.trust import BELIEVED, Trust
 from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
-from shapepose_fg.setup_check.belief import trust_of
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
+from shapepose_fg.setup_check.exclusion import trust_of
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.matching import same_frame
 from shapepose_fg.setup_check.over_time import parted
-from shapepose_fg.setup_check.small import Problem
+from shapepose_fg.setup_check.small_errors import Problem
 
 _SAME_PX = 0.6
 """Maximum distance, px, between detections of one picture stored with pixel accuracy."""

@@ -11,7 +11,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.pieces import add_view, project, solved, triangulated
+from shapepose_fg.core.kernel_geometry import add_view, project, solved, triangulated
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.fit import Others, match, possible_matches

@@ -24,7 +24,7 @@ from shapepose_fg.setup_check.matching import (
     same_frame,
 )
 from shapepose_fg.setup_check.over_time import stories
-from shapepose_fg.setup_check.small import ONE, Problem, named, probable
+from shapepose_fg.setup_check.small_errors import ONE, Problem, named, probable
 
 _AGREEMENT, _LEAST_GAIN, _LIKELY_LAG, _SMALL = 0.12, 0.004, 12.0, 8
 """Criteria for a time offset: sufficient agreement, and a gain of 7 mm on average; or the third as

@@ -13,7 +13,7 @@ from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
-from shapepose_fg.tracking.following import core_distance
+from shapepose_fg.tracking.identities import core_distance
 from shapepose_fg.tracking.view_assignment import Predicted, assign_with_probability
 
 LEAST_PROBABILITY = 0.6

@@ -1,7 +1,7 @@
 """Tracking from frame to frame: prediction, assignment of detections in all views, Kalman update.
 
 The detections around a track's predicted joints are its observations, whether or not stage I would
-find the person in this frame. Several worlds are tracked at once (`worlds.py`): a world is a global
+find the person in this frame. Several worlds are tracked at once (`global_hypotheses.py`): a world is a global
 hypothesis, a set of tracks that share no detection; worlds are independent of each other.
 """
 

@@ -18,7 +18,7 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.evidence import Look, gather
-from shapepose_fg.setup_check.small import Problem
+from shapepose_fg.setup_check.small_errors import Problem
 from tests.calibration.conftest import FPS, disturbed, off_by
 from tests.setup_check.spoiled_setups import biased, lasting
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.calibration import synchronisation
-from shapepose_fg.calibration.in_space import InSpace
+from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.synchronisation import synchronise
 from shapepose_fg.calibration.tracks import Tracks

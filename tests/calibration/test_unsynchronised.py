@@ -9,7 +9,7 @@ import pytest
 
 from shapepose_fg.calibration import unsynchronised
 from shapepose_fg.calibration.from_people import Undetermined, own_tracks
-from shapepose_fg.calibration.rise_and_fall import offsets_without_poses
+from shapepose_fg.calibration.offsets_from_heights import offsets_without_poses
 from shapepose_fg.calibration.tracks import next_of, on_one_clock
 from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
 from shapepose_fg.cli.main import main

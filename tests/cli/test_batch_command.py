@@ -27,7 +27,7 @@ from shapepose_fg.pipeline.runs.manifest import frames_done
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
-from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking.identities import FollowingConfig
 
 CONFIG = PipelineConfig(
     batch_frames=6,

@@ -11,7 +11,7 @@ import pytest
 import shapepose_fg.detection2d.recording as recording
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.moments import CameraClock, align
+from shapepose_fg.core.frame_sets import CameraClock, align
 from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.footage.footage import open_footage

@@ -2,10 +2,10 @@
 
 import pytest
 
-from shapepose_fg.estimation import plain_view
+from shapepose_fg.estimation import missed_detections
 
 
 @pytest.fixture
 def out_of_sight(monkeypatch):
     """Joints without detections are hidden by something that nobody knows of, not missed in plain view."""
-    monkeypatch.setattr(plain_view, "LEAST_VIEWS", 99)
+    monkeypatch.setattr(missed_detections, "LEAST_VIEWS", 99)

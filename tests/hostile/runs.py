@@ -45,9 +45,9 @@ from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.tracking import following
+from shapepose_fg.tracking import identities
 from shapepose_fg.tracking.edits import Action, Edit
-from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking.identities import FollowingConfig
 from tests.core import test_reconstruction as results
 from tests.estimation.test_windows import NobodyFitter
 from tests.hostile.trying import Prepare, only_in
@@ -83,11 +83,11 @@ class Stopping(InFolder):
 @contextmanager
 def short_blocks() -> Iterator[None]:
     """So that following stands between two windows in the middle of a stretch, too."""
-    before, following.BLOCK_S = following.BLOCK_S, 0.2
+    before, identities.BLOCK_S = identities.BLOCK_S, 0.2
     try:
         yield
     finally:
-        following.BLOCK_S = before
+        identities.BLOCK_S = before
 
 
 @cache

@@ -22,7 +22,7 @@ from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking.identities import FollowingConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import BodyScale, TrackingConfig, Tracks
 from tests.marks import slow

@@ -39,8 +39,8 @@ from shapepose_fg.pipeline.runs.manifest import (
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
-from shapepose_fg.tracking import following
-from shapepose_fg.tracking.following import FollowingConfig
+from shapepose_fg.tracking import identities
+from shapepose_fg.tracking.identities import FollowingConfig
 
 CONFIG = PipelineConfig(
     batch_frames=6,
@@ -55,9 +55,9 @@ CUTS = (24,)
 def short_blocks(dance):
     """So that following stands between two windows in the middle of a stretch, too; `dance`, which others share,
     is made before."""
-    before, following.BLOCK_S = following.BLOCK_S, 0.2
+    before, identities.BLOCK_S = identities.BLOCK_S, 0.2
     yield
-    following.BLOCK_S = before
+    identities.BLOCK_S = before
 
 
 @pytest.fixture(scope="module")
@@ -193,8 +193,8 @@ def command(scene, recording, tmp_path_factory) -> list[str]:
 SHORT_BLOCKS = """
 import sys, time
 from shapepose_fg.core.storage.kept_arrays import InFolder
-from shapepose_fg.tracking import following
-following.BLOCK_S = 0.2
+from shapepose_fg.tracking import identities
+identities.BLOCK_S = 0.2
 keep, last = InFolder.keep, sys.argv.pop(1)
 def keep_and_wait(self, name, *more):
     keep(self, name, *more)

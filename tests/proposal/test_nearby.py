@@ -16,7 +16,7 @@ from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.proposal.nearby import Sight, nearby
 from shapepose_fg.proposal.possible_people import Frame, _claimed
 from shapepose_fg.proposal.stage_one import StageOne
-from shapepose_fg.tracking.following import FollowState, finish
+from shapepose_fg.tracking.identities import FollowState, finish
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
-from shapepose_fg.tracking.following import FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.identities import FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig, Tracks
 
 FPS = 30.0

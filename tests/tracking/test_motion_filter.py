@@ -7,8 +7,8 @@ import pytest
 
 from factors import CONSTANT_VELOCITY, kernel_weight
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.kernel_geometry import ROBUST, robust_weight
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.pieces import ROBUST, robust_weight
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.proposal.nearby import Sight

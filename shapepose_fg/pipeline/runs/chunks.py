@@ -16,7 +16,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.windows import Engine, Span
-from shapepose_fg.tracking.following import BLOCK_S
+from shapepose_fg.tracking.identities import BLOCK_S
 
 WARM_S = 6.0
 """Tracking time before a chunk, s: tracks are established after a second or two, and longer

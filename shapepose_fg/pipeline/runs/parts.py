@@ -18,7 +18,7 @@ from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.pipeline.runs.chunks import Border
 from shapepose_fg.pipeline.windows import StreamState
-from shapepose_fg.tracking.following import MOST_FRAMES, FollowState, observed, people_at
+from shapepose_fg.tracking.identities import MOST_FRAMES, FollowState, observed, people_at
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 

@@ -10,7 +10,7 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.carried_error import carried_covariance
+from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise
 
 CONFIG = ObservationConfig(kernel="none")

@@ -5,7 +5,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.doubt import association_spread, exchange_spread, limbs_to_exchange
+from shapepose_fg.estimation.association_uncertainty import association_spread, exchange_spread, limbs_to_exchange
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
 
 PLAIN = ObservationConfig(kernel="none", rho_2d_m=1.0)

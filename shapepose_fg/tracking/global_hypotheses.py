@@ -3,7 +3,7 @@ both ends.
 
 A world is a global hypothesis: a set of tracks that share no detection. People are searched for in
 several frames, tracked from there forwards and backwards, and the tracks that explain most are
-selected (`presence.py`). The selected people are then joined in one world in the frames that show
+selected (`track_selection.py`). The selected people are then joined in one world in the frames that show
 them best, and tracked again from there, so that they no longer take each other's detections.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.detections import Input
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.presence import Account, Chosen, weighed
+from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
@@ -76,9 +76,9 @@ class Hypotheses:
     """(T,) duration that each frame represents, s (`lasting`)."""
 
     @cached_property
-    def account(self) -> Account:
+    def account(self) -> EvidenceTable:
         """The hypotheses as weighted detections for the selection."""
-        return Account.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
+        return EvidenceTable.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
 
     def __len__(self) -> int:
         return len(self.carried)
@@ -111,7 +111,9 @@ class Seed:
     """Whether to search for further people."""
 
 
-def explained(tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: int) -> tuple[Hypotheses, Chosen]:
+def explained(
+    tracker: Tracker, frames: Sequence[Input], carried: Tracks, keep: int
+) -> tuple[Hypotheses, SelectedTracks]:
     """Track hypotheses of T frames, and the best selection of them.
 
     `carried` are the people of the frame before; `keep` is the index of the frame from which they
@@ -185,7 +187,7 @@ def _seed(tracker: Tracker, frames: Sequence[Input], key: int, places: Array, ca
 
 
 def _restarts(
-    tracker: Tracker, frames: Sequence[Input], times: Array, found: Hypotheses, chosen: Chosen
+    tracker: Tracker, frames: Sequence[Input], times: Array, found: Hypotheses, chosen: SelectedTracks
 ) -> list[Seed]:
     """Worlds of all selected people, each from the frame of a `_RESTART_S` interval that shows them
     best.

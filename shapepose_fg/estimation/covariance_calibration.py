@@ -25,7 +25,7 @@ WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
 
 
 @dataclass(frozen=True)
-class Clues:
+class CovarianceFeatures:
     """Features of the uncertainty of N rows' joints, solved over time: the graph's covariance, and
     contradicting evidence.
 
@@ -91,7 +91,7 @@ class Calibration:
     """Factor on the feature of this name: probability that two limbs that fit both bodies are
     exchanged."""
     person: float
-    """Covariances are multiplied by the exponential of this times `Clues.person`. If the overall
+    """Covariances are multiplied by the exponential of this times `CovarianceFeatures.person`. If the overall
     uncertainty of a person is large, its detections more often belong to another person, and no
     other feature shows this."""
 
@@ -107,7 +107,7 @@ class Calibration:
         scale = np.array([known.get(name, mean) for name in joints])
         return cls(scale, *(float(data[name]) for name in WEIGHTS))
 
-    def covariance(self, clues: Clues) -> Array:
+    def covariance(self, clues: CovarianceFeatures) -> Array:
         """(N, J, 3, 3) covariances to report, m²."""
         times = self.scale * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
         added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange

@@ -12,8 +12,8 @@ import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.nearby import Sight
-from shapepose_fg.tracking.presence import Account, Chosen, own_evidence, probability, weighed
-from shapepose_fg.tracking.worlds import lasting
+from shapepose_fg.tracking.global_hypotheses import lasting
+from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, own_evidence, probability, weighed
 
 PLACES = 4
 PRICE = 0.15
@@ -22,7 +22,7 @@ STEP_S = 0.1
 
 def account_of(
     rows: Sequence[Sequence[list[int] | None]], times: int | None = None, step_s: float = STEP_S
-) -> Account:
+) -> EvidenceTable:
     """Of people's detections in each frame, numbers in the frame, at most 8. Each place costs `PRICE` unseen."""
     T = times or len(rows[0])
     candidate = np.full((len(rows), T, PLACES, 1), -1)
@@ -33,7 +33,7 @@ def account_of(
             if own:
                 candidate[h, t, : len(own), 0] = own
     weight, price = np.full(candidate.shape, (1 + PRICE) / PLACES), np.full((len(rows), T), PRICE)
-    return Account.of(candidate, weight, price, there, np.full(T, 8), np.full(T, step_s))
+    return EvidenceTable.of(candidate, weight, price, there, np.full(T, 8), np.full(T, step_s))
 
 
 def evidence_of(
@@ -42,14 +42,14 @@ def evidence_of(
     step_s: float = STEP_S,
     on_trial: bool = False,
     left: bool = False,
-) -> Chosen:
+) -> SelectedTracks:
     """Choose among (detections in each frame, world). With `left` those whom the chosen leave over."""
     account = account_of([frames for frames, _ in rows], times, step_s)
     chosen = account.ways(np.array([world for _, world in rows]), on_trial=on_trial)[0]
     return account.left_over(chosen) if left else chosen
 
 
-def stretches(chosen: Chosen) -> list[tuple[int, int, int]]:
+def stretches(chosen: SelectedTracks) -> list[tuple[int, int, int]]:
     columns = (chosen.hypothesis.tolist(), chosen.start.tolist(), chosen.stop.tolist())
     return sorted(zip(*columns, strict=True))
 
@@ -253,8 +253,8 @@ def test_ways_agree_where_people_have_the_same_detections():
     first, second = [[0, 1]] * 10, [[2, 3]] * 10
     account = account_of([first, second, first[:5] + second[:5], second[:5] + first[:5]])
 
-    def way(*who: int) -> Chosen:
-        return Chosen(np.array(who), np.zeros(len(who), int), np.full(len(who), 10), np.ones(len(who)))
+    def way(*who: int) -> SelectedTracks:
+        return SelectedTracks(np.array(who), np.zeros(len(who), int), np.full(len(who), 10), np.ones(len(who)))
 
     assert account.agreement(way(0, 1), way(1, 0)) == 1.0
     assert account.agreement(way(0, 1), way(2, 3)) == 0.5

@@ -8,9 +8,9 @@ import pytest
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.pipeline.runs.parts import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.pipeline.windows import StreamState
-from shapepose_fg.tracking.following import BLOCK_S, FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.global_hypotheses import Seed, follow_worlds
+from shapepose_fg.tracking.identities import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import Tracks
-from shapepose_fg.tracking.worlds import Seed, follow_worlds
 from tests.marks import slow
 
 

@@ -5,7 +5,13 @@ import pytest
 
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.plain_view import ELSEWHERE_M, MISSED, UNUSUAL, elsewhere_variance, limbs_that_hide
+from shapepose_fg.estimation.missed_detections import (
+    ELSEWHERE_M,
+    MISSED,
+    UNUSUAL,
+    elsewhere_variance,
+    limbs_that_hide,
+)
 
 WRIST = BODY_25.index("RWrist")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.pieces import project
+from shapepose_fg.core.kernel_geometry import project
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import Sight, limbs_of, tie
@@ -55,7 +55,7 @@ at a time has hardly more, and a recording of half a second is too short to gath
 
 
 @dataclass(frozen=True)
-class Chosen(Rows):
+class SelectedTracks(Rows):
     """K selected tracks and the frames in which they are present, in order of selection, best
     first.
     """
@@ -217,7 +217,7 @@ def probability(evidence: float) -> float:
 
 
 @dataclass(frozen=True)
-class Account:
+class EvidenceTable:
     """H track hypotheses in T frames as weighted detections, from which tracks are selected."""
 
     place: NDArray[np.int32]
@@ -242,7 +242,7 @@ class Account:
     @classmethod
     def of(
         cls, candidate: Whole, weight: Real, price: Real, there: Mask, counts: Index, lasts_s: Array
-    ) -> "Account":
+    ) -> "EvidenceTable":
         """Build it from detections `candidate` (H, T, J, V), the number of detections per frame
         `counts` (T,), and `weight` (H, T, J, V) and `price` (H, T) of `weighed`.
         """
@@ -255,11 +255,11 @@ class Account:
         span, least_s = (int(seen[0]), int(seen.max())), min(LEAST_S, _EVEN * float(lasts_s.sum()))
         return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
 
-    def choose(self, world: Index) -> Chosen:
+    def choose(self, world: Index) -> SelectedTracks:
         """The best selection of `ways`."""
         return self.ways(world)[0]
 
-    def ways(self, world: Index, *, on_trial: bool = False) -> list[Chosen]:
+    def ways(self, world: Index, *, on_trial: bool = False) -> list[SelectedTracks]:
         """Selections of hypotheses and their time spans, such that each detection is evidence of
         one person only; best first.
 
@@ -280,7 +280,7 @@ class Account:
         found = [self.in_turn(each, asked) for each in (first, *(world == each for each in tried))]
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
-    def agreement(self, one: Chosen, other: Chosen) -> float:
+    def agreement(self, one: SelectedTracks, other: SelectedTracks) -> float:
         """Share of the detections of `one` and `other` that are evidence of the same people in
         both.
         """
@@ -294,7 +294,7 @@ class Account:
         same = least_cost_pairs(-shared[:-1, :-1])
         return float(shared[same].sum() / owners.shape[1]) if owners.shape[1] > 0 else 1.0
 
-    def left_over(self, chosen: Chosen) -> Chosen:
+    def left_over(self, chosen: SelectedTracks) -> SelectedTracks:
         """Tracks that could be added to the `chosen` ones if births and deaths cost nothing."""
         return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
@@ -315,7 +315,7 @@ class Account:
         _holders(self.place, self.weight, begin, who, what)
         return begin[:-1], who, what
 
-    def in_turn(self, first: Mask, asked: float = 1.0, besides: Chosen | None = None) -> Chosen:
+    def in_turn(self, first: Mask, asked: float = 1.0, besides: SelectedTracks | None = None) -> SelectedTracks:
         """Select tracks greedily, those in `first` (H,) with priority, while they have the minimum
         evidence times `asked`.
 
@@ -333,12 +333,12 @@ class Account:
         chosen, evidence = np.empty((H * T, 3), dtype=np.intp), np.empty(H * T)
         count = _in_turn(*given, *costs, free, changed, *room, chosen, evidence)
         hypothesis, start, stop = chosen[:count].T
-        return Chosen(hypothesis, start, stop, evidence[:count])
+        return SelectedTracks(hypothesis, start, stop, evidence[:count])
 
 
 @kernel("w3 s3 i1 w1 s1")
 def _holders(place, weight, begin, who, what):
-    """Fill in `Account.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts with
+    """Fill in `EvidenceTable.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts with
     two zeros.
     """
     people, frames, places = place.shape
@@ -358,7 +358,7 @@ def _in_turn(
     value, chosen, evidence,
 ):  # fmt: skip
     """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of the tracks that
-    `Account.in_turn` selects; returns their number.
+    `EvidenceTable.in_turn` selects; returns their number.
     """
     people, count = len(gains), 0
     for n in range(len(besides)):

@@ -13,15 +13,16 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.reconstruction import Known, Status
-from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
-from shapepose_fg.estimation.carried_error import carried_covariance
-from shapepose_fg.estimation.doubt import (
+from shapepose_fg.estimation.association_uncertainty import (
     DOUBTED,
     association_spread,
     exchange_spread,
     limbs_to_exchange,
     mirrored_spread,
 )
+from shapepose_fg.estimation.asynchronous_views import carried_to_frames
+from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
+from shapepose_fg.estimation.covariance_calibration import LASTS_S, Calibration, CovarianceFeatures
 from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
 from shapepose_fg.estimation.limbs import limbs_kept
 from shapepose_fg.estimation.linearisation import (
@@ -33,10 +34,9 @@ from shapepose_fg.estimation.linearisation import (
     squared_distance,
     weakest_sigma,
 )
+from shapepose_fg.estimation.missed_detections import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.noise_law import core_sigma_m, variance_ratio
-from shapepose_fg.estimation.out_of_step import carried_to_frames
-from shapepose_fg.estimation.plain_view import SPEED_M_S, elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
@@ -166,7 +166,7 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
         association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
         for clue in (of_body, draft, exchange):
             clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
-    clues = Clues(rows.frame, X, count, widened, of_body, association, draft, exchange)
+    clues = CovarianceFeatures(rows.frame, X, count, widened, of_body, association, draft, exchange)
     found = Calibration.load(joints).covariance(clues)
     single = alone[:, None] & np.isfinite(found).all(axis=(-2, -1))
     found[single] = covariance[single] + raise_eigenvalues(found[single] - covariance[single], 0.0)

@@ -7,7 +7,7 @@ import pytest
 
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.calibration import LASTS_S, Calibration, Clues
+from shapepose_fg.estimation.covariance_calibration import LASTS_S, Calibration, CovarianceFeatures
 from shapepose_fg.estimation.in_time import smoothed_in_time
 from shapepose_fg.estimation.linearisation import squared_distance
 
@@ -17,7 +17,7 @@ I3 = np.eye(3)
 def clues(**changed):
     """One joint, known to 2 cm, that nothing speaks against."""
     nothing = np.zeros((1, 1, 3, 3))
-    plain = Clues(
+    plain = CovarianceFeatures(
         np.zeros(1, dtype=int), np.zeros((1, 1, 3)), np.full((1, 1), 2), np.full((1, 1, 3, 3), 4e-4 * I3),
         np.zeros((1, 1)), nothing, nothing, nothing,
     )  # fmt: skip

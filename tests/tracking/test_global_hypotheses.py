@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.detections import Input
+from shapepose_fg.tracking.global_hypotheses import Seed, explained, follow_worlds
 from shapepose_fg.tracking.tracker import Tracker, Tracks
-from shapepose_fg.tracking.worlds import Seed, explained, follow_worlds
 
 
 @pytest.fixture

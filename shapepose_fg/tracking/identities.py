@@ -12,11 +12,11 @@ from shapepose_fg.core.bounds import Seconds, Settings
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.tracking.global_hypotheses import Hypotheses, explained, times_of
 from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.presence import Chosen, own_evidence
 from shapepose_fg.tracking.sides import hold, hold_now
+from shapepose_fg.tracking.track_selection import SelectedTracks, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks, mean_distance
-from shapepose_fg.tracking.worlds import Hypotheses, explained, times_of
 
 BLOCK_S = 3.0
 """Length of a block, s; long enough that each person is well visible in some of its frames."""
@@ -123,7 +123,7 @@ def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
     return Tracks(time_s, ids, zero, joints, np.full(len(ids), time_s))
 
 
-def _with_detections(found: Hypotheses, chosen: Chosen, *, first: bool, last: bool) -> Chosen:
+def _with_detections(found: Hypotheses, chosen: SelectedTracks, *, first: bool, last: bool) -> SelectedTracks:
     """Trim people to their first detection, if nobody precedes the `first` frame, and to their last
     detection, if nothing follows the `last` frame: at these ends, unseen frames would cost less
     than a birth or death.
@@ -149,7 +149,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
     return given, observed(given, candidate, places, next_id + np.arange(len(places)))
 
 
-def _rows(given: Input, t: int, found: Hypotheses, chosen: Chosen, identity: Index) -> Observations:
+def _rows(given: Input, t: int, found: Hypotheses, chosen: SelectedTracks, identity: Index) -> Observations:
     """The people of a frame as observations, each identity once; uncertain joints are NaN."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
     _, first = np.unique(identity[here], return_index=True)
@@ -172,7 +172,7 @@ def observed(
 
 
 def _identities(
-    found: Hypotheses, chosen: Chosen, state: FollowState, times: Array, own: int, skeleton: Skeleton
+    found: Hypotheses, chosen: SelectedTracks, state: FollowState, times: Array, own: int, skeleton: Skeleton
 ) -> tuple[Index, int]:
     """(K,) identity of each chosen person, -1 if present only in later frames; and the next unused
     identity.
@@ -199,7 +199,9 @@ def _identities(
     return identity, next_id
 
 
-def _returned(found: Hypotheses, chosen: Chosen, k: int, identity: Index, times: Array, skeleton: Skeleton) -> int:
+def _returned(
+    found: Hypotheses, chosen: SelectedTracks, k: int, identity: Index, times: Array, skeleton: Skeleton
+) -> int:
     """Identity of the nearest person who disappeared before the `k`-th chosen appears;
     -1 for none.
     """

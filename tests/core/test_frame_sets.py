@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.moments import CameraClock, align, own_frames
+from shapepose_fg.core.frame_sets import CameraClock, align, own_frames
 
 
 def clock(name: str, fps: float, frames: int, start_s: float = 0.0) -> CameraClock:

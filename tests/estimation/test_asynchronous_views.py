@@ -13,10 +13,10 @@ from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import velocities
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.out_of_step import carried_to_frames, leads
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate

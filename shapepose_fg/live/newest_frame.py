@@ -13,14 +13,14 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.body_step import MODEL_SIGMA_M
-from shapepose_fg.estimation.carried_error import carried_covariance
+from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.live.filtering import Moment
+from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracker
-from shapepose_fg.tracking.worlds import PLACED_M
 
 _OWN_S, _TOGETHER_S = 0.3, 0.7
 """Time constants with which the velocity of a joint relative to its person, and that of the person, decay, s:

@@ -11,8 +11,8 @@ from shapepose_fg.estimation.draft import drafted
 from shapepose_fg.estimation.in_time import smoothed_in_time
 from shapepose_fg.estimation.limbs import limb_steps, with_lengths
 from shapepose_fg.estimation.linearisation import ViewEvidence
-from shapepose_fg.estimation.motion_model import Lasting
-from shapepose_fg.estimation.outcome import how_known, problems, with_lasting
+from shapepose_fg.estimation.motion_model import CorrelatedError
+from shapepose_fg.estimation.reported_covariance import how_known, problems, with_lasting
 
 I3 = np.eye(3)
 
@@ -66,7 +66,7 @@ def test_errors_that_last_are_added_to_what_the_graph_knows():
     sigma = np.full((4, 3), 0.02)
     sigma[[0, 2], 1] = 0.15  # over 10 cm: not seen, but a little
     body = np.full((4, 3), 0.05)
-    motion = SimpleNamespace(views=Lasting(f, 1.0, kept))
+    motion = SimpleNamespace(views=CorrelatedError(f, 1.0, kept))
     state = SimpleNamespace(of_views=message(sigma), of_body=message(body), motion=motion)
     rng = np.random.default_rng(0)
     root = rng.normal(0, 0.01, (4, 3, 3, 3))
@@ -90,7 +90,7 @@ def test_the_nearest_frame_in_which_it_was_seen_is_carried_along():
     nobody = message(np.full((4, 1), np.inf))
     marginal = np.broadcast_to(0.03**2 * I3, (4, 1, 3, 3))
     here = window([0.0, 0.1, 0.2, 1.0], [False])
-    motion = SimpleNamespace(views=Lasting(0.5, 1.0))
+    motion = SimpleNamespace(views=CorrelatedError(0.5, 1.0))
     state = SimpleNamespace(of_views=message(sigma), of_body=nobody, motion=motion)
     found = with_lasting(state, here, marginal)
     extra = np.sqrt(np.diagonal(found - marginal, axis1=2, axis2=3))[:, 0, 0]
